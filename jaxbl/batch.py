@@ -10,7 +10,7 @@ from .cluster import Scheduler, connected
 from .errors import InputError
 from .files import make_folder, run_or_read
 from .lines import format_descriptions
-from .records.files import is_log, log_endings
+from .records.files import is_log, log_suffixes
 from .report.diagnose import probability, rms_text
 from .workers import Progress, clear_programs_if_needed, map_jobs, useful_processes
 
@@ -45,7 +45,7 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     others = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
     skipped = sorted({*others} - known)
     if not logs:
-        raise InputError(f"{source}: holds no log ({', '.join(log_endings())}, or a folder of a ROS 2 bag)")
+        raise InputError(f"{source}: holds no log ({', '.join(log_suffixes())}, or a folder of a ROS 2 bag)")
     stems = [file.stem for file in logs]
     for name in stems:
         if stems.count(name) > 1:

@@ -40,7 +40,8 @@ def inspect(
         Path | None, typer.Option(metavar="TOML", help="study, or a file with [log] alone: how to read the log")
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(metavar="NEW.toml", help="propose [log] and a nominal model for identify and diagnose")
+        Path | None,
+        typer.Option(metavar="NEW.toml", help="propose [log] and a nominal model for identify and diagnose"),
     ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
@@ -62,10 +63,10 @@ def inspect(
     if write is None:
         found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
-        from jaxbl.records.proposal import propose
+        from jaxbl.records.proposal import propose_study
 
         given = None if table is None else table.model_dump(exclude_unset=True)
-        study, guesses, found = propose(log, given, gear_ratio=gear_ratio, nominal=nominal)
+        study, guesses, found = propose_study(log, given, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
     lines = write_inspection_report(found, folder, steps)

@@ -21,7 +21,7 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
 from jaxbl.observer import AbstractSuperTwisting
-from jaxbl.records.linear_filters import filtered, parzen
+from jaxbl.records.linear_filters import filter_forwards, parzen_window
 from jaxbl.simulate import Experiment, Signals, State, initial_observer_state, initial_state, replay
 
 from .neutral_effects import complete
@@ -143,7 +143,7 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
     least = np.finfo(float).tiny
     deviation = float(np.sqrt(np.maximum(np.mean(noise**2), least)))
     # a window that keeps the spectrum positive, and what is fast out of what is slow
-    correlation = products / np.maximum(products[0], least) * parzen(lags)
+    correlation = products / np.maximum(products[0], least) * parzen_window(lags)
     residual = Residual(
         side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), correlation,
         min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
@@ -174,7 +174,7 @@ def compared(
     share = _share(experiment)
     own, other, noise, bandwidth = [], [], [], cutoff
     for one, smooth in zip(observed, residuals, strict=True):
-        late = filtered(smooth.torque, [share], [share - 1.0])
+        late = filter_forwards(smooth.torque, [share], [share - 1.0])
         low, _ = narrowed(one.residual, cutoff)
         beside = dataclasses.replace(one.residual, torque=late[one.skipped :])
         own.append(low.torque)

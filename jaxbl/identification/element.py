@@ -16,8 +16,8 @@ from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
-from jaxbl.records.element import Element, Number, error_on
-from jaxbl.records.inspection import displacement, element_noise, element_of
+from jaxbl.records.element import Element, Number, element_error
+from jaxbl.records.inspection import element_displacement, element_noise, fit_record_element
 
 # number -> where a study has it: an effect and its key
 _EFFECTS = {
@@ -123,7 +123,7 @@ def run_element(task: ElementTask) -> ElementIdentification:
         InputError: a log that shows no stiffness.
     """
     record = task.record
-    found = element_of(record, task.gear_ratio)
+    found = fit_record_element(record, task.gear_ratio)
     if found is None:
         raise InputError(
             f"{record.path}: the displacement never turns back, or hardly moves; a log of a transmission should load it to "
@@ -135,7 +135,7 @@ def run_element(task: ElementTask) -> ElementIdentification:
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness.value:.3g} ± "
             f"{stiffness.error:.2g} {stiffness.unit}); see columns and signs in [log]"
         )
-    moved = displacement(record, task.gear_ratio)
+    moved = element_displacement(record, task.gear_ratio)
     trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": found.torque})
     return ElementIdentification(task, found, to_jsonable(_summary(task, found)), trace, _tables(found))
 
@@ -181,8 +181,8 @@ def _summary(task: ElementTask, found: Element) -> dict[str, Any]:
     if task.holdout is not None:
         other = task.holdout
         assert other.torque is not None
-        moved, noise = displacement(other, task.gear_ratio), element_noise(other, task.gear_ratio)
-        error = error_on(found, moved, other.torque, other.segments, other.sample_period, noise)
+        moved, noise = element_displacement(other, task.gear_ratio), element_noise(other, task.gear_ratio)
+        error = element_error(found, moved, other.torque, other.segments, other.sample_period, noise)
         rms, relative = (None, None) if error is None else error
         summary["holdout"] = {"file": str(other.path.resolve()), "torque": {"rms": rms, "relative": relative}}
     return summary

@@ -19,7 +19,16 @@ from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import on_record, read_logs, unit_on
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.records.live import Datagrams, FollowedFile, Rows, Source, Stream, check_live, needed, wrong_period
+from jaxbl.records.live import (
+    Datagrams,
+    FollowedFile,
+    Rows,
+    Source,
+    Stream,
+    check_stream_table,
+    period_error,
+    stream_columns,
+)
 from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
 from jaxbl.workers import limit_blas_threads
@@ -149,13 +158,13 @@ def read_watch_task(
     live = follow or "://" in address
     record = None
     if live:
-        check_live(config.log, address)
+        check_stream_table(config.log, address)
     else:
         record = read_logs(config, source)
         if "load" not in record.positions:
             raise InputError(f"{source}: has no load position (theta_s); the gap is watched by both encoders")
         if not math.isclose(record.sample_period, config.run.sample_period, rel_tol=_TOLERANCE):
-            raise wrong_period(address, record.sample_period, config.run.sample_period)
+            raise period_error(address, record.sample_period, config.run.sample_period)
     with jax.enable_x64(True):
         if record is None:
             double = config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})})
@@ -235,7 +244,9 @@ def _of_record(record: Record) -> Iterator[Rows]:
 
 
 def _stream(task: WatchTask) -> Stream:
-    source: Source = Datagrams(task.name, needed(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
+    source: Source = (
+        Datagrams(task.name, stream_columns(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
+    )
     return Stream(source, task.config.log, float(task.experiment.run.sample_period))
 
 

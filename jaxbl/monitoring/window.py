@@ -27,7 +27,7 @@ import numpy as np
 from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.identification.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
-from jaxbl.records.linear_filters import slopes
+from jaxbl.records.linear_filters import savitzky_golay_slopes
 from jaxbl.simulate import Experiment
 
 PARTS = 10
@@ -155,7 +155,7 @@ class Window:
         counts[-self._half :] = 0.0
         found = {}
         for side in self._experiment.sides:
-            velocity = slopes(self._rows[f"{side}.position"], self._half) / self._period
+            velocity = savitzky_golay_slopes(self._rows[f"{side}.position"], self._half) / self._period
             rows = {"twist": self._rows["twist"], "torque": self._rows[f"{side}.torque"], "velocity": velocity}
             one = self._of_side(side, rows | {"counts": counts})
             if one is not None:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .gearing import Gearing
-from .least_squares import jackknifed
+from .least_squares import fit_with_jackknife
 from .resampling import Grid
-from .signal_quality import SHORTEST, bandwidth, interpolated, longest, low_passed, without_ends
+from .signal_quality import MIN_SAMPLES, find_bandwidth, interpolate_spline, longest_segment, low_pass, trim_filter_ends
 
 _SURELY = 6.0
 """Standard errors beyond which an estimate counts as no chance: errors of 12 blocks are themselves known to 20 %."""
@@ -67,7 +67,7 @@ class Skew:
 
     value: float
     error: float
-    windup: float
+    max_windup_delay: float
     sure: bool
 
 
@@ -88,7 +88,7 @@ class Offset:
     sure: bool
 
 
-def clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
+def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
     """Whether the skew found is a clock's, None where none is found.
 
     Friction of the load winds the shaft up by T / K and so looks like a delay. In the mean over the log the part of T in
@@ -97,7 +97,7 @@ def clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | No
     """
     if gearing.skew is None or gearing.skew_error is None or "u" not in grid.values:
         return None
-    most = windup(grid, nominal)
+    most = max_windup_delay(grid, nominal)
     if not math.isfinite(most):
         return None
     size = abs(gearing.skew)
@@ -110,7 +110,7 @@ def clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | No
     return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * most)), most, sure)
 
 
-def windup(grid: Grid, nominal: NominalDrive) -> float:
+def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:
     """The delay that friction can make at most, s: all of the motor's work done against the load's; inf: none shows."""
     work = square = 0.0
     for s in grid.segments if "u" in grid.values else ():
@@ -122,23 +122,23 @@ def windup(grid: Grid, nominal: NominalDrive) -> float:
 
 def _skew_beside_torque(grid: Grid, nominal: NominalDrive, known: float) -> float:
     """The delay in what the torque in the shaft leaves of the twist, by the motor's equation of motion; s."""
-    found = _regressed(grid, nominal, known)
+    found = _regress_twist(grid, nominal, known)
     return known if found is None else known + float(found.values[2]) / nominal.gear_ratio
 
 
-def encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
+def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     """What is constant in the twist, beside flank, velocity and acceleration, without the wind-up T / K.
 
     With T = u - J_e dω_e/dt - f_e ω_e the twist is offset + half gap sign T + T / K. None where the motion is too small, or
     the offset is too small to matter.
     """
-    found = _regressed(grid, nominal)
+    found = _regress_twist(grid, nominal)
     if found is None:
         return None
     values, errors, torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = found[:7]
     value = float(values[0])
     terms = [np.ones(len(torque)), motor_velocity, motor_acceleration, np.sign(motor_velocity)]
-    bias, bias_error = (float(x[0]) for x in jackknifed(torque, np.column_stack(terms)))
+    bias, bias_error = (float(x[0]) for x in fit_with_jackknife(torque, np.column_stack(terms)))
     constant = max(abs(float(np.mean(torque))), abs(bias) + 2.0 * bias_error if np.isfinite(bias) else np.inf)
     # a constant torque of the motor, or of its record, passes for an offset of that torque over the stiffness
     error = float(np.hypot(errors[0], constant / nominal.stiffness))
@@ -180,16 +180,16 @@ class _Regression(NamedTuple):
     plain: bool
 
 
-def _regressed(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regression | None:
+def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regression | None:
     """With theta_s moved by a skew (s); None where the motion is too small."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    width = bandwidth(motor[longest(grid.segments)], grid.period, slope=True)
-    segments = [s for s in grid.segments if s.stop - s.start >= SHORTEST]
+    width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, slope=True)
+    segments = [s for s in grid.segments if s.stop - s.start >= MIN_SAMPLES]
     if not width or not segments or "u" not in grid.values:
         return None
     parts = []
     for s in segments:
-        moved = interpolated(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
+        moved = interpolate_spline(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
         parts.append(_motion(motor[s], moved, grid.values["u"][s], nominal, 4.0 * width, grid.period))
     twist, torque, place, velocity, acceleration, motor_velocity, motor_acceleration = np.concatenate(parts).T
     shaft = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
@@ -202,18 +202,18 @@ def _regressed(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regress
         if clear.sum() < 0.25 * len(clear) or not 0.05 < share < 0.95:
             continue
         rows = np.column_stack([one, np.sign(flank), velocity, acceleration])[clear]
-        left = _left(target[clear], rows)
+        left = _residual_mean_square(target[clear], rows)
         if best is None or left < best[0]:
             best = (left, clear, rows)
     flanks = best is not None
     if best is None:
         rows = np.column_stack([one, velocity, acceleration])
-        best = (_left(target, rows), one > 0.0, rows)
+        best = (_residual_mean_square(target, rows), one > 0.0, rows)
     left, clear, rows = best
     # eccentricity of an encoder or wheel over a part of a turn has a mean as well
     around = [wave(n * place[clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
-    plain = _left(target[clear], np.column_stack([rows, *around])) > _PLAIN * left
-    values, errors = jackknifed(target[clear], rows)
+    plain = _residual_mean_square(target[clear], np.column_stack([rows, *around])) > _PLAIN * left
+    values, errors = fit_with_jackknife(target[clear], rows)
     if not np.isfinite(values).all():
         return None
     if not flanks:
@@ -227,15 +227,15 @@ def _motion(
     motor: np.ndarray, load: np.ndarray, torque: np.ndarray, nominal: NominalDrive, cutoff: float, period: float
 ) -> np.ndarray:
     """Twist, torque, load position, velocity, acceleration, and both of the motor, low-passed; shape (samples, 7)."""
-    smooth = low_passed(np.column_stack([motor, load, torque]), cutoff, period)
+    smooth = low_pass(np.column_stack([motor, load, torque]), cutoff, period)
     rates = np.gradient(smooth[:, :2], period, axis=0)
     accelerations = np.gradient(rates, period, axis=0)
     twist = smooth[:, 0] - nominal.gear_ratio * smooth[:, 1]
     columns = [twist, smooth[:, 2], smooth[:, 1], rates[:, 1], accelerations[:, 1], rates[:, 0], accelerations[:, 0]]
-    return np.column_stack(columns)[without_ends(len(motor), cutoff, period)]
+    return np.column_stack(columns)[trim_filter_ends(len(motor), cutoff, period)]
 
 
-def _left(target: np.ndarray, rows: np.ndarray) -> float:
+def _residual_mean_square(target: np.ndarray, rows: np.ndarray) -> float:
     """Mean square that a least-squares fit leaves."""
     scaled = rows / (np.abs(rows).max(axis=0) + 1e-300)
     return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxbl.validation import suggest_word
 
 from .files import LogFile
-from .signal_quality import resolution
+from .signal_quality import find_resolution
 from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
@@ -47,11 +47,11 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
         speed = getattr(table, SPEED_CHANNELS[name])
         if speed is not None:
             linear |= speed.si_unit == "m" and not found
-            found[name] = _integral(file, name, speed, stamps)
+            found[name] = _integrate_speed(file, name, speed, stamps)
         elif _is_recorded(file, table, name):
             position = getattr(table, name) or PositionTable()
             linear |= position.si_unit == "m" and not found
-            found[name] = _position(file, name, position, stamps)
+            found[name] = _read_position(file, name, position, stamps)
     if not found:
         columns = ", ".join(map(str, file.columns))
         raise file.wrong(
@@ -62,7 +62,7 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
     if table.transmitted is not None:
         torques["transmitted"] = table.transmitted
     for name, torque in torques.items():
-        found[name] = _torque(file, name, torque, stamps, linear=linear)
+        found[name] = _read_torque(file, name, torque, stamps, linear=linear)
     return found
 
 
@@ -87,12 +87,12 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
     return False
 
 
-def _numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
+def _read_numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
     """Numbers of a column at the rows that are read, unsigned words made signed."""
     file.check_length(file.name(column, f"{name}.column"), stamps.total)
     values = file.numbers(column, f"{name}.column")
     if bits is not None:
-        words = signed(values, bits)
+        words = to_signed(values, bits)
         outside = np.isnan(words)
         if outside.any():
             row = int(np.argmax(outside))
@@ -104,38 +104,38 @@ def _numbers(file: LogFile, name: str, column: str | int, bits: int | None, stam
     return values[stamps.rows]
 
 
-def signed(values: np.ndarray, bits: int) -> np.ndarray:
+def to_signed(values: np.ndarray, bits: int) -> np.ndarray:
     """Unsigned words as signed ones; NaN for what is no word of so many bits."""
     word = (values == np.round(values)) & (values >= -(2.0 ** (bits - 1))) & (values < 2.0**bits)
     return np.where(word, np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values), np.nan)
 
 
-def in_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
     """Numbers of a column, signed and unwrapped, in SI units as `[log]` says: rad (m), rad/s (m/s), N m (N)."""
     if isinstance(table, TorqueTable):
         one, factor = 1.0, 1.0 if table.factor is None else table.factor
     elif isinstance(table, SpeedTable):
-        one, factor = _SPEED[table.unit], table.factor
+        one, factor = _SPEED_FACTORS[table.unit], table.factor
     else:
-        one, factor = _POSITION[table.unit] / (table.counts_per_turn or 1.0), table.factor
+        one, factor = _POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
     return table.sign * factor * one * values + (table.offset or 0.0)
 
 
-_POSITION = {
+_POSITION_FACTORS = {
     "rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "counts": 2.0 * math.pi, "m": 1.0, "mm": 1e-3,
 }  # fmt: skip
 """Unit of a position -> rad (m); of counts, those of a turn."""
-_SPEED = {
+_SPEED_FACTORS = {
     "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
 }  # fmt: skip
 """Unit of a speed -> rad/s (m/s)."""
 
 
-def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
+def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     column = table.column_or(name)
-    values = _numbers(file, name, column, table.signed_bits, stamps)
+    values = _read_numbers(file, name, column, table.signed_bits, stamps)
     if table.minus is not None:
-        values = values - _numbers(file, name, table.minus, table.signed_bits, stamps)
+        values = values - _read_numbers(file, name, table.minus, table.signed_bits, stamps)
     if np.ptp(values) == 0.0:
         raise file.wrong(
             f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
@@ -143,23 +143,23 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
     if table.wrap is None:
         _check_wrap(file, name, table, values, stamps)
     else:
-        values = _unwrapped(file, name, table, values)
+        values = _unwrap(file, name, table, values)
     _check_unit(file, name, table, values)
-    values = in_si(table, values)
+    values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.wrong(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
 
 
-def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
+def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
     """A position from its speed by the trapezoidal rule, 0 at the first row."""
     channel = SPEED_CHANNELS[name]
     column = table.column_or(channel)
-    values = _numbers(file, channel, column, table.signed_bits, stamps)
+    values = _read_numbers(file, channel, column, table.signed_bits, stamps)
     if np.ptp(values) == 0.0:
         raise file.wrong(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
-    step = resolution(values)
-    speed = in_si(table, values)
+    step = find_resolution(values)
+    speed = to_si(table, values)
     position = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(stamps.times))])
     coarse = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
     file.warnings.append(
@@ -169,9 +169,9 @@ def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -
     return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0, held=False)
 
 
-def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:
+def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:
     column = table.column_or(name)
-    values = _numbers(file, name, column, table.signed_bits, stamps)
+    values = _read_numbers(file, name, column, table.signed_bits, stamps)
     if linear and table.unit == "N m":
         raise file.wrong(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
     if table.signed_bits is None:
@@ -188,7 +188,7 @@ def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *,
                 f"{table.saturation:g}; saturation should be the largest value that there can be"
             )
         saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
-    values = in_si(table, values)
+    values = to_si(table, values)
     if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
         raise file.wrong(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if linear else "N m", saturated, table.skew, held=name == "u")
@@ -197,7 +197,7 @@ def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *,
 # wrap-around
 
 
-def _unwrapped(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
+def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
     assert table.wrap is not None
     if np.ptp(values) > 1.001 * table.wrap:
         raise file.wrong(
@@ -251,14 +251,14 @@ def _check_unsigned(file: LogFile, name: str, column: str | int, values: np.ndar
 
 def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> None:
     """Refuse radians whose steps are an encoder's in degrees, the other way round, and counts."""
-    step = resolution(values)
+    step = find_resolution(values)
     if table.factor != 1.0 or table.unit not in ("rad", "deg") or not step:
         return
     column = f"column {table.column_or(name)!r} ({name})"
     turns = {"rad": 2.0 * math.pi, "deg": 360.0}
     other = "deg" if table.unit == "rad" else "rad"
     long = {"rad": "radians", "deg": "degrees"}
-    if _is_encoder(turns[other] / step) and not _is_encoder(turns[table.unit] / step):
+    if _is_encoder_count(turns[other] / step) and not _is_encoder_count(turns[table.unit] / step):
         raise file.wrong(
             f"{column} has steps of {step:.6g}, a turn of {round(turns[other] / step)} counts in {long[other]}: it is not "
             f'in {long[table.unit]}; set unit = "{other}" in [log] {name}'
@@ -270,7 +270,7 @@ def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarr
         )
 
 
-def _is_encoder(counts: float) -> bool:
+def _is_encoder_count(counts: float) -> bool:
     """Whether a number of counts a turn is a power of two, as those of absolute and of interpolated encoders are."""
     if not 2.0**6 <= counts <= 2.0**27:
         return False

@@ -21,8 +21,8 @@ import numpy as np
 
 from jaxbl.units import on_a_line
 
-from .least_squares import BLOCKS, jackknifed
-from .signal_quality import SHORTEST, bandwidth, longest, low_passed
+from .least_squares import BLOCKS, fit_with_jackknife
+from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass
 
 _MOST = 20_000
 """Samples that are fitted: a loop of torque over displacement is drawn by some hundred. Of longer logs means are."""
@@ -190,24 +190,27 @@ def fit_element(
         noise: of the displacement, rad (m) rms.
         linear: whether it is in m.
     """
-    rig = _rig(*_means(position, torque, segments, period, noise))
+    rig = _prepare_rig(*_average_samples(position, torque, segments, period, noise))
     if rig is None:
         return None
     # one of the two may end where no single step leads on
-    ways = [_grown(rig, _fitted(rig, ())), _grown(rig, _shrunk(rig, _positive(rig, _fitted(rig, TERMS))))]
+    ways = [
+        _add_terms(rig, _fit_model(rig, ())),
+        _add_terms(rig, _drop_terms(rig, _drop_negative_terms(rig, _fit_model(rig, TERMS)))),
+    ]
     ways.sort(key=lambda one: len(one.sizes) + len(one.shapes))
     best = ways[1] if _gain(rig, *ways) is not None else ways[0]
-    best = _shrunk(rig, best)
-    gains = {term: _gain(rig, _without(rig, best, term), best) or 0.0 for term in best.terms}
-    whole = _rig(position, torque, segments, period, noise)
-    return _summed_up(rig, whole or rig, best, gains, linear)
+    best = _drop_terms(rig, best)
+    gains = {term: _gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
+    whole = _prepare_rig(position, torque, segments, period, noise)
+    return _make_element(rig, whole or rig, best, gains, linear)
 
 
-def _means(
+def _average_samples(
     position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
 ) -> tuple[np.ndarray, np.ndarray, list[slice], float, float]:
-    """Of neighbouring samples of a long log, as arguments of :func:`_rig`."""
-    width = bandwidth(position[longest(segments)], period, slope=True) or 1.0 / (len(position) * period)
+    """Of neighbouring samples of a long log, as arguments of :func:`_prepare_rig`."""
+    width = find_bandwidth(position[longest_segment(segments)], period, slope=True) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MOST), int(1.0 / (_PER_PERIOD * width * period)))
     if count < 2:
         return position, torque, list(segments), period, noise
@@ -224,8 +227,10 @@ def _means(
     return means[0], means[1], ends, count * period, noise / math.sqrt(count)
 
 
-def _rig(position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float) -> _Rig | None:
-    width = bandwidth(position[longest(segments)], period, slope=True)
+def _prepare_rig(
+    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
+) -> _Rig | None:
+    width = find_bandwidth(position[longest_segment(segments)], period, slope=True)
     smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
     stretches: list[slice] = []
     begins: list[bool] = []
@@ -234,9 +239,9 @@ def _rig(position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], pe
     share = math.sqrt(min(2.0 * _BAND * width * period, 1.0)) if width else 1.0
     for s in segments:
         if width:
-            smooth[s] = low_passed(position[s], _BAND * width, period)
+            smooth[s] = low_pass(position[s], _BAND * width, period)
         rate[s] = np.gradient(smooth[s], period)
-        turns = _turns(smooth[s], max(_TURN * noise * share, 1e-6 * float(np.ptp(position))))
+        turns = _find_reversals(smooth[s], max(_TURN * noise * share, 1e-6 * float(np.ptp(position))))
         ends = [0, *(at + 1 for at in turns), s.stop - s.start]
         parts = [slice(s.start + a, s.start + b) for a, b in itertools.pairwise(ends) if b > a]
         for i, part in enumerate(parts):
@@ -249,13 +254,13 @@ def _rig(position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], pe
         settled = parts[2:] if len(parts) > 3 else parts[1:]
         kept += [np.arange(part.start + guard, part.stop - guard) for part in settled]
     rows = np.concatenate([*kept, np.arange(0)])
-    if len(rows) < SHORTEST or np.ptp(torque[rows]) == 0.0 or np.ptp(smooth[rows]) == 0.0:
+    if len(rows) < MIN_SAMPLES or np.ptp(torque[rows]) == 0.0 or np.ptp(smooth[rows]) == 0.0:
         return None
     blur = np.abs(rate) * period + 4.0 * noise + 1e-9 * float(np.ptp(smooth))
     return _Rig(position, rate, blur, direction, stretches, begins, rows, torque)
 
 
-def _turns(values: np.ndarray, least: float) -> list[int]:
+def _find_reversals(values: np.ndarray, least: float) -> list[int]:
     """Where a signal turns back by more than `least`: indices of its extremes between, in order."""
     slope = np.sign(np.diff(values))
     moving = np.flatnonzero(slope)
@@ -274,7 +279,7 @@ def _turns(values: np.ndarray, least: float) -> list[int]:
     return found
 
 
-class _Fitted(NamedTuple):
+class _Model(NamedTuple):
     """A model on a log: its terms, shapes, linear numbers, and mean square error."""
 
     terms: tuple[str, ...]
@@ -288,10 +293,14 @@ class _Fitted(NamedTuple):
         return bool(self.sizes[0] > 0.0 and (self.sizes[2:] > 0.0).all())
 
 
-def _grown(rig: _Rig, best: _Fitted) -> _Fitted:
+def _add_terms(rig: _Rig, best: _Model) -> _Model:
     """With terms added as long as one lowers the error clearly."""
     while True:
-        models = [_positive(rig, _fitted(rig, (*best.terms, term), best), term) for term in TERMS if term not in best.terms]
+        models = [
+            _drop_negative_terms(rig, _fit_model(rig, (*best.terms, term), best), term)
+            for term in TERMS
+            if term not in best.terms
+        ]
         tried = [(model, gain) for model in models if model.possible and (gain := _gain(rig, best, model)) is not None]
         if not tried:
             return best
@@ -303,21 +312,21 @@ def _grown(rig: _Rig, best: _Fitted) -> _Fitted:
                 best = model
 
 
-def _shrunk(rig: _Rig, model: _Fitted) -> _Fitted:
+def _drop_terms(rig: _Rig, model: _Model) -> _Model:
     """Without terms that do not lower the error clearly, the least of them first."""
     while True:
-        others = [_without(rig, model, term) for term in model.terms]
+        others = [_fit_without(rig, model, term) for term in model.terms]
         needless = [one for one in others if one.sizes[0] > 0.0 and _gain(rig, one, model) is None]
         if not needless:
             return model
-        model = min(needless, key=lambda one: float(np.mean(_held_out(rig, one))))
+        model = min(needless, key=lambda one: float(np.mean(_held_out_errors(rig, one))))
 
 
-def _without(rig: _Rig, model: _Fitted, term: str) -> _Fitted:
-    return _positive(rig, _fitted(rig, tuple(one for one in model.terms if one != term), model))
+def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
+    return _drop_negative_terms(rig, _fit_model(rig, tuple(one for one in model.terms if one != term), model))
 
 
-def _positive(rig: _Rig, found: _Fitted, new: str = "") -> _Fitted:
+def _drop_negative_terms(rig: _Rig, found: _Model, new: str = "") -> _Model:
     """A model without terms whose size is negative; as it is where that of the `new` one is."""
     while True:
         sized = [one for one in found.terms if one in _SIZES]
@@ -325,19 +334,19 @@ def _positive(rig: _Rig, found: _Fitted, new: str = "") -> _Fitted:
         terms = tuple(one for one in found.terms if one not in _SIZES or one in kept)
         if terms == found.terms or (new in _SIZES and new not in kept):
             return found
-        found = _fitted(rig, terms, found)
+        found = _fit_model(rig, terms, found)
 
 
 def _shape_names(terms: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(name for term in terms for name in _SHAPES.get(term, ())))
 
 
-def _sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
+def _fit_sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
     return np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
 
 
-def _fitted(rig: _Rig, terms: tuple[str, ...], near: _Fitted | None = None) -> _Fitted:
+def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) -> _Model:
     """Least squares; shapes that `near` has begin there, others at the best of a grid."""
     from scipy.optimize import least_squares
 
@@ -351,7 +360,7 @@ def _fitted(rig: _Rig, terms: tuple[str, ...], near: _Fitted | None = None) -> _
 
     def left(shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
         columns = rig.columns(terms, shapes, rows)
-        return rig.torque[rows] - columns @ _sizes(columns, rig.torque[rows])
+        return rig.torque[rows] - columns @ _fit_sizes(columns, rig.torque[rows])
 
     shapes = np.empty(0)
     if names:
@@ -372,35 +381,35 @@ def _fitted(rig: _Rig, terms: tuple[str, ...], near: _Fitted | None = None) -> _
         shapes = min(tried, key=lambda one: one[0])[1]
         shapes = least_squares(left, shapes, bounds=(low, high), args=(rig.rows,), x_scale=rig.half, diff_step=1e-4).x
     columns = rig.columns(terms, shapes, rig.rows)
-    sizes = _sizes(columns, rig.torque[rig.rows])
-    return _Fitted(terms, shapes, sizes, float(np.mean((rig.torque[rig.rows] - columns @ sizes) ** 2)))
+    sizes = _fit_sizes(columns, rig.torque[rig.rows])
+    return _Model(terms, shapes, sizes, float(np.mean((rig.torque[rig.rows] - columns @ sizes) ** 2)))
 
 
-def _held_out(rig: _Rig, model: _Fitted) -> np.ndarray:
+def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
     """Mean square error on each block of the log, by sizes from the others; shape (blocks,)."""
     columns, torque = rig.columns(model.terms, model.shapes, rig.rows), rig.torque[rig.rows]
     found = []
     for block in np.array_split(np.arange(len(torque)), _FOLDS):
         others = np.ones(len(torque), dtype=bool)
         others[block] = False
-        sizes = _sizes(columns[others], torque[others])
+        sizes = _fit_sizes(columns[others], torque[others])
         found.append(float(np.mean((torque[block] - columns[block] @ sizes) ** 2)))
     # what rounding leaves of a log without noise
     return np.array(found) + 1e-24 * float(np.mean(torque**2))
 
 
-def _gain(rig: _Rig, without: _Fitted, model: _Fitted) -> float | None:
+def _gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
     """Squared error on left-out blocks without a term over that with it, less 1; None where it is not clearly above 0.
 
     By logarithms: a term may matter a hundred times as much in one block as in another.
     """
-    gains = np.log(_held_out(rig, without) / _held_out(rig, model))
+    gains = np.log(_held_out_errors(rig, without) / _held_out_errors(rig, model))
     error = float(np.std(gains, ddof=1)) / math.sqrt(_FOLDS)
     mean = float(np.mean(gains))
     return math.expm1(mean) if mean > _CLEAR * error else None
 
 
-def _summed_up(rig: _Rig, whole: _Rig, model: _Fitted, gains: dict[str, float], linear: bool) -> Element:
+def _make_element(rig: _Rig, whole: _Rig, model: _Model, gains: dict[str, float], linear: bool) -> Element:
     """Numbers with errors by a jackknife over blocks, which holds for errors of any correlation in time."""
     from scipy.special import stdtrit
 
@@ -417,7 +426,7 @@ def _summed_up(rig: _Rig, whole: _Rig, model: _Fitted, gains: dict[str, float], 
         slopes.append((high - low) / (2.0 * step))
     jacobian = np.column_stack([columns, *slopes])
     left = rig.torque[rig.rows] - columns @ model.sizes
-    _, errors = jackknifed(left + jacobian @ values, jacobian)
+    _, errors = fit_with_jackknife(left + jacobian @ values, jacobian)
     reach = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
     for name, value, error in zip(names, values.tolist(), errors.tolist(), strict=True):
@@ -450,14 +459,14 @@ def _unit(name: str, linear: bool) -> str:
     return on_a_line(_UNITS[name]) if linear else _UNITS[name]
 
 
-def error_on(
+def element_error(
     found: Element, position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
 ) -> tuple[float, float] | None:
     """Rms torque by which a transmission that was found misses another log, and that over the rms of the log's torque.
 
     Arguments and None as of :func:`fit_element`.
     """
-    rig = _rig(position, torque, segments, period, noise)
+    rig = _prepare_rig(position, torque, segments, period, noise)
     if rig is None:
         return None
     left = torque[rig.rows] - rig.columns(found.terms, found.shapes, rig.rows) @ found.sizes

@@ -124,7 +124,7 @@ class LogFile:
         """A column as the file has it, shape (rows,). InputError where it is too long, or cannot be read."""
         self.length(name)
         try:
-            with _reading(f"column {name!r}"):
+            with _one_line_errors(f"column {name!r}"):
                 return np.asarray(self.columns[name])
         except InputError as error:
             raise self.wrong(str(error)) from None
@@ -178,10 +178,10 @@ class LogFile:
 
 def is_log(path: Path) -> bool:
     """Whether a file, or the folder of a ROS 2 bag, is a log by its name; :func:`read_log_file` reads others, too."""
-    return (path / _BAG).is_file() or (path.is_file() and path.suffix.lower() in log_endings())
+    return (path / _BAG).is_file() or (path.is_file() and path.suffix.lower() in log_suffixes())
 
 
-def log_endings() -> tuple[str, ...]:
+def log_suffixes() -> tuple[str, ...]:
     """Of the files that are logs by their name, with those of installed packages."""
     return (*_ENDINGS, *(f".{name}" for name in READERS))
 
@@ -198,14 +198,14 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
     """
     try:
         check_file(path)
-        columns = _columns(path, wanted)
+        columns = _read_columns(path, wanted)
         if not all(str(name).isprintable() for name in columns):
             named = {escape_unprintable(one) if isinstance(one, str) else one: values for one, values in columns.items()}
             columns.clear()
             columns.update(named)
         return LogFile(path, columns)
     except FileNotFoundError:
-        why = explain_missing_file(path, log_endings())
+        why = explain_missing_file(path, log_suffixes())
     except IsADirectoryError:
         why = "is a folder; a log file is needed"
     except OSError as error:
@@ -215,30 +215,30 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
     raise InputError(f"{path}: {why}")
 
 
-def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
+def _read_columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     suffix = path.suffix.lower()
     if (path / _BAG).is_file():
-        with _reading("a ROS bag"):
+        with _one_line_errors("a ROS bag"):
             return read_bag(path, wanted)
     if suffix not in _ENDINGS and suffix[1:] in READERS:
-        return _added(path, suffix[1:])
+        return _read_with_installed_reader(path, suffix[1:])
     with path.open("rb") as file:
         head = file.read(_HEAD)
         whole = not file.read(1)
     for mark, kind, read in _MARKS:
         if head.startswith(mark):
-            with _reading(kind):
+            with _one_line_errors(kind):
                 return read(path, wanted)
     if not head.removeprefix(BOM_UTF8).strip():
         raise InputError(f"is empty; {_KINDS}")
     if head.startswith(b"PAR1"):
-        with _reading("Parquet"):
-            return _parquet(path)
+        with _one_line_errors("Parquet"):
+            return _read_parquet(path)
     # an HDF5 file begins so; MATLAB 7.3 puts half a kilobyte of text before that
     if b"\x89HDF" in (head[:4], head[512:516]):
-        return _hdf5(path)
+        return _read_hdf5(path)
     if suffix == ".mat":
-        return _matlab(path, wanted)
+        return _read_matlab(path, wanted)
     if head.startswith(b"SQLite format 3"):
         raise InputError("is a database, perhaps of a ROS 2 bag; give the bag's folder, the one with metadata.yaml")
     if b"\0" in head:
@@ -246,15 +246,15 @@ def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     # whole lines, so that no letter is cut
     head = head if whole else head[: head.rfind(b"\n") + 1] or head
     try:
-        return _of_text(path, head.decode("utf-8-sig"), "utf-8-sig", whole, wanted)
+        return _read_text(path, head.decode("utf-8-sig"), "utf-8-sig", whole, wanted)
     except UnicodeDecodeError:
         # a degree sign in a header of an old program
-        return _of_text(path, head.decode("latin-1"), "latin-1", whole, wanted)
+        return _read_text(path, head.decode("latin-1"), "latin-1", whole, wanted)
 
 
-def _added(path: Path, ending: str) -> Columns:
+def _read_with_installed_reader(path: Path, ending: str) -> Columns:
     """Columns by the reader of an installed package."""
-    with _reading(f"a log by the reader of .{ending} files"):
+    with _one_line_errors(f"a log by the reader of .{ending} files"):
         found = READERS[ending](path)
     try:
         columns = found if isinstance(found, Columns) else Columns(found)
@@ -268,17 +268,17 @@ def _added(path: Path, ending: str) -> Columns:
     return columns
 
 
-def _of_text(path: Path, head: str, encoding: str, whole: bool, wanted: Collection[str | int]) -> dict[str | int, Any]:
+def _read_text(path: Path, head: str, encoding: str, whole: bool, wanted: Collection[str | int]) -> dict[str | int, Any]:
     def text() -> str:
         check_file(path, _MOST_WHOLE)
         return head if whole else path.read_text(encoding=encoding)
 
     if path.suffix.lower() == ".json" or head.lstrip()[0] in "[{":
-        with _reading("JSON"):
-            return _json(text())
+        with _one_line_errors("JSON"):
+            return _read_json(text())
     _check_lines(path)
-    with _reading("a table", UnicodeDecodeError):
-        return _text(path, head, encoding, text, wanted)
+    with _one_line_errors("a table", UnicodeDecodeError):
+        return _read_table(path, head, encoding, text, wanted)
 
 
 def _check_lines(path: Path) -> None:
@@ -295,7 +295,7 @@ def _check_lines(path: Path) -> None:
             count += ends
 
 
-def _parquet(path: Path) -> dict[str | int, Any]:
+def _read_parquet(path: Path) -> dict[str | int, Any]:
     from pyarrow.parquet import ParquetFile
 
     with ParquetFile(path) as file:
@@ -311,7 +311,7 @@ def _parquet(path: Path) -> dict[str | int, Any]:
 
 
 @contextmanager
-def _reading(kind: str, *passed: type[Exception]) -> Iterator[None]:
+def _one_line_errors(kind: str, *passed: type[Exception]) -> Iterator[None]:
     """Errors of the libraries that read files, which are of many classes, in one line; those of `passed` as they are."""
     try:
         yield
@@ -326,16 +326,16 @@ _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|i
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _text(
+def _read_table(
     path: Path, head: str, encoding: str, text: Callable[[], str], wanted: Collection[str | int]
 ) -> dict[str | int, Any]:
     """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
     lines = head.splitlines()
     if max(map(len, lines)) == len(head) and len(head) > _HEAD // 2:
         raise InputError(f"has no line break in its first {len(head)} characters; a log has a line for each row")
-    if (block := _behind_remarks(lines, text)) is not None:
+    if (block := _read_behind_remarks(lines, text)) is not None:
         return block
-    form = text_form(lines)
+    form = detect_text_format(lines)
 
     def rows(wanted: Collection[str | int]) -> tuple[list[str | int], dict[str | int, np.ndarray], int]:
         """Names of all columns, values of those that are wanted (all, if none is), and the number of rows."""
@@ -362,7 +362,10 @@ def _text(
         return every, {name: np.concatenate(values) for name, values in parts.items()}, count
 
     # another encoding is tried then: the letter may be far behind the head
-    with _reading("a table", UnicodeDecodeError), warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+    with (
+        _one_line_errors("a table", UnicodeDecodeError),
+        warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),
+    ):
         try:
             every, values, count = rows(wanted)
         except pd.errors.EmptyDataError:
@@ -376,7 +379,7 @@ def _text(
     }
 
 
-class TextForm(NamedTuple):
+class TextFormat(NamedTuple):
     """How rows of text are written.
 
     Attributes:
@@ -408,7 +411,7 @@ class TextForm(NamedTuple):
     def numbers(self, lines: list[str]) -> np.ndarray:
         """Rows as numbers, shape (rows, columns); NaN for a cell that holds none. Lines of another number of cells are
         left out."""
-        lines = [line for line in lines if len(_cells(line, self.separator)) == self.count]
+        lines = [line for line in lines if len(_split_cells(line, self.separator)) == self.count]
         if not lines:
             return np.empty((0, self.count))
         options = self.options() | {"names": None}
@@ -416,7 +419,7 @@ class TextForm(NamedTuple):
         return np.stack([pd.to_numeric(frame[i], errors="coerce").to_numpy(float) for i in range(self.count)], axis=1)
 
 
-def text_form(lines: list[str]) -> TextForm:
+def detect_text_format(lines: list[str]) -> TextFormat:
     """How the rows of a text are written, from its first lines.
 
     Raises:
@@ -426,28 +429,28 @@ def text_form(lines: list[str]) -> TextForm:
     if skipped is None:
         raise InputError("holds only remarks; rows of numbers are needed")
     first = lines[skipped]
-    separator = _separator(first)
-    cells = _cells(first, separator)
+    separator = _find_separator(first)
+    cells = _split_cells(first, separator)
     if len(cells) > _MOST_COLUMNS:
         raise InputError(f"has {len(cells)} columns; at most {_MOST_COLUMNS} can be read")
     header = not any(_NUMBER.fullmatch(cell) for cell in cells)
     second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
-    if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
+    if header and len(_split_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
         cells = [*cells, ""]  # a separator at the end of the rows
-    decimal = _decimal(lines[skipped + header :], separator)
-    names = _names(cells) if header else None
-    return TextForm(separator, decimal, names, len(cells), skipped + header)
+    decimal = _find_decimal_sign(lines[skipped + header :], separator)
+    names = _check_names(cells) if header else None
+    return TextFormat(separator, decimal, names, len(cells), skipped + header)
 
 
 _SPACE = r"\s+"
 
 
-def _separator(line: str) -> str:
+def _find_separator(line: str) -> str:
     """What stands between the cells of a line."""
     return next((c for c in ";\t," if c in line), _SPACE)
 
 
-def _decimal(rows: list[str], separator: str) -> str:
+def _find_decimal_sign(rows: list[str], separator: str) -> str:
     """The decimal sign of rows: a comma between digits is one where something else separates, and no point is one."""
     text = "\n".join(rows)
     return "," if separator != "," and re.search(r"\d,\d", text) and not re.search(r"\d\.\d", text) else "."
@@ -457,47 +460,49 @@ _REMARKS = 100
 """Lines that a program may write before the rows: exports of drive software and of scopes have ten to thirty."""
 
 
-def _behind_remarks(lines: list[str], text: Callable[[], str]) -> Columns | None:
+def _read_behind_remarks(lines: list[str], text: Callable[[], str]) -> Columns | None:
     """Rows behind a block of remarks, as EPOS Studio and TwinCAT Scope write them; None where there is no such block.
 
     `lines` are the first of the `text`.
 
     The lines just before the rows hold names and, below, units; TwinCAT's the word Name over each column of times.
     """
-    start = next((i for i in range(min(len(lines) - 2, _REMARKS)) if _is_row(lines[i]) and _is_row(lines[i + 1])), 0)
+    start = next(
+        (i for i in range(min(len(lines) - 2, _REMARKS)) if _is_number_row(lines[i]) and _is_number_row(lines[i + 1])), 0
+    )
     head = [line for line in lines[:start] if line.strip() and not line.lstrip().startswith("#")]
     if len(head) < 2:
         return None
-    separator = _separator(lines[start])
+    separator = _find_separator(lines[start])
     if separator == _SPACE:
         return None
-    count = len(_cells(lines[start], separator))
+    count = len(_split_cells(lines[start], separator))
     known = any(mark in line for line in head for mark in ("EPOS Studio", "Starttime of export"))
-    if not known and len(_cells(head[0], separator)) == count:
+    if not known and len(_split_cells(head[0], separator)) == count:
         return None
     rows = [line for line in text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
-    decimal = _decimal(rows, separator)
-    with _reading("a table"):
+    decimal = _find_decimal_sign(rows, separator)
+    with _one_line_errors("a table"):
         frame = pd.read_csv(
             io.StringIO("\n".join(rows)), sep=separator, header=None, decimal=decimal, skipinitialspace=True, index_col=False
         )
-    titles = [_cells(line, separator) for line in head]
+    titles = [_split_cells(line, separator) for line in head]
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope = [cells for cells in titles if cells[0] == "Name"]
     names = scope[-1] if scope else titles[-2] if len(titles) > 1 else titles[-1] if titles else []
     units = titles[-1] if len(titles) > 1 and not scope else []
-    return _together([frame[i].to_numpy() for i in range(count)], names, units)
+    return _name_columns([frame[i].to_numpy() for i in range(count)], names, units)
 
 
-def _is_row(line: str) -> bool:
+def _is_number_row(line: str) -> bool:
     """Whether a line holds two numbers or more, and nothing else."""
-    separator = _separator(line)
-    cells = [] if separator == _SPACE else _cells(line, separator)
+    separator = _find_separator(line)
+    cells = [] if separator == _SPACE else _split_cells(line, separator)
     cells = cells[:-1] if cells and not cells[-1] else cells
     return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)
 
 
-def _together(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
+def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
     """Columns with their names; those with times of their own at the times of the first."""
     found, times = Columns(), values[0]
     own = times
@@ -522,12 +527,12 @@ def _together(values: list[np.ndarray], names: list[str], units: list[str]) -> C
     return found
 
 
-def _cells(line: str, separator: str) -> list[str]:
+def _split_cells(line: str, separator: str) -> list[str]:
     cells = next(csv.reader([line], delimiter=separator), []) if len(separator) == 1 else line.split()
     return [cell.strip() for cell in cells]
 
 
-def _names(cells: list[str]) -> list[str]:
+def _check_names(cells: list[str]) -> list[str]:
     if cells and not cells[-1]:
         cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
     if len({*cells}) < len(cells):
@@ -536,7 +541,7 @@ def _names(cells: list[str]) -> list[str]:
     return cells
 
 
-def _json(text: str) -> dict[str | int, Any]:
+def _read_json(text: str) -> dict[str | int, Any]:
     """An array of objects or of rows of numbers, an object that holds one array of objects, or arrays by name."""
     try:
         data = json.loads(text)
@@ -549,7 +554,7 @@ def _json(text: str) -> dict[str | int, Any]:
         rows = [value for value in data.values() if isinstance(value, list) and value and isinstance(value[0], dict)]
         if len(rows) != 1:
             for name, value in data.items():
-                _add_json(columns, name, value)
+                _add_json_columns(columns, name, value)
             if not columns:
                 raise InputError("holds no array of rows or of numbers; a log needs one")
             return columns
@@ -559,19 +564,19 @@ def _json(text: str) -> dict[str | int, Any]:
     if not isinstance(data, list) or not data or not all(isinstance(row, dict) for row in data):
         raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
     names = dict.fromkeys(name for row in data for name in row)
-    return {name: _plain([row.get(name) for row in data]) for name in names}
+    return {name: _to_array([row.get(name) for row in data]) for name in names}
 
 
-def _add_json(columns: dict[str | int, Any], name: str, value: Any) -> None:
+def _add_json_columns(columns: dict[str | int, Any], name: str, value: Any) -> None:
     """Arrays, columns of matrices as `name[0]`, and what objects hold as `name.key`."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            _add_json(columns, f"{name}.{key}", inner)
+            _add_json_columns(columns, f"{name}.{key}", inner)
     elif _is_matrix(value):
         for i, column in enumerate(np.asarray(value, dtype=float).T):
             columns[f"{name}[{i}]"] = column
     elif isinstance(value, list):
-        columns[name] = _plain(value)
+        columns[name] = _to_array(value)
 
 
 def _is_matrix(value: Any) -> bool:
@@ -582,19 +587,19 @@ def _is_matrix(value: Any) -> bool:
     return plain and len({len(row) for row in value}) == 1
 
 
-def _plain(values: list[Any]) -> np.ndarray:
+def _to_array(values: list[Any]) -> np.ndarray:
     return np.asarray(pd.Series(values, dtype=object).infer_objects())
 
 
-def _matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
+def _read_matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     """Vectors, columns of matrices (`name[0]`), fields of structures (`name.field`), and cells (`name[0]`)."""
     from scipy.io import loadmat, whosmat
 
     def loaded(name: str) -> Any:
-        with _reading("a MATLAB file"):
+        with _one_line_errors("a MATLAB file"):
             return loadmat(path, variable_names=[name], squeeze_me=True, struct_as_record=True)[name]
 
-    with _reading("a MATLAB file"):
+    with _one_line_errors("a MATLAB file"):
         known = whosmat(path)
     tops = {re.split(r"[.\[]", str(column))[0] for column in wanted}
     columns: dict[str | int, Any] = {}
@@ -603,37 +608,39 @@ def _matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
         if kind in ("cell", "struct"):
             # what is in them shows only once they are loaded
             if not wanted or name in tops:
-                _add(columns, name, loaded(name))
+                _add_matlab_columns(columns, name, loaded(name))
             else:
                 others.append(name)
         elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
-            _add_lazily(columns, name, shape, lambda name=name: loaded(name))
+            _add_vectors(columns, name, shape, lambda name=name: loaded(name))
     # a message that lists columns has to know their names
     for name in others if not any(one in columns for one in wanted) else ():
-        _add(columns, name, loaded(name))
-    return _some(columns)
+        _add_matlab_columns(columns, name, loaded(name))
+    return _require_columns(columns)
 
 
-_Some = TypeVar("_Some", bound=dict[str | int, Any])
+_ColumnsType = TypeVar("_Some", bound=dict[str | int, Any])
 
 
-def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
+def _add_matlab_columns(columns: dict[str | int, Any], name: str, value: Any) -> None:
     value = np.asarray(value)
     if value.dtype.names:
         if value.ndim == 0:
             for field in value.dtype.names:
-                _add(columns, f"{name}.{field}", value[field].item() if value[field].dtype == object else value[field])
+                _add_matlab_columns(
+                    columns, f"{name}.{field}", value[field].item() if value[field].dtype == object else value[field]
+                )
         elif value.ndim == 1:
             for i, one in enumerate(value):
-                _add(columns, f"{name}[{i}]", one)
+                _add_matlab_columns(columns, f"{name}[{i}]", one)
     elif value.dtype == object:
         for i, one in enumerate(value.ravel() if value.ndim else []):
-            _add(columns, f"{name}[{i}]", one)
+            _add_matlab_columns(columns, f"{name}[{i}]", one)
     elif value.dtype.kind in "biuf":
-        _add_lazily(columns, name, value.shape, lambda: value)
+        _add_vectors(columns, name, value.shape, lambda: value)
 
 
-def _add_lazily(columns: dict[str | int, Any], name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
+def _add_vectors(columns: dict[str | int, Any], name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
     """A vector, or the columns of a matrix, of which `load` gives the values; `shape` may have ones that are squeezed."""
     shape = tuple(one for one in shape if one != 1)
     if len(shape) == 2 and (min(shape) > _MOST_COLUMNS or math.prod(shape) > _MOST_ROWS):
@@ -647,7 +654,7 @@ def _add_lazily(columns: dict[str | int, Any], name: str, shape: tuple[int, ...]
             columns[f"{name}[{i}]"] = Column(lambda i=i: np.take(np.squeeze(load()), i, axis=along), shape[1 - along])
 
 
-def _hdf5(path: Path) -> dict[str | int, Any]:
+def _read_hdf5(path: Path) -> dict[str | int, Any]:
     """MATLAB 7.3, or any HDF5 file of vectors. What a file takes from other files is not read: it could be any of them."""
     import h5py
 
@@ -656,7 +663,7 @@ def _hdf5(path: Path) -> dict[str | int, Any]:
     elsewhere: list[str] = []
 
     def loaded(place: str) -> np.ndarray:
-        with _reading("a MATLAB file"), h5py.File(path) as file:
+        with _one_line_errors("a MATLAB file"), h5py.File(path) as file:
             return np.asarray(file[place])
 
     def add(name: str, item: Any) -> None:
@@ -671,7 +678,7 @@ def _hdf5(path: Path) -> dict[str | int, Any]:
         elif item.attrs.get("MATLAB_class") == b"char":
             return
         elif item.dtype.kind in "biuf":
-            _add_lazily(columns, name, item.shape, lambda place=item.name: loaded(place))
+            _add_vectors(columns, name, item.shape, lambda place=item.name: loaded(place))
         elif h5py.check_ref_dtype(item.dtype) is not None:
             # cells, and structures of several entries
             if item.size > _MOST_COLUMNS or place in seen:
@@ -690,15 +697,15 @@ def _hdf5(path: Path) -> dict[str | int, Any]:
             elif (item := group.get(key)) is not None:
                 add(f"{prefix}{key}", item)
 
-    with _reading("a MATLAB file"), h5py.File(path) as file:
+    with _one_line_errors("a MATLAB file"), h5py.File(path) as file:
         seen.add(h5py.h5o.get_info(file.id).addr)
         add_all(file, "")
     if elsewhere:
         columns.notes.append(f"Not read, as the data are in other files: {', '.join(elsewhere[:20])}.")
-    return _some(columns)
+    return _require_columns(columns)
 
 
-def _some(columns: _Some) -> _Some:
+def _require_columns(columns: _ColumnsType) -> _ColumnsType:
     if not columns:
         raise InputError("holds no vectors of numbers; a log needs them")
     return columns

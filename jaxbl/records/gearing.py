@@ -6,10 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import lost_motion
-from .least_squares import jackknifed
+from .least_squares import fit_with_jackknife
 from .lost_motion import LostMotion
-from .rigid_body import direction_of
-from .signal_quality import SHORTEST, ChannelFigures, bandwidth, interpolated, longest, low_passed, without_ends
+from .rigid_body import smooth_sign
+from .signal_quality import (
+    MIN_SAMPLES,
+    ChannelStatistics,
+    find_bandwidth,
+    interpolate_spline,
+    longest_segment,
+    low_pass,
+    trim_filter_ends,
+)
 
 HARMONICS = 8
 """Terms of the cosine series over position: eccentricity and the first harmonics of gear and encoder errors."""
@@ -94,15 +102,15 @@ def fit_gearing(
     Lost motion is found with the ratio that is `expected`, if one is. Gear and encoders repeat after a `turn` of the load;
     None on a linear axis.
     """
-    part = longest(segments)
-    width = _width(load[part], period)
-    usable = [s for s in segments if s.stop - s.start >= SHORTEST]
+    part = longest_segment(segments)
+    width = _velocity_bandwidth(load[part], period)
+    usable = [s for s in segments if s.stop - s.start >= MIN_SAMPLES]
     fit = _fit_with_skew(times, motor, load, usable, period, width) if width and usable else None
     if fit is None:
         return None
     target, rows, found, errors, skew, known = fit
     # the ratio is that of the whole motion, whatever repeats within it
-    slopes, slope_errors = _fitted(target, rows[:, :4])
+    slopes, slope_errors = _fit_terms(target, rows[:, :4])
     if not np.isfinite(slopes).all():
         return None
     left, slope = target - rows[:, :4] @ slopes, float(slopes[0])
@@ -114,14 +122,14 @@ def fit_gearing(
     # only a significant skew is undone
     undone = skew if known and abs(skew) > 4.0 * errors[1] / abs(found[0]) else 0.0
     ratio = slope if expected is None else expected
-    aligned = [interpolated(times[s], load[s], times[s] + undone) if undone else load[s] for s in usable]
+    aligned = [interpolate_spline(times[s], load[s], times[s] + undone) if undone else load[s] for s in usable]
     motor_there, load_there = np.concatenate([motor[s] for s in usable]), np.concatenate(aligned)
     twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, slope))
     motion = float(np.ptp(motor_there))
     wide = min(twist, least) > WIDE_TWIST * motion
     # a load that sticks and slips, or a coarse encoder, shows its direction no sooner than the motor does
-    slow = min(width, _width(motor[part], period) or width)
-    lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
+    slow = min(width, _velocity_bandwidth(motor[part], period) or width)
+    lost = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
     if lost is None:
         # no flank is in contact for long: from the rough regression
         lost = LostMotion.from_motion(2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2]))
@@ -146,11 +154,11 @@ def fit_gearing(
 def _fit_with_skew(
     times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, width: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
-    """Repeats :func:`_gear_fit` until the skew of the load stays; its results, the skew, and whether there is one."""
+    """Repeats :func:`_regress_motor` until the skew of the load stays; its results, the skew, and whether there is one."""
     skew, known, fit = 0.0, True, None
     # converges quadratically: five steps are ample
     for _ in range(5):
-        fit = _gear_fit(times, motor, load, segments, period, 4.0 * width, skew)
+        fit = _regress_motor(times, motor, load, segments, period, 4.0 * width, skew)
         if fit is None:
             return None
         step = float(fit[2][1] / fit[2][0])
@@ -192,16 +200,16 @@ def fit_drift(
 
     Arguments as of :func:`fit_gearing`.
     """
-    width = _width(load[longest(segments)], period)
-    usable = [s for s in segments if s.stop - s.start >= SHORTEST]
+    width = _velocity_bandwidth(load[longest_segment(segments)], period)
+    usable = [s for s in segments if s.stop - s.start >= MIN_SAMPLES]
     if not width or not usable:
         return None
-    constant = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew)
+    constant = _regress_motor(times, motor, load, usable, period, 4.0 * width, skew)
     drift, fit, error = 0.0, None, np.inf
     half = 0.5 * float(times[-1] - times[0])
     # converges quadratically, as the skew does
     for _ in range(6):
-        fit = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew, drift)
+        fit = _regress_motor(times, motor, load, usable, period, 4.0 * width, skew, drift)
         if fit is None or constant is None:
             return None
         values, errors = fit[2], fit[3]
@@ -212,14 +220,14 @@ def fit_drift(
         if abs(steps[0]) + abs(steps[1]) * half < 1e-3 * period:
             break
     assert fit is not None and constant is not None
-    gains = np.log(_held_out(*constant[:2]) / _held_out(fit[0], fit[1]))
+    gains = np.log(_held_out_errors(*constant[:2]) / _held_out_errors(fit[0], fit[1]))
     better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
     if not better or abs(drift) < 6.0 * error or abs(drift) * half < 0.05 * period:
         return None
     return Drift(drift, error, skew, abs(drift) * half)
 
 
-def _held_out(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Mean square error on each block of a regression on the others, shape (blocks,)."""
     scaled, found = rows / (np.abs(rows).max(axis=0) + 1e-300), []
     blocks = np.array_split(np.arange(len(target)), _FOLDS)
@@ -230,26 +238,26 @@ def _held_out(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _width(positions: np.ndarray, period: float) -> float:
+def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
     """Bandwidth of the velocity, Hz; of motion that is slower than a spectrum shows, a few times one over its duration."""
-    width = bandwidth(positions, period, slope=True)
+    width = find_bandwidth(positions, period, slope=True)
     slow = 10.0 / (len(positions) * period)
-    if width or len(positions) < SHORTEST:
+    if width or len(positions) < MIN_SAMPLES:
         return width
-    fast = positions - low_passed(positions, 4.0 * slow, period)
+    fast = positions - low_pass(positions, 4.0 * slow, period)
     return slow if np.std(fast) < 0.03 * np.ptp(positions) else 0.0
 
 
-def _fitted(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`jackknifed`; without the velocity, in column 1, where it is nothing but the flank."""
-    found, errors = jackknifed(target, rows)
+def _fit_terms(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`fit_with_jackknife`; without the velocity, in column 1, where it is nothing but the flank."""
+    found, errors = fit_with_jackknife(target, rows)
     if np.isfinite(found).all():
         return found, errors
-    found, errors = jackknifed(target, np.delete(rows, 1, axis=1))
+    found, errors = fit_with_jackknife(target, np.delete(rows, 1, axis=1))
     return np.insert(found, 1, 0.0), np.insert(errors, 1, np.inf)
 
 
-def _lost_motion(
+def _fit_lost_motion(
     times: np.ndarray,
     motor: np.ndarray,
     aligned: list[np.ndarray],
@@ -270,9 +278,9 @@ def _lost_motion(
 
     parts = []
     for s, load in zip(segments, aligned, strict=True):
-        smooth = low_passed(load, cutoff, period)
+        smooth = low_pass(load, cutoff, period)
         velocity = np.gradient(smooth, period)
-        cut = without_ends(len(smooth), cutoff, period)
+        cut = trim_filter_ends(len(smooth), cutoff, period)
         parts.append(
             np.stack([times[s], motor[s] - ratio * load, smooth, velocity, np.gradient(velocity, period)], axis=1)[cut]
         )
@@ -291,7 +299,7 @@ def _lost_motion(
     guard = round(0.5 / (cutoff * period))
     best = None
     for angle in _MIXTURES:
-        flank = _mixture(angle, velocity, acceleration, sizes)
+        flank = _flank_signal(angle, velocity, acceleration, sizes)
         clear = np.abs(flank) > 0.3
         if clear.sum() < 0.25 * len(clear):
             continue
@@ -307,23 +315,23 @@ def _lost_motion(
         if best is None or size < best[0]:
             best = (size, flank, clear)
     if best is None:
-        return None if wide else lost_motion.by_load(time, twist, position, velocity, turn)
+        return None if wide else lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn)
     _, flank, clear = best
-    found = lost_motion.by_motion(twist, terms, flank, clear)
+    found = lost_motion.fit_lost_motion_by_direction(twist, terms, flank, clear)
     if wide:
         # a shaft winds up as its load is moved: part of this shift, and in so few cycles it is unknown how much
-        alone = lost_motion.by_motion(twist, terms[:, :1], flank, clear)
+        alone = lost_motion.fit_lost_motion_by_direction(twist, terms[:, :1], flank, clear)
         return found.between(alone) if found and alone else found
     if found is None or found.lost_motion_error > 0.25 * abs(found.lost_motion):
         # at one speed, delays and wind-up look like lost motion: take a delay to be no more than a period
         delay = ratio * period * _rms(velocity)
-        still = lost_motion.by_motion(twist, np.delete(terms, 1, axis=1), flank, clear, beside=delay)
+        still = lost_motion.fit_lost_motion_by_direction(twist, np.delete(terms, 1, axis=1), flank, clear, beside=delay)
         if still is not None and (found is None or still.lost_motion_error < 0.5 * found.lost_motion_error):
             found = still
     if found is not None and found.twist_residual < 0.25 * abs(found.lost_motion):
         return found
     # two flanks by the direction of motion explain little: the load may change them
-    return lost_motion.by_load(time, twist, position, velocity, turn) or found
+    return lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn) or found
 
 
 def _rms(values: np.ndarray) -> float:
@@ -331,18 +339,18 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) + 1e-300
 
 
-def _mixture(angle: float, velocity: np.ndarray, acceleration: np.ndarray, sizes: tuple[float, float]) -> np.ndarray:
+def _flank_signal(angle: float, velocity: np.ndarray, acceleration: np.ndarray, sizes: tuple[float, float]) -> np.ndarray:
     """One of :data:`_MIXTURES`, by the rms of both."""
     return np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
 
 
-def twist_noise(ratio: float, motor: ChannelFigures, load: ChannelFigures) -> float:
+def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics) -> float:
     """Noise and resolution of both encoders together, rms, at the motor, in their unit."""
     noise = [motor.noise, ratio * load.noise, motor.resolution / 12.0**0.5, ratio * load.resolution / 12.0**0.5]
     return float(np.hypot.reduce(noise))
 
 
-def _gear_fit(
+def _regress_motor(
     times: np.ndarray,
     motor: np.ndarray,
     load: np.ndarray,
@@ -361,11 +369,11 @@ def _gear_fit(
     parts, smooth_motor = [], []
     for s in segments:
         late = skew + (drift or 0.0) * (times[s] - middle)
-        smooth = low_passed(interpolated(times[s], load[s], times[s] + late), cutoff, period)
+        smooth = low_pass(interpolate_spline(times[s], load[s], times[s] + late), cutoff, period)
         velocity = np.gradient(smooth, times[s])
         parts.append(np.stack([smooth, velocity, np.gradient(velocity, times[s])]))
-        smooth_motor.append(low_passed(motor[s], cutoff, period))
-    inner = [without_ends(len(signal), cutoff, period) for signal in smooth_motor]
+        smooth_motor.append(low_pass(motor[s], cutoff, period))
+    inner = [trim_filter_ends(len(signal), cutoff, period) for signal in smooth_motor]
 
     def joined(signals: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([signal[..., cut] for signal, cut in zip(signals, inner, strict=True)], axis=-1)
@@ -381,13 +389,13 @@ def _gear_fit(
     )
     best = None
     for angle in _MIXTURES:
-        mixed = [_mixture(angle, velocity, acceleration, sizes) for _, velocity, acceleration in parts]
+        mixed = [_flank_signal(angle, velocity, acceleration, sizes) for _, velocity, acceleration in parts]
         # between the flanks the twist is anywhere in the gap
         clear = np.abs(joined(mixed)) > 0.3
         few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
         if len(few) < 3 * rows.shape[1] or clear.sum() < 0.25 * len(clear):
             continue
-        flank = rows[:, 2] = joined([low_passed(direction_of(m), cutoff, period) for m in mixed])
+        flank = rows[:, 2] = joined([low_pass(smooth_sign(m), cutoff, period) for m in mixed])
         scaled = rows[few] / (np.abs(rows[few]).max(axis=0) + 1e-300)
         fitted = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[few], rcond=1e-12)[0]
         size = float(np.mean((target[few] - scaled @ fitted) ** 2))
@@ -400,7 +408,7 @@ def _gear_fit(
         about = np.concatenate([times[s][cut] for s, cut in zip(segments, inner, strict=True)]) - middle
         rows = np.column_stack([rows, velocity * about])
     rows, target = rows[best[2]], target[best[2]]
-    found, errors = _fitted(target, rows)
+    found, errors = _fit_terms(target, rows)
     if not np.isfinite(found).all() or found[0] == 0.0:
         return None
     return target, rows, found, errors

@@ -11,9 +11,9 @@ import numpy as np
 from .alignment import NominalDrive
 from .element import Element, fit_element
 from .gearing import Gearing, twist_noise
-from .least_squares import jackknifed
+from .least_squares import fit_with_jackknife
 from .reader import Record, read_log_table, read_record
-from .signal_quality import low_passed
+from .signal_quality import low_pass
 from .table import POSITION_CHANNELS, LogTable
 
 
@@ -58,13 +58,13 @@ class Inspection:
         channel = record.findings.channels[POSITION_CHANNELS[side]]
         turning = channel.unit == "rad"
         if self.log.kind == "element":
-            moved, torque = np.ptp(displacement(record, self.gear_ratio)), record.torque
+            moved, torque = np.ptp(element_displacement(record, self.gear_ratio)), record.torque
             assert torque is not None
             return (
                 f"As read: displacement over {moved:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
                 f"{record.findings.channels['u'].unit}. If the rig is another, see the units in [log]."
             )
-        fastest = float(np.quantile(np.abs(velocity(record)), 0.999))
+        fastest = float(np.quantile(np.abs(compute_velocity(record)), 0.999))
         sizes = [f"{side} up to " + (f"{fastest * 30.0 / math.pi:.3g} rpm" if turning else f"{fastest:.3g} m/s")]
         if record.torque is not None and np.ptp(record.torque):
             sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.findings.channels['u'].unit}")
@@ -118,32 +118,34 @@ def inspect(
     record = read_record(path, table, gear_ratio=gear_ratio, nominal=nominal)
     if table.kind == "element":
         ratio = None if len(record.positions) < 2 else gear_ratio or 1.0
-        element = element_of(record, ratio)
-        return Inspection(record, table, ratio, 0 if element is None else element.reversals, _of_element(element), element)
+        element = fit_record_element(record, ratio)
+        return Inspection(
+            record, table, ratio, 0 if element is None else element.reversals, _judge_element(element), element
+        )
     gearing = record.findings.gearing
     ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
     if len(record.positions) < 2:
         ratio = None
-    speed = velocity(record)
-    reversals = _reversals(record, speed)
-    rigid = _of_inertia_and_friction(record, speed, reversals)
+    speed = compute_velocity(record)
+    reversals = _count_reversals(record, speed)
+    rigid = _judge_rigid_drive(record, speed, reversals)
     if gearing is not None and gearing.wide:
-        rigid = [_beside_a_gap(judgement) for judgement in rigid]
-    found = [*rigid, *_of_transmission(record, speed, reversals, ratio)]
+        rigid = [_weaken_for_loose_load(judgement) for judgement in rigid]
+    found = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
     return Inspection(record, table, ratio, reversals, tuple(found))
 
 
-def displacement(record: Record, gear_ratio: float | None) -> np.ndarray:
+def element_displacement(record: Record, gear_ratio: float | None) -> np.ndarray:
     """Of an element: of one side, against `gear_ratio` times the other's if it was recorded; rad (m), shape (samples,)."""
     motor, load = record.positions["motor"], record.positions.get("load")
     return motor if load is None else motor - (gear_ratio or 1.0) * load
 
 
-def element_of(record: Record, gear_ratio: float | None) -> Element | None:
+def fit_record_element(record: Record, gear_ratio: float | None) -> Element | None:
     """What a log says of a transmission on a test rig; None where it shows nothing."""
     assert record.torque is not None
     channel = record.findings.channels["theta_e"]
-    moved, noise = displacement(record, gear_ratio), element_noise(record, gear_ratio)
+    moved, noise = element_displacement(record, gear_ratio), element_noise(record, gear_ratio)
     return fit_element(moved, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m")
 
 
@@ -155,19 +157,19 @@ def element_noise(record: Record, gear_ratio: float | None) -> float:
     return float(np.hypot.reduce([one for part in parts for one in part]))
 
 
-_WORDS = {
+_ELEMENT_NUMBERS = {
     "stiffness": "stiffness", "gap": "half_gap", "damping": "damping", "dry friction": "dry_friction",
     "hysteresis": "hysteresis", "friction under load": "friction_coefficient",
 }  # fmt: skip
 """Quantity of an element -> its number."""
 
 
-def _of_element(found: Element | None) -> tuple[Judgement, ...]:
+def _judge_element(found: Element | None) -> tuple[Judgement, ...]:
     if found is None:
         why = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
-        return tuple(Judgement(quantity, "no", why) for quantity in _WORDS)
+        return tuple(Judgement(quantity, "no", why) for quantity in _ELEMENT_NUMBERS)
     judgements = []
-    for quantity, key in _WORDS.items():
+    for quantity, key in _ELEMENT_NUMBERS.items():
         number = found.numbers.get(key)
         if number is None:
             judgements.append(Judgement(quantity, "no", "does not make the torque any better on parts of the log left out"))
@@ -184,44 +186,44 @@ def main_side(record: Record) -> str:
     return "motor" if "motor" in record.positions else "load"
 
 
-def velocity(record: Record, side: str | None = None) -> np.ndarray:
+def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,); by default of the main side."""
     side = side or main_side(record)
     width = record.findings.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
         position = record.positions[side][s]
-        smooth = low_passed(position, 4.0 * width, record.sample_period) if width else position
+        smooth = low_pass(position, 4.0 * width, record.sample_period) if width else position
         speed[s] = np.gradient(smooth, record.sample_period)
     return speed
 
 
-def _moving(speed: np.ndarray) -> np.ndarray:
+def _is_moving(speed: np.ndarray) -> np.ndarray:
     return np.abs(speed) > 0.1 * np.sqrt(np.mean(speed**2))
 
 
-def _reversals(record: Record, speed: np.ndarray) -> int:
-    moving = _moving(speed)
+def _count_reversals(record: Record, speed: np.ndarray) -> int:
+    moving = _is_moving(speed)
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
 
-def _same(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Judgement]:
+def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Judgement]:
     return [Judgement(quantity, answer, why) for quantity in quantities]
 
 
-def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) -> list[Judgement]:
+def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> list[Judgement]:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
     torque, found = record.torque, record.findings.dynamics
     if torque is None:
-        return _same(names, "no", "no torque was recorded: the log shows kinematics only")
+        return _judge_alike(names, "no", "no torque was recorded: the log shows kinematics only")
     if np.ptp(torque) == 0.0:
         why = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
-        return _same(names, "weak", why)
+        return _judge_alike(names, "weak", why)
     if found is None:
-        return _same(names, "no", "the motion does not exceed the noise")
-    moving = np.abs(speed[_moving(speed)])
+        return _judge_alike(names, "no", "the motion does not exceed the noise")
+    moving = np.abs(speed[_is_moving(speed)])
     slow, fast = np.quantile(moving, [0.05, 0.95])
-    both = min((speed[_moving(speed)] > 0).mean(), (speed[_moving(speed)] < 0).mean())
+    both = min((speed[_is_moving(speed)] > 0).mean(), (speed[_is_moving(speed)] < 0).mean())
     width = record.findings.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
     percent = [f"{100 * share:.0f} % of the torque" for share in found.shares]
     spread = [abs(error / value) if value else math.inf for value, error in zip(found.values, found.errors, strict=True)]
@@ -241,11 +243,11 @@ def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) 
     alone = "motion in one direction only: hard to separate from"
     if fast < 1.5 * slow:
         why = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
-        result += _same(names[1:3], "weak", why)
+        result += _judge_alike(names[1:3], "weak", why)
     else:
         result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
         if both < 0.05:
-            result += _same(["Coulomb friction"], "weak", f"{alone} a constant torque")
+            result += _judge_alike(["Coulomb friction"], "weak", f"{alone} a constant torque")
         else:
             result.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
     if both < 0.05:
@@ -254,7 +256,7 @@ def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) 
     return [*result, Judgement("constant torque", "yes", why)]
 
 
-def _beside_a_gap(judgement: Judgement) -> Judgement:
+def _weaken_for_loose_load(judgement: Judgement) -> Judgement:
     """A fit of one rigid body says little of a motor whose load follows only loosely."""
     if judgement.answer == "no" or judgement.quantity == "constant torque":
         return judgement
@@ -262,7 +264,7 @@ def _beside_a_gap(judgement: Judgement) -> Judgement:
     return replace(judgement, answer="weak", why=why)
 
 
-def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Judgement]:
+def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Judgement]:
     names = ("gear ratio", "lost motion", "stiffness")
     gearing, channels = record.findings.gearing, record.findings.channels
     if len(record.positions) < 2:
@@ -270,10 +272,10 @@ def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: f
         why = f"there is no {missing} encoder: the transmission in between is not observed"
         if missing == "load" and record.torque is not None and reversals >= 2:
             tried = "from the motor's encoder alone: jaxbl identify with a model of two inertias tries"
-            return [Judgement(names[0], "no", why), *_same(names[1:], "weak", f"{tried}, and says if it cannot")]
-        return _same(names, "no", why)
+            return [Judgement(names[0], "no", why), *_judge_alike(names[1:], "weak", f"{tried}, and says if it cannot")]
+        return _judge_alike(names, "no", why)
     if gearing is None or ratio is None:
-        return _same(names, "no", "the motion does not exceed the noise")
+        return _judge_alike(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
     left = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
     if gearing.wide:
@@ -282,12 +284,12 @@ def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: f
     answer = "yes" if gearing.residual < 0.05 and not gearing.wide else "weak"
     return [
         Judgement("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}"),
-        _lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
-        _stiffness(record, speed, ratio, noise),
+        _judge_lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
+        _judge_stiffness(record, speed, ratio, noise),
     ]
 
 
-def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
+def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
     size = gearing.lost_motion_text(unit)
     answer, why = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
@@ -301,7 +303,7 @@ def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> J
     return Judgement("lost motion", answer, why)
 
 
-def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:
+def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:
     """From twist over torque within one direction of motion; `noise` is the twist's, rms."""
     torque = record.transmitted
     if torque is None:
@@ -315,10 +317,10 @@ def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) ->
     targets, rows = [], []
     for s in record.segments:
         signals = np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1)
-        smooth = low_passed(signals, 4.0 * width, record.sample_period)
+        smooth = low_pass(signals, 4.0 * width, record.sample_period)
         targets.append(smooth[:, 0])
         rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
-    found, errors = jackknifed(np.concatenate(targets), np.concatenate(rows))
+    found, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
     if not np.isfinite(found[0]):
         return Judgement("stiffness", "weak", "the log is too short to see how the twist follows the torque")
     reach = abs(float(found[0])) * float(np.std(torque))

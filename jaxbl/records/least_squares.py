@@ -6,7 +6,7 @@ BLOCKS = 12
 """Parts of a log that are left out in turn: enough for a standard error within 20 %, and each long against correlations."""
 
 
-def jackknifed(target: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of regressors, shape (samples, terms), and their standard errors (delete-a-block jackknife).
 
     The errors hold for residuals of any correlation in time; both are nan where undetermined.

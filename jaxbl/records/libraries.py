@@ -47,7 +47,7 @@ class Column:
         return np.asarray(self.load(), dtype=dtype)
 
 
-def _library(name: str, kind: str, package: str = "") -> Any:
+def _import_library(name: str, kind: str, package: str = "") -> Any:
     try:
         return import_module(name)
     except ImportError:
@@ -56,7 +56,7 @@ def _library(name: str, kind: str, package: str = "") -> Any:
 
 def read_tdms(path: Path) -> dict[str | int, Any]:
     """Channels of a TDMS file by name, by `group/channel` where a name occurs twice; `t` from their increment, s."""
-    library = _library("nptdms", "TDMS")
+    library = _import_library("nptdms", "TDMS")
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
     names = [channel.name for channel in channels]
 
@@ -80,7 +80,7 @@ def read_mdf(path: Path) -> dict[str | int, Any]:
 
     Channels of other groups, with times of their own, are interpolated to these.
     """
-    file = _library("asammdf", "MDF").MDF(path)
+    file = _import_library("asammdf", "MDF").MDF(path)
     groups = range(len(file.groups))
     longest = max(groups, key=lambda i: file.groups[i].channel_group.cycles_nr)
     times = np.asarray(file.get_master(longest))
@@ -98,11 +98,11 @@ def read_mdf(path: Path) -> dict[str | int, Any]:
     return found
 
 
-_LONGEST = 64
+_MAX_LIST_LENGTH = 64
 """Entries of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
 
 
-class _Source(NamedTuple):
+class _Recording(NamedTuple):
     """Messages of a recording.
 
     Attributes:
@@ -116,7 +116,7 @@ class _Source(NamedTuple):
 
 def read_mcap(path: Path, wanted: Collection[str | int] = ()) -> Columns:
     """As :func:`read_bag`, of an MCAP file whose messages are JSON or ROS 2's."""
-    library = _library("mcap.reader", "MCAP", "mcap")
+    library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
         summary = library.make_reader(file).get_summary()
     if summary is None or summary.statistics is None:
@@ -137,18 +137,18 @@ def read_mcap(path: Path, wanted: Collection[str | int] = ()) -> Columns:
                     yield channel.topic, message.log_time, json.loads(message.data)
                 else:
                     if schema.id not in types:
-                        types[schema.id] = _ros_types(schema)
+                        types[schema.id] = _message_types(schema)
                     yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
-    found = _columns_of(_Source(counts, messages), wanted)
+    found = _recording_columns(_Recording(counts, messages), wanted)
     if other:
         found.notes.append(f"Messages that are neither JSON nor ROS 2's are not read: {', '.join(sorted(other))}.")
     return found
 
 
-def _ros_types(schema: Any) -> Any:
+def _message_types(schema: Any) -> Any:
     """What decodes messages of a schema that a file holds."""
-    library = _library("rosbags.typesys", "MCAP with messages of ROS 2", "rosbags")
+    library = _import_library("rosbags.typesys", "MCAP with messages of ROS 2", "rosbags")
     store = library.get_typestore(library.Stores.EMPTY)
     text = schema.data.decode()
     store.register(
@@ -163,7 +163,7 @@ def read_bag(path: Path, wanted: Collection[str | int] = ()) -> Columns:
     These are the stamps of the messages' headers where they have them, else the times of recording. Of topics that hold
     `wanted` columns the one with the most messages gives the times; others are interpolated to them.
     """
-    library = _library("rosbags.highlevel", "a ROS bag", "rosbags")
+    library = _import_library("rosbags.highlevel", "a ROS bag", "rosbags")
     with library.AnyReader([path]) as reader:
         counts: dict[str, int] = {}
         for one in reader.connections:
@@ -175,16 +175,16 @@ def read_bag(path: Path, wanted: Collection[str | int] = ()) -> Columns:
             for connection, time, data in reader.messages(connections=asked):
                 yield connection.topic, time, reader.deserialize(data, connection.msgtype)
 
-    return _columns_of(_Source(counts, messages), wanted)
+    return _recording_columns(_Recording(counts, messages), wanted)
 
 
-def _columns_of(source: _Source, wanted: Collection[str | int]) -> Columns:
+def _recording_columns(source: _Recording, wanted: Collection[str | int]) -> Columns:
     """Columns of a recording, loaded as they are asked for: all that are wanted of a topic at once."""
     fields: dict[str, dict[str, list[str | int]]] = {}
     for topic, count in source.counts.items():
         first = next(source.messages([topic]), None) if count else None
         if first is not None:
-            fields[topic] = dict(_numbers_in(first[2], []))
+            fields[topic] = dict(_find_numbers(first[2], []))
     places = {f"{topic}.{name}": (topic, name) for topic, names in fields.items() for name in names}
     if not places:
         raise InputError("holds no messages with numbers; a log needs them")
@@ -200,9 +200,9 @@ def _columns_of(source: _Source, wanted: Collection[str | int]) -> Columns:
             paths = [fields[topic][places[one][1]] for one in names]
             stamps, recorded, rows = array("q"), array("q"), array("d")
             for _, time, message in source.messages([topic]):
-                stamps.append(_stamp(message))
+                stamps.append(_header_time(message))
                 recorded.append(time)
-                rows.extend(float(_at(message, path)) for path in paths)
+                rows.extend(float(_number_at(message, path)) for path in paths)
             # a clock may begin at 0; headers that are not filled in are all 0
             filled = len(stamps) > 1 and all(stamps[1:])
             times[topic] = np.frombuffer(stamps if filled else recorded, dtype=np.int64)
@@ -230,21 +230,21 @@ def _columns_of(source: _Source, wanted: Collection[str | int]) -> Columns:
     return found
 
 
-def _numbers_in(message: Any, path: list[str | int]) -> Iterator[tuple[str, list[str | int]]]:
+def _find_numbers(message: Any, path: list[str | int]) -> Iterator[tuple[str, list[str | int]]]:
     """Names of all numbers in a message, as `pose.position.x` or `position[0]`, and the way to each."""
     if isinstance(message, bool | int | float | np.number):
         yield "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in path).lstrip("."), path
     elif isinstance(message, list | tuple | np.ndarray):
-        for i in range(len(message) if len(message) <= _LONGEST else 0):
-            yield from _numbers_in(message[i], [*path, i])
+        for i in range(len(message) if len(message) <= _MAX_LIST_LENGTH else 0):
+            yield from _find_numbers(message[i], [*path, i])
     elif not isinstance(message, str | bytes) and message is not None:
         fields = message if isinstance(message, dict) else vars(message)
         for name in fields:
             if not name.startswith("__"):
-                yield from _numbers_in(fields[name], [*path, name])
+                yield from _find_numbers(fields[name], [*path, name])
 
 
-def _at(message: Any, path: list[str | int]) -> Any:
+def _number_at(message: Any, path: list[str | int]) -> Any:
     """A number in a message; nan where it has none."""
     try:
         for one in path:
@@ -254,8 +254,8 @@ def _at(message: Any, path: list[str | int]) -> Any:
     return message
 
 
-def _stamp(message: Any) -> int:
+def _header_time(message: Any) -> int:
     """Time in the header of a message, ns; 0 where it has none."""
-    seconds = _at(message, ["header", "stamp", "sec"])
-    rest = _at(message, ["header", "stamp", "nanosec"])
+    seconds = _number_at(message, ["header", "stamp", "sec"])
+    rest = _number_at(message, ["header", "stamp", "nanosec"])
     return 0 if np.isnan(seconds) else int(seconds) * 1_000_000_000 + (0 if np.isnan(rest) else int(rest))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 
-def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float]) -> np.ndarray:
+def filter_forwards(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float]) -> np.ndarray:
     """Values behind y_k = b_0 x_k + b_1 x_{k-1} + ... - a_1 y_{k-1} - a_2 y_{k-2} - ..., as if the first value had always
     been there.
 
@@ -38,8 +38,8 @@ def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequen
     return np.stack(solved, axis=1).reshape(driven.shape) + steady
 
 
-def butterworth(cutoff: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Low-pass of second order for :func:`filtered`; cutoff in half sampling rates."""
+def butterworth_coefficients(cutoff: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Low-pass of second order for :func:`filter_forwards`; cutoff in half sampling rates."""
     warped = np.tan(0.5 * np.pi * cutoff)
     whole = 1.0 + np.sqrt(2.0) * warped + warped**2
     first = float(warped**2 / whole)
@@ -49,17 +49,19 @@ def butterworth(cutoff: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     )
 
 
-def both_ways(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float], beyond: int) -> np.ndarray:
+def filter_both_ways(
+    values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float], beyond: int
+) -> np.ndarray:
     """Values behind a filter forwards and then backwards, without delay; before either end they go on for so many samples as
     their own image, turned about the end."""
     ends = 2.0 * values[0] - values[beyond:0:-1], 2.0 * values[-1] - values[-2 : -beyond - 2 : -1]
     longer = np.concatenate([ends[0], values, ends[1]]) if beyond else values
-    there = filtered(longer, numerator, denominator)
-    back = filtered(there[::-1], numerator, denominator)[::-1]
+    there = filter_forwards(longer, numerator, denominator)
+    back = filter_forwards(there[::-1], numerator, denominator)[::-1]
     return back[beyond : len(back) - beyond]
 
 
-def welch(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+def welch_spectrum(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (cycles a sample) and one-sided power spectral density of values: mean over pieces of a length that
     overlap by half, each without its mean and under a Hann window."""
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
@@ -71,7 +73,7 @@ def welch(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     return np.fft.rfftfreq(length), density
 
 
-def slopes(values: np.ndarray, half: int) -> np.ndarray:
+def savitzky_golay_slopes(values: np.ndarray, half: int) -> np.ndarray:
     """Slope, a sample, of the cubic that fits best the values up to so many samples to each side of each one, shape
     (samples,); those nearer to an end than that are wrong."""
     at = np.arange(-half, half + 1)
@@ -89,7 +91,7 @@ def low_pass_taps(count: int, cutoff: float) -> np.ndarray:
     return taps / np.sum(taps)
 
 
-def parzen(lags: int) -> np.ndarray:
+def parzen_window(lags: int) -> np.ndarray:
     """Parzen's window from lag 0 on, over so many lags: its spectrum is positive."""
     at = np.arange(lags)
     along = at / (lags - 0.5)

@@ -19,10 +19,10 @@ import numpy as np
 from jaxbl.errors import InputError, shorten
 from jaxbl.validation import check_file, explain_missing_file
 
-from .channels import in_si, signed
-from .files import LogFile, TextForm, log_endings, text_form
+from .channels import to_si, to_signed
+from .files import LogFile, TextFormat, detect_text_format, log_suffixes
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
-from .time_stamps import GAP, ONE
+from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 LOST, GAPS, RESTARTS = "lost samples interpolated", "gaps in time", "restarts of the clock"
@@ -83,7 +83,7 @@ class Source(Protocol):
         ...
 
 
-def needed(table: LogTable) -> list[str | int]:
+def stream_columns(table: LogTable) -> list[str | int]:
     """Columns that are read from a stream, in the order of rows without a header: time, input, motor and load position,
     then those to be subtracted and those of `where`."""
     time = table.t or TimeTable()
@@ -95,14 +95,14 @@ def needed(table: LogTable) -> list[str | int]:
     return list(dict.fromkeys([*found, *(table.where or {})]))
 
 
-def _channel_of(table: LogTable) -> dict[str | int, str]:
+def _channel_keys(table: LogTable) -> dict[str | int, str]:
     """Column -> the key of `[log]` that can name another one."""
     ends = [table.position(name) for name in POSITION_CHANNELS.values()]
     pairs = [("t", table.t or TimeTable()), ("u", table.u or TorqueTable()), *ends]
     return {one.column_or(name): name for name, one in pairs}
 
 
-def check_live(table: LogTable, name: str) -> None:
+def check_stream_table(table: LogTable, name: str) -> None:
     """Refuse what a stream cannot have: it takes the whole log.
 
     Raises:
@@ -119,14 +119,14 @@ def check_live(table: LogTable, name: str) -> None:
         raise InputError(f"{name}: [log] {open_[0]} is for whole logs; leave it out for rows that arrive one by one")
 
 
-class _Channels:
+class _ChannelReader:
     """Columns become channels in SI units, row by row; remembers turns of wrapped positions, and integrals of speeds."""
 
     def __init__(self, table: LogTable, name: str, columns: Sequence[str | int]):
         self._table, self._count = table, len(columns)
         file = LogFile(Path(name), dict.fromkeys(columns, ()))
-        keys = _channel_of(table)
-        self._at = {one: list(columns).index(file.name(one, keys.get(one, ""))) for one in needed(table)}
+        keys = _channel_keys(table)
+        self._at = {one: list(columns).index(file.name(one, keys.get(one, ""))) for one in stream_columns(table)}
         self._before: dict[str, float] = {}
         self._row = 0
 
@@ -141,9 +141,9 @@ class _Channels:
             stamps = (self._row + np.arange(len(values))) * clock.period
             self._row += len(values)
         else:
-            stamps = values[:, self._at[clock.column_or("t")]] * ONE[clock.unit]
+            stamps = values[:, self._at[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
         torque_table = table.u or TorqueTable()
-        torque = in_si(torque_table, self._words(values, torque_table.column_or("u"), torque_table.signed_bits))
+        torque = to_si(torque_table, self._words(values, torque_table.column_or("u"), torque_table.signed_bits))
         raw, ends = {}, {}
         for side, name in POSITION_CHANNELS.items():
             channel, one = table.position(name)
@@ -160,13 +160,13 @@ class _Channels:
 
     def _words(self, values: np.ndarray, column: str | int, bits: int | None) -> np.ndarray:
         numbers = values[:, self._at[column]]
-        return numbers if bits is None else signed(numbers, bits)
+        return numbers if bits is None else to_signed(numbers, bits)
 
     def _position(self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):
             return values
         if isinstance(table, SpeedTable):
-            speed = in_si(table, values)
+            speed = to_si(table, values)
             speeds = np.append(self._before.get(f"{side} speed", float(speed[0])), speed)
             times = np.append(self._before.get(f"{side} time", float(stamps[0])), stamps)
             # over a gap, too, as if the speed had gone straight from one end to the other
@@ -177,7 +177,7 @@ class _Channels:
         if table.wrap is not None:
             values = np.unwrap(np.append(self._before.get(side, float(values[0])), values), period=table.wrap)[1:]
             self._before[side] = values[-1]
-        return in_si(table, values)
+        return to_si(table, values)
 
 
 class Stream:
@@ -195,7 +195,7 @@ class Stream:
     def __init__(self, source: Source, table: LogTable, period: float):
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
-        self._channels: _Channels | None = None
+        self._channels: _ChannelReader | None = None
         self._columns: list[str | int] = []
         self._last: tuple[float, float, dict[str, float]] | None = None
         self._first: list[float] = []
@@ -212,7 +212,7 @@ class Stream:
             return []
         columns, values = found
         if self._channels is None or list(columns) != self._columns:
-            self._channels, self._columns = _Channels(self._table, self.source.name, columns), list(columns)
+            self._channels, self._columns = _ChannelReader(self._table, self.source.name, columns), list(columns)
         stamps, torque, positions, unreadable = self._channels.take(values)
         self._count(UNREADABLE, unreadable)
         self._judge(stamps)
@@ -232,7 +232,7 @@ class Stream:
         self._judged, times = True, np.array(self._first)
         found = float(np.median(times[_APART:] - times[:-_APART])) / _APART
         if not math.isclose(found, self._period, rel_tol=_TOLERANCE):
-            raise wrong_period(self.source.name, found, self._period)
+            raise period_error(self.source.name, found, self._period)
         if np.mean(np.diff(times) == 0.0) > 0.5:
             raise InputError(
                 f"{self.source.name}: most stamps are that of the row before; they should be finer than the sampling "
@@ -260,10 +260,10 @@ class Stream:
         positions = {side: values[fit] for side, values in positions.items()}
         if not len(stamps):
             return []
-        starts = np.flatnonzero(np.diff(stamps) > GAP * self._period) + 1
+        starts = np.flatnonzero(np.diff(stamps) > GAP_PERIODS * self._period) + 1
         self._count(GAPS, len(starts))
         anew = self._last is None
-        if self._last is not None and stamps[0] - self._last[0] > GAP * self._period:
+        if self._last is not None and stamps[0] - self._last[0] > GAP_PERIODS * self._period:
             self._count(GAPS, 1)
             self._last, anew = None, True
         found = []
@@ -292,7 +292,7 @@ class Stream:
         return Rows(first, torque[own], {side: values[own] for side, values in positions.items()}, anew)
 
 
-def wrong_period(name: str, found: float, period: float) -> InputError:
+def period_error(name: str, found: float, period: float) -> InputError:
     """What to raise where samples come at another period (s) than the model's."""
     return InputError(
         f"{name}: samples are {1e3 * found:.6g} ms apart, [run] sample_period of the model is {1e3 * period:.6g} ms; they "
@@ -315,7 +315,7 @@ class FollowedFile:
             check_file(path)
             self._file = path.open("rb")
         except FileNotFoundError:
-            raise InputError(f"{path}: {explain_missing_file(path, log_endings())}") from None
+            raise InputError(f"{path}: {explain_missing_file(path, log_suffixes())}") from None
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         except OSError as error:
@@ -339,7 +339,7 @@ class FollowedFile:
             if len(said) < 2:
                 return None
             try:
-                self._form = text_form(said)
+                self._form = detect_text_format(said)
             except InputError as error:
                 raise InputError(f"{self.name}: {error}") from None
             self._header = said[0] if self._form.names is not None else ""
@@ -388,9 +388,9 @@ class Datagrams:
         self.fault = ""
         self._fields = list(fields)
         self._numbered = any(isinstance(one, int) for one in fields)
-        self._form: TextForm | None = None
+        self._form: TextFormat | None = None
         self._header = ""
-        host, port = _host(address)
+        host, port = _parse_address(address)
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
@@ -467,7 +467,7 @@ class Datagrams:
     def _begin(self, lines: list[str]) -> bool:
         """See from the first of some lines how rows of text are written; False where that is no row."""
         try:
-            form = text_form(lines)
+            form = detect_text_format(lines)
         except InputError as error:
             return self._unfit(str(error))
         if form.names is not None:
@@ -492,7 +492,7 @@ class Datagrams:
         self._socket.close()
 
 
-def _host(address: str) -> tuple[str, int]:
+def _parse_address(address: str) -> tuple[str, int]:
     wrong = InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
     try:
         parts = urlsplit(address)

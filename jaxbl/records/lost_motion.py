@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from .least_squares import BLOCKS, jackknifed
-from .signal_quality import SHORTEST
+from .least_squares import BLOCKS, fit_with_jackknife
+from .signal_quality import MIN_SAMPLES
 
 Flank = Literal["motion", "load"]
 
@@ -62,7 +62,7 @@ def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
 # by the direction of motion
 
 
-def by_motion(
+def fit_lost_motion_by_direction(
     twist: np.ndarray, rows: np.ndarray, flank: np.ndarray, clear: np.ndarray, *, beside: float = 0.0
 ) -> LostMotion | None:
     """From the twist theta_e - ratio theta_s on both flanks, wherever one of them is surely in contact.
@@ -72,10 +72,10 @@ def by_motion(
     """
     signs = np.sign(flank[clear])
     changes = int(np.count_nonzero(np.diff(signs)))
-    if changes < 2 or len(signs) < SHORTEST:
+    if changes < 2 or len(signs) < MIN_SAMPLES:
         return None
     terms = np.column_stack([0.5 * signs, rows[clear]])
-    found, errors = jackknifed(twist[clear], terms)
+    found, errors = fit_with_jackknife(twist[clear], terms)
     if not np.isfinite(found).all():
         return None
     value = float(found[0])
@@ -112,7 +112,7 @@ class _Cells:
         return values - (np.bincount(self.group, values) / np.maximum(np.bincount(self.group), 1))[self.group]
 
 
-def _cells(
+def _average_passes(
     times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
 ) -> _Cells | None:
     moving = np.abs(velocity) > 0.25 * np.sqrt(np.mean(velocity**2))
@@ -125,7 +125,7 @@ def _cells(
     place = np.clip(((position - low) / span - turns) * BINS, 0, BINS - 1).astype(int)
     forwards = velocity > 0.0
     at = np.flatnonzero(moving)
-    if len(at) < SHORTEST:
+    if len(at) < MIN_SAMPLES:
         return None
     # a long rest may hide a change of the load
     rests = np.diff(times[at]) > 0.02 * (times[at[-1]] - times[at[0]])
@@ -141,7 +141,7 @@ def _cells(
     return _Cells(mean[order], when[order], place[at][first], passing[first], 2 * place[at][first] + forwards[at][first])
 
 
-def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray | bool = True) -> tuple[float, np.ndarray]:
+def _shift_between_states(cells: _Cells, late: np.ndarray, kept: np.ndarray | bool = True) -> tuple[float, np.ndarray]:
     """Biweight location of the shifts of the places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: such places fall short, and count less.
@@ -170,7 +170,7 @@ def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray | bool = True) -> t
     return found, shifts
 
 
-def _states(cells: _Cells) -> np.ndarray | None:
+def _find_states(cells: _Cells) -> np.ndarray | None:
     """Which of two states each cell is in: the assignment that leaves least, with few changes."""
     count = len(cells.twist)
     plain = cells.centred(cells.twist)
@@ -186,7 +186,7 @@ def _states(cells: _Cells) -> np.ndarray | None:
     chosen = None
     for state in starts:
         for _ in range(12):
-            shift, _ = _shift(cells, state)
+            shift, _ = _shift_between_states(cells, state)
             if not math.isfinite(shift) or shift == 0.0:
                 break
             left = cells.centred(cells.twist - shift * state)
@@ -194,7 +194,7 @@ def _states(cells: _Cells) -> np.ndarray | None:
             if (again == state).all():
                 break
             state = again
-        shift, _ = _shift(cells, state)
+        shift, _ = _shift_between_states(cells, state)
         size = float(np.sum(cells.centred(cells.twist - shift * state) ** 2))
         if math.isfinite(shift) and (chosen is None or size < chosen[0]):
             chosen = (size, state)
@@ -219,20 +219,20 @@ def _viterbi(values: np.ndarray, shift: float, variance: float) -> np.ndarray:
     return state
 
 
-def by_load(
+def fit_lost_motion_by_load(
     times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
 ) -> LostMotion | None:
     """From what changes between passes over the same places in the same direction; None where nothing clearly does.
 
     Position and velocity are the load's; gear and encoders repeat after a `turn` of it, None on a linear axis.
     """
-    cells = _cells(times, twist, position, velocity, turn)
+    cells = _average_passes(times, twist, position, velocity, turn)
     if cells is None or len(cells.twist) < 24:
         return None
-    state = _states(cells)
+    state = _find_states(cells)
     if state is None or state.all() or not state.any():
         return None
-    value, shifts = _shift(cells, state)
+    value, shifts = _shift_between_states(cells, state)
     if not math.isfinite(value):
         return None
     left = cells.centred(cells.twist - value * state)
@@ -242,8 +242,10 @@ def by_load(
         return None
     passes = np.unique(cells.passing)
     groups = np.array_split(np.arange(BINS), BLOCKS)
-    without_passes = [_shift(cells, state, cells.passing != p)[0] for p in passes]
-    without_places = [_shift(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()]
+    without_passes = [_shift_between_states(cells, state, cells.passing != p)[0] for p in passes]
+    without_places = [
+        _shift_between_states(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()
+    ]
     variance = 0.0
     for without in (without_passes, without_places):
         finite = np.array([w for w in without if math.isfinite(w)])

@@ -12,14 +12,14 @@ from .files import LogFile
 from .gearing import UNRELATED, Gearing, twist_noise
 from .resampling import Grid
 from .rigid_body import RigidFit
-from .signal_quality import ChannelFigures, resolution
+from .signal_quality import ChannelStatistics, find_resolution
 from .table import POSITION_CHANNELS, LogTable
-from .time_stamps import Segments
+from .time_stamps import SegmentedStamps
 
 
 def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
     """Refuse a position that moves by three steps of its resolution or less."""
-    step = resolution(values)
+    step = find_resolution(values)
     if step and np.ptp(values) < 3.5 * step:
         raise file.wrong(
             f"{name} moves by only {round(np.ptp(values) / step)} steps of its resolution {step:.3g}; a log of a drive in "
@@ -36,17 +36,17 @@ def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
             raise file.wrong(f"{name} and {other} are the same in every row; each needs a column of its own")
 
 
-_STAND = 20
+_STANDSTILL_SAMPLES = 20
 """Equal readings in a row from which an encoder stands still: fewer are its resolution, or a reversal."""
 
 
-def note_standing(file: LogFile, segments: Segments, channels: Mapping[str, RawChannel]) -> None:
+def note_standing(file: LogFile, segments: SegmentedStamps, channels: Mapping[str, RawChannel]) -> None:
     """Remark on an encoder that stands exactly still while the other one moves by a fifth of its range."""
     for name, other in (("theta_e", "theta_s"), ("theta_s", "theta_e")):
         values, moving = channels[name].values, channels[other].values
         # what its resolution hides is no standing
-        hidden = 2.0 * resolution(values) * np.ptp(moving) / np.ptp(values)
-        stays = (stay for part in segments.parts for stay in _stays(values, part))
+        hidden = 2.0 * find_resolution(values) * np.ptp(moving) / np.ptp(values)
+        stays = (stay for part in segments.parts for stay in _find_standstills(values, part))
         stay = next((one for one in stays if np.ptp(moving[one]) > max(0.2 * np.ptp(moving), hidden)), None)
         if stay is None:
             continue
@@ -57,10 +57,10 @@ def note_standing(file: LogFile, segments: Segments, channels: Mapping[str, RawC
         file.notes.append(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
 
 
-def _stays(values: np.ndarray, part: slice) -> Iterator[slice]:
+def _find_standstills(values: np.ndarray, part: slice) -> Iterator[slice]:
     """Where values of a part are equal for long."""
     ends = np.flatnonzero(np.diff(values[part], prepend=np.nan, append=np.nan) != 0.0) + part.start
-    yield from (slice(a, b) for a, b in itertools.pairwise(ends.tolist()) if b - a >= _STAND)
+    yield from (slice(a, b) for a, b in itertools.pairwise(ends.tolist()) if b - a >= _STANDSTILL_SAMPLES)
 
 
 def check_gear_ratio(
@@ -90,7 +90,7 @@ def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float
     uncertain = max(0.02, 3.0 * found.residual, 5.0 * found.ratio_error / abs(expected))
     if abs(relative - 1.0) <= uncertain:
         return
-    guess, why = min(_mistakes(table, expected), key=lambda pair: abs(relative / pair[0] - 1.0))
+    guess, why = min(_likely_mistakes(table, expected), key=lambda pair: abs(relative / pair[0] - 1.0))
     if abs(relative / guess - 1.0) > uncertain:
         why = "gear_ratio, or a unit in [log], is wrong"
     moves = f"theta_e moves {found.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
@@ -102,7 +102,7 @@ def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float
     file.notes.append(f"{moves}, but the two are related only roughly; perhaps {why}.")
 
 
-def _mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
+def _likely_mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
     """Usual mistakes: the factor that each puts on the ratio of both motions, and what is wrong then."""
     (motor, motor_table), (load, load_table) = table.position("theta_e"), table.position("theta_s")
     degrees, see = 180.0 / math.pi, "; see unit in [log]"
@@ -130,7 +130,9 @@ def _check_size(file: LogFile, table: LogTable, grid: Grid, expected: float) -> 
     if relative_twist(expected) < 0.8:
         return
     # load and motor may well move against each other, beyond a resonance or in a gap: no mistake of sign is meant here
-    least, why = min((relative_twist(expected * factor), why) for factor, why in _mistakes(table, expected) if factor > 0.0)
+    least, why = min(
+        (relative_twist(expected * factor), why) for factor, why in _likely_mistakes(table, expected) if factor > 0.0
+    )
     if least < 0.7:
         size = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
         raise file.wrong(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
@@ -152,7 +154,7 @@ def _check_twist(file: LogFile, unit: str, found: Gearing, expected: float) -> N
     )
 
 
-_RETURNED = -0.5
+_MAX_RETURNED_WORK = -0.5
 """Work put in, over that which torque and motion exchange, below which no model of a drive can follow."""
 
 
@@ -188,7 +190,7 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         text = f"the drive returns {-100 * share:.0f} % of the work"
         file.warnings.append(f"Doubtful: {text}: the load drives it, or u has the wrong sign or acts late.")
         # a lag turns the torque of an inertia against the speed; a wrong sign turns it against the acceleration, too
-        if share < _RETURNED and not forwards:
+        if share < _MAX_RETURNED_WORK and not forwards:
             file.contradiction = (
                 f"{text}, which only a drive does that its load drives: set sign = -1 in [log] u, or take a log in which "
                 "the motor drives"
@@ -216,7 +218,7 @@ _FAR_WORK = 100.0
 Dry friction that a model lacks takes ten times as much; that a drive takes a tenth is seen only in wrong units."""
 
 
-def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
+def check_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
     """Say first that inertia, torque or friction are far from the nominal ones, as a wrong unit makes them.
 
     Where they are so far that no fit is worth its time, `file.contradiction` says so. Friction takes the work
@@ -273,7 +275,7 @@ def _is_fast(found: RigidFit, nominal: NominalDrive) -> bool:
 # remarks
 
 
-def note_channel(file: LogFile, name: str, figures: ChannelFigures, fastest: float) -> None:
+def note_channel(file: LogFile, name: str, figures: ChannelStatistics, fastest: float) -> None:
     """Remark on jumps, saturation and improbable speeds of a channel; `fastest` is its rate of change, unit/s."""
     if figures.jumps:
         file.notes.append(
@@ -300,7 +302,7 @@ def note_skew(file: LogFile, found: Gearing, period: float) -> None:
         )
 
 
-def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelFigures]) -> None:
+def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelStatistics]) -> None:
     """Remark on the lost motion where it stands out of the noise of both encoders."""
     unit = figures["theta_e"].unit
     text = f"Lost motion at the motor: {found.lost_motion_text(unit)}"

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, jackknifed
-from .rigid_body import direction_of
-from .signal_quality import SHORTEST, low_passed, without_ends
+from .least_squares import BLOCKS, fit_with_jackknife
+from .rigid_body import smooth_sign
+from .signal_quality import MIN_SAMPLES, low_pass, trim_filter_ends
 
 _HARMONICS = 40
 """Most periods a turn: more than poles, slots and balls of small drives make."""
@@ -46,7 +46,7 @@ class TurningLog(NamedTuple):
     period: float
 
 
-class Turned(NamedTuple):
+class ZeroShift(NamedTuple):
     """By how much positions of a log count less than those of another, rad.
 
     Attributes:
@@ -60,7 +60,7 @@ class Turned(NamedTuple):
     waves: tuple[int, ...]
 
 
-class _Moving(NamedTuple):
+class _MovingRows(NamedTuple):
     """Rows in motion behind the low-pass: torque, columns of the motion, and cos(n position) and sin(n position),
     n = 1, 2, ..."""
 
@@ -70,14 +70,14 @@ class _Moving(NamedTuple):
     sine: np.ndarray
 
 
-def turned(first: TurningLog, second: TurningLog) -> Turned | None:
+def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     """By how much the positions of the second log have to be turned to be those of the first; None where torques over the
     turn do not surely say that they have to."""
     cutoff = min(_CUTOFF, 0.1 / max(first.period, second.period))
-    one, other = (_moving(log, cutoff) for log in (first, second))
+    one, other = (_select_moving_rows(log, cutoff) for log in (first, second))
     if one is None or other is None:
         return None
-    values, errors = jackknifed(one.torque, np.hstack([one.columns, one.cosine, one.sine]))
+    values, errors = fit_with_jackknife(one.torque, np.hstack([one.columns, one.cosine, one.sine]))
     if not np.isfinite(values).all():
         return None
     known = one.columns.shape[1]
@@ -99,56 +99,55 @@ def turned(first: TurningLog, second: TurningLog) -> Turned | None:
     squares = np.array([np.sum((left[rows, :1] - left[rows, 1:]) ** 2, axis=0) for rows in blocks])
     total = squares.sum(axis=0)
     best, still = int(np.argmin(total)), squares[:, len(places) // 2]
-    if not (_surely(none, squares[:, best]) > _SHOWN and _surely(still, squares[:, best]) > _OTHER):
+    if not (_error_reduction(none, squares[:, best]) > _SHOWN and _error_reduction(still, squares[:, best]) > _OTHER):
         return None
     lowest = np.flatnonzero((total <= np.roll(total, 1)) & (total <= np.roll(total, -1)))
-    equal = [i for i in lowest if i == best or _surely(squares[:, i], squares[:, best]) < _OTHER]
+    equal = [i for i in lowest if i == best or _error_reduction(squares[:, i], squares[:, best]) < _OTHER]
     at = min(equal, key=lambda i: abs(places[i]))
     # places within half a period of the fastest wave
     near = (at + np.arange(-(_STEPS // 2), _STEPS // 2 + 1)) % len(places)
     step = places[1] - places[0]
     value, *without = (
-        places[at] + step * (_least(one[near]) - _STEPS // 2) for one in (total, *(total - some for some in squares))
+        places[at] + step * (_parabola_minimum(one[near]) - _STEPS // 2)
+        for one in (total, *(total - some for some in squares))
     )
     error = float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((np.array(without) - np.mean(without)) ** 2)))
     if not abs(value) > _OTHER * error:
         return None
-    return Turned(float(value), error, tuple(int(n) for n in harmonics))
+    return ZeroShift(float(value), error, tuple(int(n) for n in harmonics))
 
 
-def _moving(log: TurningLog, cutoff: float) -> _Moving | None:
+def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     """Rows of a log in motion; None where it does not turn far enough."""
     parts = []
     for s in log.segments:
-        if s.stop - s.start < SHORTEST:
+        if s.stop - s.start < MIN_SAMPLES:
             continue
-        place = low_passed(log.motor[s], cutoff, log.period)
+        place = low_pass(log.motor[s], cutoff, log.period)
         velocity = np.gradient(place, log.period)
-        columns = [np.gradient(velocity, log.period), velocity, direction_of(velocity), np.ones(len(place))]
+        columns = [np.gradient(velocity, log.period), velocity, smooth_sign(velocity), np.ones(len(place))]
         if log.load is not None:
-            twist = place - low_passed(log.load[s], cutoff, log.period)
+            twist = place - low_pass(log.load[s], cutoff, log.period)
             columns += [twist, np.gradient(twist, log.period)]
         # no more samples than the low-pass leaves, wave by wave: logs may be long
-        inner = without_ends(len(place), cutoff, log.period)
+        inner = trim_filter_ends(len(place), cutoff, log.period)
         rows = slice(inner.start, inner.stop, max(int(0.1 / (cutoff * log.period)), 1))
         cosine, sine = (
-            np.stack(
-                [low_passed(wave(n * log.motor[s]), cutoff, log.period)[rows] for n in range(1, _HARMONICS + 1)], axis=1
-            )
+            np.stack([low_pass(wave(n * log.motor[s]), cutoff, log.period)[rows] for n in range(1, _HARMONICS + 1)], axis=1)
             for wave in (np.cos, np.sin)
         )
-        torque = low_passed(log.torque[s], cutoff, log.period)[rows]
+        torque = low_pass(log.torque[s], cutoff, log.period)[rows]
         parts.append((torque, np.stack(columns, axis=1)[rows], cosine, sine))
     if not parts or sum(float(np.ptp(log.motor[s])) for s in log.segments) < _TURNS * 2.0 * np.pi:
         return None
-    whole = _Moving(*map(np.concatenate, zip(*parts, strict=True)))
+    whole = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))
     speed = np.abs(whole.columns[:, 1])
     rows = speed > _MOVING * np.sqrt(np.mean(speed**2))
-    found = _Moving(*(one[rows] for one in whole))
+    found = _MovingRows(*(one[rows] for one in whole))
     return found if len(found.torque) > BLOCKS * 2 * _HARMONICS else None
 
 
-def _least(squares: np.ndarray) -> float:
+def _parabola_minimum(squares: np.ndarray) -> float:
     """Where squares are least, between those tried by a parabola; an index."""
     best = int(np.clip(np.argmin(squares), 1, len(squares) - 2))
     before, at, after = squares[best - 1 : best + 2]
@@ -156,7 +155,7 @@ def _least(squares: np.ndarray) -> float:
     return best + (float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0)
 
 
-def _surely(none: np.ndarray, some: np.ndarray) -> float:
+def _error_reduction(none: np.ndarray, some: np.ndarray) -> float:
     """Standard errors by which squares are less, by blocks."""
     gains = none - some
     # not by rounding

@@ -13,11 +13,11 @@ from jaxbl.errors import InputError
 from .alignment import NominalDrive
 from .files import LogFile, read_log_file
 from .inspection import Inspection, inspect
-from .least_squares import jackknifed
-from .rigid_body import direction_of
-from .signal_quality import SHORTEST, low_passed, without_ends
+from .least_squares import fit_with_jackknife
+from .rigid_body import smooth_sign
+from .signal_quality import MIN_SAMPLES, low_pass, trim_filter_ends
 
-_VAGUE = 0.5
+_ROUGH_UNCERTAINTY = 0.5
 """Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
 _NAMES = {
     "t": r"t|time|timestamp|times|zeit|clock",
@@ -42,7 +42,7 @@ _POSITIONS = ("rad", "deg", "turn", "counts", "m", "mm")
 _TORQUES = ("N m", "N", "A", "V", "counts", "mN m", "%", "mA")
 
 
-def _split(file: LogFile, column: str | int) -> tuple[str, str]:
+def _split_unit(file: LogFile, column: str | int) -> tuple[str, str]:
     """Name of a column without its unit, in lower case, and the unit that it says, as `[log]` calls it; "" for none."""
     name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
     if found := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
@@ -53,32 +53,32 @@ def _split(file: LogFile, column: str | int) -> tuple[str, str]:
     return name, _UNITS.get(unit, unit)
 
 
-def _is(kind: str, name: str) -> bool:
+def _matches(kind: str, name: str) -> bool:
     """Whether a name, or a word of it, is one of a kind."""
-    return any(re.fullmatch(_NAMES[kind], one) for one in (_whole(name), *re.split(r"[^a-z0-9äöü]+", name)))
+    return any(re.fullmatch(_NAMES[kind], one) for one in (_join_words(name), *re.split(r"[^a-z0-9äöü]+", name)))
 
 
-def _whole(name: str) -> str:
+def _join_words(name: str) -> str:
     return name.replace(" ", "_")
 
 
-def _channel(name: str, unit: str) -> str:
+def _guess_channel(name: str, unit: str) -> str:
     """The channel that a column is by its name and unit; "" for none."""
-    if _is("t", name):
+    if _matches("t", name):
         return "t"
-    side = "s" if _is("load", name) else "e"
+    side = "s" if _matches("load", name) else "e"
     # a unit that is not known may be any
     may = {kind: unit in units or unit not in _UNITS.values() for kind, units in
            (("u", _TORQUES), ("omega", (*_SPEEDS, "counts")), ("position", _POSITIONS))}  # fmt: skip
-    speed, place = unit in _SPEEDS or _is("omega", name), _is("position", name)
+    speed, place = unit in _SPEEDS or _matches("omega", name), _matches("position", name)
     # current_position is no current
-    if may["u"] and (re.fullmatch(_NAMES["u"], _whole(name)) or (_is("u", name) and not (speed or place))):
+    if may["u"] and (re.fullmatch(_NAMES["u"], _join_words(name)) or (_matches("u", name) and not (speed or place))):
         return "u"
     if speed:
         return f"omega_{side}" if may["omega"] else ""
     # motor and load alone say what moves, and not which quantity it is: a temperature is one of the motor, too
-    alone = any(re.fullmatch(_NAMES[one], _whole(name)) and not unit for one in ("motor", "load"))
-    said = unit in _POSITIONS and (_is("motor", name) or _is("load", name))
+    alone = any(re.fullmatch(_NAMES[one], _join_words(name)) and not unit for one in ("motor", "load"))
+    said = unit in _POSITIONS and (_matches("motor", name) or _matches("load", name))
     return f"theta_{side}" if (place and may["position"]) or alone or said else ""
 
 
@@ -96,30 +96,30 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
         )
     found: dict[str, list[tuple[bool, str | int, str, np.ndarray]]] = {}
     for column in file.columns:
-        name, unit = _split(file, column)
-        channel, wanted = _channel(name, unit), _is("wanted", name)
+        name, unit = _split_unit(file, column)
+        channel, wanted = _guess_channel(name, unit), _matches("wanted", name)
         if not channel:
             continue
         numbers = file.values(column)
         # a torque that was asked for stands for one that was not measured, a side alone for a position
         if numbers.dtype.kind in "iuf" and (channel == "u" or not wanted):
-            last = wanted or _is("load", name) if channel == "u" else not _is("position", name)
+            last = wanted or _matches("load", name) if channel == "u" else not _matches("position", name)
             found.setdefault(channel, []).append((last, column, unit, numbers))
     table: dict[str, Any] = {}
     guesses: list[str] = []
     for channel, columns in found.items():
         _, column, unit, numbers = min(columns, key=lambda one: one[0])
         if channel == "t":
-            table["t"] = _time(column, unit, numbers, guesses)
+            table["t"] = _guess_time_table(column, unit, numbers, guesses)
         elif channel == "u":
-            if _is("wanted", _split(file, column)[0]):
+            if _matches("wanted", _split_unit(file, column)[0]):
                 guesses.append(f"u is '{column}', the torque asked for: no column looks like a measured one.")
-            table["u"] = _torque(column, unit, guesses)
+            table["u"] = _guess_torque_table(column, unit, guesses)
         elif channel.startswith("theta"):
-            table[channel] = _position(column, unit, numbers, guesses)
+            table[channel] = _guess_position_table(column, unit, numbers, guesses)
         # a measured position is better than the integral of a speed
         elif channel and channel.replace("omega", "theta") not in found:
-            table[channel] = _speed(column, unit, guesses)
+            table[channel] = _guess_speed_table(column, unit, guesses)
     if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
@@ -131,7 +131,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     return table, guesses
 
 
-def _time(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_time_table(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
     if unit not in ("s", "ms", "us", "ns"):
         median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
         # drives are sampled every 10 us to 0.1 s
@@ -141,7 +141,7 @@ def _time(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) 
     return {"column": column, "unit": unit}
 
 
-def _torque(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
+def _guess_torque_table(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
     plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
     if unit in ("A", "V", "%", "mA", "counts"):
         guesses.append(f"u.factor: put in the torque of one {unit}; 1 is a placeholder for each A or V, and for 100 %.")
@@ -152,31 +152,31 @@ def _torque(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
         return {"column": column, "unit": unit, "factor": 1.0}
     if unit in ("N m", "N"):
         return {"column": column, "unit": unit}
-    guesses.append(_assumed("u", unit, "N m"))
+    guesses.append(_unit_guess("u", unit, "N m"))
     return {"column": column}
 
 
-def _assumed(what: str, unit: str, default: str) -> str:
+def _unit_guess(what: str, unit: str, default: str) -> str:
     return f"The unit of {what} is " + (f"'{unit}': put in factor; " if unit else "not said: ") + f"{default} is assumed."
 
 
-def _position(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_position_table(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
     whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
     if unit == "counts" or (not unit and whole):
         guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
         return {"column": column, "unit": "counts", "counts_per_turn": 4096.0}
     if unit not in _POSITIONS:
-        guesses.append(_assumed(f"'{column}'", unit, "rad"))
+        guesses.append(_unit_guess(f"'{column}'", unit, "rad"))
     return {"column": column, "unit": unit if unit in _POSITIONS else "rad"}
 
 
-def _speed(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
+def _guess_speed_table(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
     if unit not in _SPEEDS:
-        guesses.append(_assumed(f"'{column}'", unit, "rad/s"))
+        guesses.append(_unit_guess(f"'{column}'", unit, "rad/s"))
     return {"column": column, "unit": unit if unit in _SPEEDS else "rad/s"}
 
 
-def propose(
+def propose_study(
     path: str | Path,
     log: dict[str, Any] | None = None,
     *,
@@ -206,8 +206,10 @@ def propose(
         guesses.append("u is reversed: with the sign of the file the drive would accelerate against it.")
         found = inspect(path, table, gear_ratio=gear_ratio)
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
-        rough = vars(_nominal(found, guesses, gear_ratio))
-        nominal = NominalDrive(**{name: one if name == "gear_ratio" else _rounded(one) for name, one in rough.items()})
+        rough = vars(_fit_nominal_drive(found, guesses, gear_ratio))
+        nominal = NominalDrive(
+            **{name: one if name == "gear_ratio" else _round_to_3_digits(one) for name, one in rough.items()}
+        )
     else:
         guesses.append("The numbers of the drive are those of the model that was given.")
     if math.isfinite(nominal.stiffness):
@@ -216,14 +218,14 @@ def propose(
             if key in found.record.corrections:
                 name, _ = found.log.position(channel)
                 table[name] = _as_table(table.get(name, name)) | {key: found.record.corrections[key]}
-    return _study(found, nominal, table), guesses, found
+    return _make_study(found, nominal, table), guesses, found
 
 
 def _as_table(given: Any) -> dict[str, Any]:
     return given if isinstance(given, dict) else {"column": given}
 
 
-def _nominal(found: Inspection, guesses: list[str], known: float | None) -> NominalDrive:
+def _fit_nominal_drive(found: Inspection, guesses: list[str], known: float | None) -> NominalDrive:
     """Inertia and friction by the rough fit; of two sides half of it each, at the motor."""
     dynamics, gearing = found.record.findings.dynamics, found.record.findings.gearing
     inertia, viscous = 1.0, 0.0
@@ -241,12 +243,12 @@ def _nominal(found: Inspection, guesses: list[str], known: float | None) -> Nomi
         return NominalDrive(inertia, viscous)
     both = found.record.positions
     parts = [
-        _kinematics(both["motor"][s], both["load"][s], found.record.findings.channels["theta_e"].bandwidth, period)
+        _load_motion(both["motor"][s], both["load"][s], found.record.findings.channels["theta_e"].bandwidth, period)
         for s in found.record.segments
-        if s.stop - s.start >= SHORTEST
+        if s.stop - s.start >= MIN_SAMPLES
     ]
     motor, rows = (np.concatenate(column) for column in zip(*parts, strict=True))
-    values, errors = jackknifed(motor, rows)
+    values, errors = fit_with_jackknife(motor, rows)
     if not np.isfinite(values).all() or values[0] <= 0.0:
         raise InputError(
             f"{found.record.path}: theta_e moves {gearing.ratio:.4g} for each 1 of theta_s; it should be more than 0: set "
@@ -271,18 +273,18 @@ def _nominal(found: Inspection, guesses: list[str], known: float | None) -> Nomi
     return replace(drive, stiffness=stiffness, half_gap=0.5 * max(gearing.lost_motion, 0.0))
 
 
-def _kinematics(motor: np.ndarray, load: np.ndarray, width: float, period: float) -> tuple[np.ndarray, np.ndarray]:
+def _load_motion(motor: np.ndarray, load: np.ndarray, width: float, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Motor position, and load position, velocity, acceleration, direction, 1; low-passed."""
     cutoff = 4.0 * width
-    smooth = low_passed(np.column_stack([motor, load]), cutoff, period) if width else np.column_stack([motor, load])
+    smooth = low_pass(np.column_stack([motor, load]), cutoff, period) if width else np.column_stack([motor, load])
     velocity = np.gradient(smooth[:, 1], period)
     acceleration = np.gradient(velocity, period)
-    rows = np.column_stack([smooth[:, 1], velocity, acceleration, direction_of(velocity), np.ones(len(motor))])
-    cut = without_ends(len(motor), cutoff, period) if width else slice(None)
+    rows = np.column_stack([smooth[:, 1], velocity, acceleration, smooth_sign(velocity), np.ones(len(motor))])
+    cut = trim_filter_ends(len(motor), cutoff, period) if width else slice(None)
     return smooth[cut, 0], rows[cut]
 
 
-def _study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> dict[str, Any]:
+def _make_study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> dict[str, Any]:
     record = found.record
     two = math.isfinite(nominal.stiffness)
     names = ("motor_inertia", "motor_viscous", *(("load_inertia", "load_viscous", "gear_ratio") if two else ()))
@@ -295,9 +297,9 @@ def _study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> d
         study["transmission"] = law if nominal.half_gap else {"law": "linear_shaft", "stiffness": law["stiffness"]}
     noise = record.findings.channels["theta_e" if "motor" in record.positions else "theta_s"].noise
     return study | {
-        "encoders": {"noise": _rounded(noise)},
+        "encoders": {"noise": _round_to_3_digits(noise)},
         "run": {"sample_period": record.sample_period, "substeps": plant_steps(nominal, record.sample_period)},
-        "uncertainty": {"relative": _VAGUE, "exact": ["drive.gear_ratio"] if two else []},
+        "uncertainty": {"relative": _ROUGH_UNCERTAINTY, "exact": ["drive.gear_ratio"] if two else []},
         "log": table,
     }
 
@@ -310,6 +312,6 @@ def plant_steps(drive: NominalDrive, period: float) -> int:
     return max(math.ceil(10.0 * math.sqrt(rate) * period / (2.0 * math.pi)), 1)
 
 
-def _rounded(value: float) -> float:
+def _round_to_3_digits(value: float) -> float:
     """To three digits: no more of a rough fit is meant."""
     return float(f"{value:.3g}")

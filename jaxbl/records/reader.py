@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from jaxbl.errors import InputError
 from jaxbl.validation import check_sizes, explain_first_error
 
-from .alignment import NominalDrive, Skew, clock_skew, encoder_offset, windup
+from .alignment import NominalDrive, Skew, find_encoder_offset, judge_clock_skew, max_windup_delay
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
@@ -21,21 +21,21 @@ from .plausibility import (
     check_gear_ratio,
     check_motion,
     check_torque,
+    check_units,
     note_channel,
     note_lost_motion,
     note_skew,
     note_standing,
-    warn_units,
 )
-from .resampling import Delay, Grid, resampled
+from .resampling import Delay, Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
-from .signal_quality import ChannelFigures, channel_figures, longest
+from .signal_quality import ChannelStatistics, longest_segment, measure_channel
 from .table import ELEMENT_NEEDS, POSITION_CHANNELS, LogTable
-from .time_stamps import Sampling, Segments, read_time_stamps, split_at_gaps
+from .time_stamps import Sampling, SegmentedStamps, read_time_stamps, split_at_gaps
 
 
 @dataclass(frozen=True)
-class Findings:
+class LogStatistics:
     """What the log says about itself.
 
     Attributes:
@@ -46,7 +46,7 @@ class Findings:
     """
 
     sampling: Sampling
-    channels: dict[str, ChannelFigures]
+    channels: dict[str, ChannelStatistics]
     gearing: Gearing | None
     dynamics: RigidFit | None
 
@@ -88,7 +88,7 @@ class Record:
     warnings: tuple[str, ...]
     corrections: dict[str, float]
     contradiction: str
-    findings: Findings
+    findings: LogStatistics
     intervals: np.ndarray
     logs: tuple[tuple[Path, slice], ...]
 
@@ -157,7 +157,7 @@ def read_record(
     # from there to evenly spaced samples
     two = drive and len(encoders) == 2
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None
-    grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio, shaft)
+    grid, gearing, regular = _resample_and_align(file, table, segments, channels, gear_ratio, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
     # what these say of the drive
@@ -168,10 +168,12 @@ def read_record(
     if dynamics is not None:
         check_torque(file, dynamics, grid, position)
         if nominal is not None:
-            warn_units(file, dynamics, encoders[0], nominal)
+            check_units(file, dynamics, encoders[0], nominal)
     # uneven stamps would pass for noise of what moves between them
     source = Grid(segments.times, {n: raw.values for n, raw in channels.items()}, segments.parts, grid.period)
-    figures = {name: _figures(file, name, raw, segments, source if regular else grid) for name, raw in channels.items()}
+    figures = {
+        name: _measure_channel(file, name, raw, segments, source if regular else grid) for name, raw in channels.items()
+    }
     if gearing is not None:
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
         figures["theta_s"] = replace(figures["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
@@ -195,16 +197,16 @@ def read_record(
         warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith("Doubtful"))),
         corrections=file.corrections,
         contradiction=file.contradiction,
-        findings=Findings(segments.sampling, figures, gearing, dynamics),
+        findings=LogStatistics(segments.sampling, figures, gearing, dynamics),
         intervals=np.diff(segments.times),
         logs=((file.path, slice(0, len(grid.time))),),
     )
 
 
-def _evenly_spaced(
+def _resample_and_align(
     file: LogFile,
     table: LogTable,
-    segments: Segments,
+    segments: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     gear_ratio: float | None,
     shaft: NominalDrive | None,
@@ -215,7 +217,7 @@ def _evenly_spaced(
     delays = {name: Delay(raw.skew if isinstance(raw.skew, float) else 0.0, raw.drift) for name, raw in channels.items()}
 
     def attempt() -> tuple[Grid, Gearing | None]:
-        grid = resampled(file, segments, channels, period, delays, interpolate=not regular)
+        grid = resample_channels(file, segments, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
@@ -224,10 +226,10 @@ def _evenly_spaced(
 
     grid, gearing = attempt()
     asked = any(raw.skew == "estimate" for raw in channels.values())
-    open_ = shaft is not None and _is_open(table, "skew")
+    open_ = shaft is not None and _is_left_out(table, "skew")
     said = []
-    if gearing is not None and (asked or open_) and _is_open(table, "drift"):
-        drift = _drift(gearing, grid, shaft if open_ else None)
+    if gearing is not None and (asked or open_) and _is_left_out(table, "drift"):
+        drift = _find_clock_drift(gearing, grid, shaft if open_ else None)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
@@ -238,10 +240,10 @@ def _evenly_spaced(
             )
     first = delays.get("theta_s", Delay())
     if asked:
-        delays["theta_s"] = Delay(first.skew + _estimated_skew(file, gearing, period), first.drift)
+        delays["theta_s"] = Delay(first.skew + _estimate_skew(file, gearing, period), first.drift)
         grid, gearing = attempt()
     elif open_ and shaft is not None and gearing is not None:
-        found = clock_skew(gearing, grid, shaft)
+        found = judge_clock_skew(gearing, grid, shaft)
         if found is not None and found.sure:
             delays["theta_s"] = Delay(first.skew + found.value, first.drift)
             grid, gearing = attempt()
@@ -263,7 +265,7 @@ def _evenly_spaced(
     return grid, gearing, regular
 
 
-def _drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
+def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
     """A drift between the clocks of both encoders, as far as friction of the nominal drive, if one is given, is no cause."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
     if gearing.wide:
@@ -271,13 +273,14 @@ def _drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | 
     found = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
     # friction that changes as the machine warms up changes the wind-up, by less than all of it
     if found is None or (
-        shaft is not None and found.reach < windup(grid, shaft) + 6.0 * found.reach * found.error / abs(found.value)
+        shaft is not None
+        and found.reach < max_windup_delay(grid, shaft) + 6.0 * found.reach * found.error / abs(found.value)
     ):
         return None
     return found
 
 
-def _estimated_skew(file: LogFile, gearing: Gearing | None, period: float) -> float:
+def _estimate_skew(file: LogFile, gearing: Gearing | None, period: float) -> float:
     if gearing is None or gearing.skew is None or gearing.skew_error is None:
         raise file.wrong("theta_s.skew = 'estimate': this motion does not show a skew; give it in s, or leave it out")
     found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
@@ -290,7 +293,7 @@ def _estimated_skew(file: LogFile, gearing: Gearing | None, period: float) -> fl
     return gearing.skew
 
 
-def _is_open(table: LogTable, key: str) -> bool:
+def _is_left_out(table: LogTable, key: str) -> bool:
     """Whether `[log]` leaves a key of theta_e and theta_s out; a speed in place of theta_s may not have it."""
     motor, load = table.position("theta_e")[1], table.position("theta_s")[1]
     return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
@@ -320,9 +323,9 @@ def _correct_offset(
 ) -> None:
     """Take an offset between the encoders out of theta_e where it is sure, and say so; say that it may be one, if not."""
     integrals = [name for name in POSITION_CHANNELS.values() if table.position(name)[0] != name]
-    if not integrals and not _is_open(table, "offset"):
+    if not integrals and not _is_left_out(table, "offset"):
         return
-    found = encoder_offset(grid, nominal)
+    found = find_encoder_offset(grid, nominal)
     if found is None:
         return
     if integrals:
@@ -351,12 +354,14 @@ def _correct_offset(
     )
 
 
-def _figures(file: LogFile, name: str, raw: RawChannel, segments: Segments, source: Grid) -> ChannelFigures:
+def _measure_channel(
+    file: LogFile, name: str, raw: RawChannel, segments: SegmentedStamps, source: Grid
+) -> ChannelStatistics:
     """Figures on a channel, with remarks; noise and bandwidth are taken from the longest part of `source`."""
-    part = longest(source.segments)
+    part = longest_segment(source.segments)
     values, times = source.values[name][part], source.time[part]
     period = float(times[-1] - times[0]) / (len(values) - 1)
-    figures = channel_figures(
+    figures = measure_channel(
         values,
         period,
         [raw.values[p] for p in segments.parts],
@@ -382,7 +387,7 @@ _PAUSE = 10
 """Periods between logs that are joined."""
 
 
-def join(records: Sequence[Record]) -> Record:
+def join_records(records: Sequence[Record]) -> Record:
     """Several logs of one machine as one record: one after the other, with figures and units of the first.
 
     Raises:
@@ -399,7 +404,7 @@ def join(records: Sequence[Record]) -> Record:
                 f"[log] resample = {period:.6g} reads both alike"
             )
         for one, other in ((record, first), (first, record)):
-            if missing := _channels(other) - _channels(one):
+            if missing := _channel_names(other) - _channel_names(one):
                 name = min(missing)
                 raise InputError(f"{one.path}: has no {name}, which {other.path} has; logs of one machine should be alike")
         times.append(record.time - record.time[0] + end)
@@ -413,9 +418,9 @@ def join(records: Sequence[Record]) -> Record:
     return replace(
         first,
         time=np.concatenate(times),
-        torque=_together([record.torque for record in records]),
-        positions={side: _together([record.positions[side] for record in records]) for side in first.positions},
-        transmitted=_together([record.transmitted for record in records]),
+        torque=_concatenate([record.torque for record in records]),
+        positions={side: _concatenate([record.positions[side] for record in records]) for side in first.positions},
+        transmitted=_concatenate([record.transmitted for record in records]),
         segments=tuple(segments),
         notes=tuple(notes),
         warnings=tuple(warnings),
@@ -424,10 +429,10 @@ def join(records: Sequence[Record]) -> Record:
     )
 
 
-def _channels(record: Record) -> set[str]:
+def _channel_names(record: Record) -> set[str]:
     torques = {"torque": record.torque, "transmitted torque": record.transmitted}
     return {f"{side} position" for side in record.positions} | {name for name, one in torques.items() if one is not None}
 
 
-def _together(parts):
+def _concatenate(parts):
     return None if parts[0] is None else np.concatenate(parts)

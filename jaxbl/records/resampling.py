@@ -8,8 +8,8 @@ import numpy as np
 
 from .channels import RawChannel
 from .files import LogFile
-from .signal_quality import SHORTEST, interpolated
-from .time_stamps import Segments
+from .signal_quality import MIN_SAMPLES, interpolate_spline
+from .time_stamps import SegmentedStamps
 
 _FINEST = 100
 """Samples for each of the log: between its own there is nothing new, and memory ends."""
@@ -42,9 +42,9 @@ class Delay(NamedTuple):
         return self.skew + self.drift * times
 
 
-def resampled(
+def resample_channels(
     file: LogFile,
-    segments: Segments,
+    segments: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     period: float,
     delays: Mapping[str, Delay],
@@ -63,22 +63,22 @@ def resampled(
         if not interpolate and not any(map(any, delays.values())):
             grid = first + period * np.arange(len(stamps), dtype=float)
         else:
-            grid = _common_grid(file, stamps, period, delays.values(), None if interpolate else first)
+            grid = _common_times(file, stamps, period, delays.values(), None if interpolate else first)
         for name, raw in channels.items():
             own = stamps - delays[name].at(stamps)
             if not interpolate and not any(delays[name]) and len(grid) == len(stamps):
                 values[name].append(raw.values[part])
             elif raw.held:
-                values[name].append(_held_means(own, raw.values[part], grid, period))
+                values[name].append(_mean_over_periods(own, raw.values[part], grid, period))
             else:
-                values[name].append(interpolated(own, raw.values[part], grid))
+                values[name].append(interpolate_spline(own, raw.values[part], grid))
         times.append(grid)
         parts.append(slice(begin, begin + len(grid)))
         begin += len(grid)
     return Grid(np.concatenate(times), {name: np.concatenate(v) for name, v in values.items()}, tuple(parts), period)
 
 
-def _common_grid(
+def _common_times(
     file: LogFile, stamps: np.ndarray, period: float, delays: Iterable[Delay], first: float | None
 ) -> np.ndarray:
     """Times at which all channels have values, s; on the grid that begins at `first`, if it is given."""
@@ -88,18 +88,18 @@ def _common_grid(
         # where the channels without skew have their samples
         low = first + period * math.ceil((low - first) / period - 1e-6)
     count = math.floor((high - low) / period + 1e-6) + 1
-    if count > _FINEST * len(stamps) + SHORTEST:
+    if count > _FINEST * len(stamps) + MIN_SAMPLES:
         raise file.wrong(
             f"a period of {period:g} s makes {count} samples of {len(stamps)}; at least a hundredth of the log's is needed"
         )
-    if count < SHORTEST // 2:
+    if count < MIN_SAMPLES // 2:
         raise file.wrong(
-            f"with these skews and this period a segment has {max(count, 0)} samples; at least {SHORTEST // 2} are needed"
+            f"with these skews and this period a segment has {max(count, 0)} samples; at least {MIN_SAMPLES // 2} are needed"
         )
     return low + period * np.arange(count, dtype=float)
 
 
-def _held_means(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
+def _mean_over_periods(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
     """Means, over each period of a grid, of values that are held from each stamp to the next.
 
     The last value is held for one more period. Means keep the impulse, and with it the velocity that a torque makes.

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .least_squares import jackknifed
-from .signal_quality import SHORTEST, bandwidth, longest, low_passed, without_ends
+from .least_squares import fit_with_jackknife
+from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass, trim_filter_ends
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class RigidFit:
         return {"terms": terms, "residual": self.residual}
 
 
-def direction_of(velocity: np.ndarray) -> np.ndarray:
+def smooth_sign(velocity: np.ndarray) -> np.ndarray:
     """+1 or -1 by the sign of a velocity, smooth through zero, shape (samples,)."""
     # 2 % of the rms velocity: standstill then counts as neither direction
     return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
@@ -69,21 +69,21 @@ def direction_of(velocity: np.ndarray) -> np.ndarray:
 
 def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
     """Regress a torque, held from each stamp to the next, on the motion of one encoder; None where that is too small."""
-    width = bandwidth(position[longest(segments)], period, slope=True)
+    width = find_bandwidth(position[longest_segment(segments)], period, slope=True)
     if width == 0.0 or np.ptp(torque) == 0.0:
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes
     cutoff = 3.0 * width
     targets, all_rows, slowing = [], [], 0.0
     for s in segments:
-        if s.stop - s.start < SHORTEST:
+        if s.stop - s.start < MIN_SAMPLES:
             continue
-        smooth = low_passed(position[s], cutoff, period)
+        smooth = low_pass(position[s], cutoff, period)
         velocity = np.gradient(smooth, period)
         acceleration = np.gradient(velocity, period)
-        direction = low_passed(direction_of(velocity), cutoff, period)
-        held = low_passed(torque[s], cutoff, period)
-        cut = without_ends(len(smooth), cutoff, period)
+        direction = low_pass(smooth_sign(velocity), cutoff, period)
+        held = low_pass(torque[s], cutoff, period)
+        cut = trim_filter_ends(len(smooth), cutoff, period)
         columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(held, period)]
         all_rows.append(np.stack(columns, axis=1)[cut])
         slowing += float(velocity[cut][0] ** 2 - velocity[cut][-1] ** 2)
@@ -93,7 +93,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
     if np.ptp(target) == 0.0:
         return None
-    found, errors = jackknifed(target, rows)
+    found, errors = fit_with_jackknife(target, rows)
     if not np.isfinite(found).all():
         # two terms are proportional to each other
         found, errors = np.zeros(6), np.full(6, np.inf)

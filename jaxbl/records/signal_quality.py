@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .linear_filters import both_ways, butterworth, welch
+from .linear_filters import butterworth_coefficients, filter_both_ways, welch_spectrum
 
-SHORTEST = 64
+MIN_SAMPLES = 64
 """Samples that a log needs, and a segment to be filtered and regressed: ten samples for each of six terms of a regression.
 
 Other segments need half as many.
@@ -15,7 +15,7 @@ Other segments need half as many.
 
 
 @dataclass(frozen=True)
-class ChannelFigures:
+class ChannelStatistics:
     """Figures on one measured channel, in SI units.
 
     Attributes:
@@ -36,16 +36,16 @@ class ChannelFigures:
     unit: str
     least: float
     largest: float
-    resolution: float
+    find_resolution: float
     noise: float
-    bandwidth: float
+    find_bandwidth: float
     saturated: float
-    jumps: int
+    count_jumps: int
     skew: float | None = None
     skew_error: float | None = None
 
 
-def channel_figures(
+def measure_channel(
     values: np.ndarray,
     period: float,
     parts: Sequence[np.ndarray],
@@ -54,29 +54,29 @@ def channel_figures(
     unit: str,
     is_position: bool,
     saturated: float,
-) -> ChannelFigures:
+) -> ChannelStatistics:
     """Figures on a channel.
 
     Noise and bandwidth are those of `values`, its longest segment at even spacing; all else is that of the `parts` between
     gaps, with `stamps` (s) where these are uneven. `saturated` is the share of samples at a known saturation level.
     """
     every = np.concatenate(parts)
-    step = resolution(every)
-    frequency, density = spectrum(values, period)
-    found = sum(map(jumps, parts, [step] * len(parts), stamps or [None] * len(parts))) if is_position else 0
-    return ChannelFigures(
+    step = find_resolution(every)
+    frequency, density = power_spectrum(values, period)
+    found = sum(map(count_jumps, parts, [step] * len(parts), stamps or [None] * len(parts))) if is_position else 0
+    return ChannelStatistics(
         unit=unit,
         least=float(every.min()),
         largest=float(every.max()),
         resolution=step,
         noise=float(np.sqrt(noise_floor(frequency, density) * 0.5 / period)),
-        bandwidth=bandwidth(values, period, slope=is_position) if np.ptp(values) else 0.0,
-        saturated=saturated or (0.0 if is_position else stays(every, step)),
+        bandwidth=find_bandwidth(values, period, slope=is_position) if np.ptp(values) else 0.0,
+        saturated=saturated or (0.0 if is_position else saturated_share(every, step)),
         jumps=found,
     )
 
 
-def resolution(values: np.ndarray) -> float:
+def find_resolution(values: np.ndarray) -> float:
     """Step of which all differences between values are multiples; 0 where there is none."""
     span = float(np.ptp(values)) if len(values) else 0.0
     steps = np.diff(np.unique(values))
@@ -93,7 +93,7 @@ def resolution(values: np.ndarray) -> float:
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
-def spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def power_spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """One-sided power spectral density of evenly spaced values, or of their slope, by Welch's method.
 
     Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
@@ -101,7 +101,7 @@ def spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
     length = min(max(len(differences) // 4, 16), 4096, len(differences))
-    frequency, density = welch(differences, length)
+    frequency, density = welch_spectrum(differences, length)
     frequency, density = frequency[1:], density[1:]
     density = density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
     frequency = frequency / period
@@ -109,15 +109,15 @@ def spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple
 
 
 def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
-    """Median density above a third of the sampling rate, unit²/Hz, from :func:`spectrum`."""
+    """Median density above a third of the sampling rate, unit²/Hz, from :func:`power_spectrum`."""
     return float(np.median(density[frequency >= 2.0 / 3.0 * frequency[-1]]))
 
 
-def bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
+def find_bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
     """Frequency in Hz below which 95 % of the power lies that stands out of the noise, of values or their slope; 0: none."""
-    frequency, density = spectrum(values, period)
+    frequency, density = power_spectrum(values, period)
     # steps of the resolution make noise of their own, and not always up to the end of the band
-    floor = max(noise_floor(frequency, density), resolution(values) ** 2 / 6.0 * period)
+    floor = max(noise_floor(frequency, density), find_resolution(values) ** 2 / 6.0 * period)
     # differences of noise leak into the first two frequencies
     clear = np.where(np.arange(len(density)) < 2, 24.0, 6.0) * floor
     power = np.where(density > clear, density - floor, 0.0) * (frequency**2 if slope else 1.0)
@@ -127,7 +127,7 @@ def bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
     return float(frequency[np.searchsorted(total, 0.95 * total[-1])])
 
 
-def stays(values: np.ndarray, step: float) -> float:
+def saturated_share(values: np.ndarray, step: float) -> float:
     """Share of samples in stays of five or more at the least or the largest value (within half a `step`)."""
     if np.ptp(values) == 0.0:
         return 0.0
@@ -141,7 +141,7 @@ def stays(values: np.ndarray, step: float) -> float:
     return share / len(values)
 
 
-def jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) -> int:
+def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) -> int:
     """Isolated outliers and steps of a position: differences far off those around them, and more than a few steps.
 
     Positions without time stamps (s) are evenly spaced.
@@ -161,29 +161,31 @@ def jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) 
     return int(np.count_nonzero(np.diff(at, prepend=-10) > 2))
 
 
-def low_passed(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
+def low_pass(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
     """Values without what is above a frequency (Hz), without delay: 2nd-order Butterworth forwards and backwards.
 
     Samples run along the first axis. Where the cutoff is near the end of the band, values stay as they are.
     """
     if 2.0 * cutoff * period > 0.8:
         return values
-    return both_ways(values, *butterworth(2.0 * cutoff * period), min(len(values) - 1, round(2.0 / (cutoff * period))))
+    return filter_both_ways(
+        values, *butterworth_coefficients(2.0 * cutoff * period), min(len(values) - 1, round(2.0 / (cutoff * period)))
+    )
 
 
-def without_ends(samples: int, cutoff: float, period: float) -> slice:
-    """The samples of a segment without its ends, where :func:`low_passed` and differences have not settled."""
+def trim_filter_ends(samples: int, cutoff: float, period: float) -> slice:
+    """The samples of a segment without its ends, where :func:`low_pass` and differences have not settled."""
     edge = min(round(1.0 / (cutoff * period)), samples // 8) + 2
     return slice(edge, samples - edge)
 
 
-def interpolated(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def interpolate_spline(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Values at other times by a cubic spline; beyond the ends the value at the end."""
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(times, values)(np.clip(at, times[0], times[-1]))
 
 
-def longest(segments: Sequence[slice]) -> slice:
+def longest_segment(segments: Sequence[slice]) -> slice:
     """The longest segment."""
     return max(segments, key=lambda s: s.stop - s.start)

@@ -8,33 +8,33 @@ from pydantic_core import PydanticCustomError
 from jaxbl.validation import Positive, StrictTable, table_error
 
 
-def _is_column(value: Any) -> Any:
+def _check_column(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, str | int) or (isinstance(value, int) and value < 0):
         raise PydanticCustomError("column", "should be a column's name, or its number counted from 0")
     return value
 
 
-def _is_skew(value: Any) -> Any:
+def _check_skew(value: Any) -> Any:
     if isinstance(value, bool) or not (isinstance(value, int | float) or value == "estimate"):
         raise PydanticCustomError("skew", "should be a number of seconds or 'estimate'")
     return value
 
 
-def _is_plain(value: Any) -> Any:
+def _check_scalar(value: Any) -> Any:
     if not isinstance(value, bool | int | float | str):
         raise PydanticCustomError("where", "should be a number, text, true or false")
     return value
 
 
-def _is_sign(value: Any) -> Any:
+def _check_sign(value: Any) -> Any:
     if isinstance(value, bool) or value not in (1, -1):
         raise PydanticCustomError("sign", "should be 1 or -1")
     return int(value)
 
 
-_Column = Annotated[str | int, BeforeValidator(_is_column)]
-_Skew = Annotated[float | Literal["estimate"], BeforeValidator(_is_skew)]
-_Sign = Annotated[int, BeforeValidator(_is_sign)]
+_Column = Annotated[str | int, BeforeValidator(_check_column)]
+_Skew = Annotated[float | Literal["estimate"], BeforeValidator(_check_skew)]
+_Sign = Annotated[int, BeforeValidator(_check_sign)]
 
 _SECONDS: Any = {"unit": "s"}
 
@@ -184,7 +184,7 @@ SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
 ELEMENT_NEEDS = "an element is found from its displacement theta_e and the torque u; both are needed"
 """Why a log of a transmission on a test rig is refused."""
 
-_Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
+_Scalar = Annotated[bool | int | float | str, BeforeValidator(_check_scalar)]
 
 
 class LogTable(StrictTable):
@@ -210,7 +210,7 @@ class LogTable(StrictTable):
     absent: list[_ChannelName] | None = Field(
         default=None, description="channels that were not recorded, of u, theta_e, theta_s; left out: none"
     )
-    where: dict[str, _Plain] | None = Field(
+    where: dict[str, _Scalar] | None = Field(
         default=None, description="column -> value: only rows that have it (a switch, a mode); left out: all rows"
     )
     start: float | None = Field(

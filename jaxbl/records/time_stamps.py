@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from .files import LogFile
-from .signal_quality import SHORTEST, longest, resolution
+from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
 from .table import LogTable, TimeTable
 
-GAP = 3.5
+GAP_PERIODS = 3.5
 """Intervals longer than this many periods are gaps: up to two lost samples in a row are interpolated."""
-ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
 _SLOW = 0.5
 """Period in s from which a remark asks for the unit of the stamps: drives are sampled much faster."""
@@ -63,7 +63,7 @@ class TimeStamps(NamedTuple):
     gap: float
 
 
-class Segments(NamedTuple):
+class SegmentedStamps(NamedTuple):
     """Parts of a log between its gaps.
 
     Attributes:
@@ -83,10 +83,10 @@ class Segments(NamedTuple):
 
 def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     """The rows that `[log]` selects, and their times; InputError where time does not increase, or too few are left."""
-    stamps = _stamps(file, table)
+    stamps = _read_stamps(file, table)
     start = float(stamps[0])
     stamps = stamps - start
-    rows = _selected_rows(file, table, stamps)
+    rows = _select_rows(file, table, stamps)
     intervals = np.diff(stamps)
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups
@@ -96,10 +96,10 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     if median >= _SLOW:
         file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
-    return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP * median, 2.5 * group))
+    return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group))
 
 
-def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
+def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
     """Of all rows, s, shape (rows of the file,)."""
     time = table.t or TimeTable()
     if time.period is not None:
@@ -108,9 +108,9 @@ def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
         length = max(file.length(file.name(one)) for one in read or file.columns)
         stamps = np.arange(length, dtype=float) * time.period
     else:
-        stamps = file.seconds(time.column_or("t"), ONE[time.unit], "t.column")
-    if len(stamps) < SHORTEST:
-        raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
+        stamps = file.seconds(time.column_or("t"), SECONDS_PER_UNIT[time.unit], "t.column")
+    if len(stamps) < MIN_SAMPLES:
+        raise file.wrong(f"has {len(stamps)} rows; a log needs at least {MIN_SAMPLES}")
     back = np.diff(stamps) < 0.0
     if back.any() or stamps[0] == stamps[-1]:
         wrong = f" is {stamps[0]:g} s in all rows"
@@ -121,7 +121,7 @@ def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
     return stamps
 
 
-def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarray:
+def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarray:
     """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
     keep = np.ones(len(stamps), dtype=bool)
     for column, value in (table.where or {}).items():
@@ -135,20 +135,20 @@ def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.nda
         if limit is not None:
             keep &= ~outside(stamps, limit)
     rows = np.flatnonzero(keep)
-    if len(rows) < SHORTEST:
+    if len(rows) < MIN_SAMPLES:
         raise file.wrong(
-            f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {SHORTEST} are needed"
+            f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
         )
     if len(rows) < len(stamps):
         file.notes.append(f"{len(rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
     return rows
 
 
-def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
+def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     """Parts between gaps, without those that are too short and without repeated stamps; InputError where few are left."""
     times, rows = stamps.times, stamps.rows
-    parts = _parts(times, stamps.gap)
-    grids = [even_grid(times[p]) for p in parts if _is_long(p)]
+    parts = _split_at_intervals(times, stamps.gap)
+    grids = [fit_even_stamps(times[p]) for p in parts if _is_long_enough(p)]
     even = bool(grids) and all(grid.even for grid in grids)
     distinct = np.ones(len(times), dtype=bool)
     if not even:
@@ -159,12 +159,12 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
         row = rows[int(np.argmin(distinct))] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
         times, rows = times[distinct], rows[distinct]
-        parts = _parts(times, stamps.gap)
-    kept = [p for p in parts if _is_long(p)]
-    samples = sum(map(_length, kept))
-    if samples < SHORTEST:
-        most = max(map(_length, parts))
-        raise file.wrong(f"gaps leave no {SHORTEST} samples in a row (the longest part has {most}); a log needs them")
+        parts = _split_at_intervals(times, stamps.gap)
+    kept = [p for p in parts if _is_long_enough(p)]
+    samples = sum(map(_count_samples, kept))
+    if samples < MIN_SAMPLES:
+        most = max(map(_count_samples, parts))
+        raise file.wrong(f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {most}); a log needs them")
     intervals = np.diff(times)
     if len(parts) > 1:
         widest = int(np.argmax(intervals))
@@ -178,8 +178,8 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
     if even:
         times = times.copy()
         for p, grid in zip(kept, grids, strict=True):
-            times[p] = grid.first + grid.period * np.arange(_length(p))
-        period = grids[kept.index(longest(kept))].period
+            times[p] = grid.first + grid.period * np.arange(_count_samples(p))
+        period = grids[kept.index(longest_segment(kept))].period
     sampling = Sampling(
         samples=len(stamps.times),
         median_period=stamps.median,
@@ -189,23 +189,23 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
         repeated=repeated,
         even=even,
     )
-    return Segments(times, distinct, kept, period, sampling)
+    return SegmentedStamps(times, distinct, kept, period, sampling)
 
 
-def _length(part: slice) -> int:
+def _count_samples(part: slice) -> int:
     return part.stop - part.start
 
 
-def _is_long(part: slice) -> bool:
-    return _length(part) >= SHORTEST // 2
+def _is_long_enough(part: slice) -> bool:
+    return _count_samples(part) >= MIN_SAMPLES // 2
 
 
-def _parts(stamps: np.ndarray, gap: float) -> list[slice]:
+def _split_at_intervals(stamps: np.ndarray, gap: float) -> list[slice]:
     ends = np.flatnonzero(np.diff(stamps) > gap) + 1
     return [slice(a, b) for a, b in itertools.pairwise([0, *ends.tolist(), len(stamps)])]
 
 
-class EvenGrid(NamedTuple):
+class StampFit(NamedTuple):
     """The even grid that fits stamps best: whether they lie on it, its period and its first time, s."""
 
     even: bool
@@ -213,13 +213,13 @@ class EvenGrid(NamedTuple):
     first: float
 
 
-def even_grid(stamps: np.ndarray) -> EvenGrid:
+def fit_even_stamps(stamps: np.ndarray) -> StampFit:
     """The even grid that fits increasing stamps best, in s, shape (samples,), by least squares."""
     index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     middle = stamps.mean()
     period = float(index @ (stamps - middle) / (index @ index))
     largest = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
-    rounding = resolution(np.diff(stamps))
+    rounding = find_resolution(np.diff(stamps))
     even = period > 0.0 and (largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period))
-    return EvenGrid(even, period, float(middle + period * index[0]))
+    return StampFit(even, period, float(middle + period * index[0]))

@@ -10,9 +10,9 @@ import tomli_w
 from jaxbl.files import to_jsonable, write_atomic
 from jaxbl.lines import NextStep, format_descriptions, format_table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
-from jaxbl.records.inspection import main_side, velocity
-from jaxbl.records.signal_quality import longest, low_passed, spectrum
-from jaxbl.records.time_stamps import GAP
+from jaxbl.records.inspection import compute_velocity, main_side
+from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
+from jaxbl.records.time_stamps import GAP_PERIODS
 
 from .figures import COLOURS, FAINT, Drawn, legend, limits, stacked, style, subplots
 from .page import PageTable, write_report
@@ -116,7 +116,7 @@ def _channels(record: Record) -> Drawn:
     side = main_side(record)
     unit = record.findings.channels[POSITION_CHANNELS[side]].unit
     channels = [(_CHANNELS[n][0], record.findings.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
-    rows = [*channels, (f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3])]
+    rows = [*channels, (f"{side} velocity", f"{unit}/s", compute_velocity(record, side), COLOURS[3])]
     figure, axes = stacked(len(rows), 1.5, width=7.0)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
         for segment in record.segments:
@@ -129,11 +129,11 @@ def _channels(record: Record) -> Drawn:
 
 def _spectra(record: Record) -> Drawn:
     values = {n: v for n, v in _values(record).items() if np.ptp(v)}
-    part = longest(record.segments)
+    part = longest_segment(record.segments)
     figure, axes = stacked(len(values), 2.1, "frequency (Hz)", width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
         channel = record.findings.channels[name]
-        frequency, density = spectrum(signal[part], record.sample_period)
+        frequency, density = power_spectrum(signal[part], record.sample_period)
         label, colour = _CHANNELS[name]
         ax.loglog(frequency, np.sqrt(density), color=colour, lw=1.0)
         ax.set_ylabel(f"{label}\n({channel.unit}/√Hz)")
@@ -155,12 +155,12 @@ def _torque_over_velocity(record: Record) -> Drawn:
     side = main_side(record)
     channel = record.findings.channels[POSITION_CHANNELS[side]]
     dynamics = record.findings.dynamics
-    speed = velocity(record, side)
+    speed = compute_velocity(record, side)
     torque, label, less, edge = record.torque.copy(), "torque u", "", 0
     if dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05:
         for s in record.segments:
             # the same low-pass as that of the acceleration
-            torque[s] = low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
+            torque[s] = low_pass(torque[s], 4.0 * channel.bandwidth, record.sample_period)
             torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
         label = "u less inertia torque"
         less = f" Less the torque of an inertia of {dynamics.values[0]:.4g}: a rough estimate, not an identification."
@@ -196,7 +196,7 @@ def _twist(inspection: Inspection) -> Drawn:
         chosen = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
     else:
         split, names = "the direction of motion", ("forwards", "backwards")
-        chosen = velocity(record, "load")[at] > 0.0
+        chosen = compute_velocity(record, "load")[at] > 0.0
     for ax, (x, label) in zip(axes, panels, strict=True):
         for rows, colour, name in zip((at[chosen], at[~chosen]), COLOURS, names, strict=False):
             ax.plot(x[rows], twist[rows], ".", ms=1.8, color=colour, alpha=0.6, label=name)
@@ -213,7 +213,7 @@ def _twist(inspection: Inspection) -> Drawn:
 
 def _intervals(record: Record) -> Drawn:
     ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
-    inside = record.intervals <= GAP * record.findings.sampling.median_period
+    inside = record.intervals <= GAP_PERIODS * record.findings.sampling.median_period
     ends, intervals = ends[inside], intervals[inside]
     figure, (left, right) = subplots(7.0, 2.6, columns=2, width_ratios=(3, 1), sharey=True)
     left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbl.identification.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.records.linear_filters import filtered
+from jaxbl.records.linear_filters import filter_forwards
 
 from .figures import SIDES
 
@@ -89,7 +89,7 @@ class LogSignals:
         found, part = np.full(len(values), np.nan), values[self.observed]
         if constant > 0.0 and np.isfinite(part).all():
             share = -np.expm1(-self.record.sample_period / constant)
-            part = filtered(part, [share], [share - 1.0])
+            part = filter_forwards(part, [share], [share - 1.0])
         found[self.observed] = part
         return found
 

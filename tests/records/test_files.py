@@ -397,7 +397,7 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
     np.stack([T, U], axis=1).tofile(tmp_path / "log.REC")
     assert not files.is_log(tmp_path / "log.REC")
     installed(rec=read)
-    assert files.is_log(tmp_path / "log.REC") and files.log_endings()[-1] == ".rec"
+    assert files.is_log(tmp_path / "log.REC") and files.log_suffixes()[-1] == ".rec"
     columns = read_log_file(tmp_path / "log.REC", ("t", "u"))
     for name, values in {"t": T, "u": U}.items():
         np.testing.assert_array_equal(columns.numbers(name), values)

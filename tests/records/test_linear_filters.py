@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxbl.records.linear_filters import both_ways, butterworth, filtered, low_pass_taps, parzen, slopes, welch
+from jaxbl.records.linear_filters import (
+    butterworth_coefficients,
+    filter_both_ways,
+    filter_forwards,
+    low_pass_taps,
+    parzen_window,
+    savitzky_golay_slopes,
+    welch_spectrum,
+)
 
 RANDOM = np.random.default_rng(0)
 WALK = np.cumsum(RANDOM.standard_normal((3001, 2)), axis=0)
@@ -15,26 +23,28 @@ WALK = np.cumsum(RANDOM.standard_normal((3001, 2)), axis=0)
 def test_both_ways_is_that_of_scipy(cutoff, beyond):
     sections = signal.butter(2, cutoff, output="sos")
     known = signal.sosfiltfilt(sections, WALK, axis=0, padlen=beyond)
-    assert both_ways(WALK, *butterworth(cutoff), beyond) == pytest.approx(known, rel=1e-9, abs=1e-9)
-    assert both_ways(WALK[:, 0], *butterworth(cutoff), beyond) == pytest.approx(known[:, 0], rel=1e-9, abs=1e-9)
+    assert filter_both_ways(WALK, *butterworth_coefficients(cutoff), beyond) == pytest.approx(known, rel=1e-9, abs=1e-9)
+    assert filter_both_ways(WALK[:, 0], *butterworth_coefficients(cutoff), beyond) == pytest.approx(
+        known[:, 0], rel=1e-9, abs=1e-9
+    )
 
 
 def test_one_way_begins_as_if_the_first_value_had_lasted():
     known, _ = signal.lfilter([0.1], [1.0, -0.9], WALK, axis=0, zi=0.9 * WALK[:1])
-    assert filtered(WALK, [0.1], [-0.9]) == pytest.approx(known, rel=1e-12, abs=1e-12)
-    assert filtered(np.full(7, 3.0), [0.1], [-0.9]) == pytest.approx(3.0, abs=0.0)
+    assert filter_forwards(WALK, [0.1], [-0.9]) == pytest.approx(known, rel=1e-12, abs=1e-12)
+    assert filter_forwards(np.full(7, 3.0), [0.1], [-0.9]) == pytest.approx(3.0, abs=0.0)
 
 
 @pytest.mark.parametrize("length", [16, 17, 750, 3001])
 def test_spectrum_is_that_of_scipy(length):
     known = signal.welch(WALK[:, 0], fs=1.0, nperseg=length, detrend="constant")
-    for one, other in zip(welch(WALK[:, 0], length), known, strict=True):
+    for one, other in zip(welch_spectrum(WALK[:, 0], length), known, strict=True):
         assert one == pytest.approx(other, rel=1e-9, abs=1e-12 * other.max())
 
 
 def test_windows_are_those_of_scipy():
     assert low_pass_taps(161, 1.0 / 8.0) == pytest.approx(signal.firwin(161, 1.0 / 8.0), rel=1e-12, abs=1e-15)
-    assert parzen(40) == pytest.approx(signal.windows.parzen(79)[39:], rel=1e-12)
+    assert parzen_window(40) == pytest.approx(signal.windows.parzen(79)[39:], rel=1e-12)
 
 
 @pytest.mark.parametrize("half", [2, 20, 201])
@@ -42,4 +52,4 @@ def test_slopes_are_those_of_scipy_away_from_the_ends(half):
     values = 1e4 + np.cumsum(np.random.default_rng(0).standard_normal(3001))
     inside = slice(half, -half)
     expected = signal.savgol_filter(values, 2 * half + 1, 3, deriv=1)[inside]
-    np.testing.assert_allclose(slopes(values, half)[inside], expected, atol=1e-10)
+    np.testing.assert_allclose(savitzky_golay_slopes(values, half)[inside], expected, atol=1e-10)

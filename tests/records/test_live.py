@@ -21,8 +21,8 @@ from jaxbl.records.live import (
     Datagrams,
     FollowedFile,
     Stream,
-    check_live,
-    needed,
+    check_stream_table,
+    stream_columns,
 )
 
 PERIOD = 1e-3
@@ -176,7 +176,7 @@ def test_rows_are_what_the_reader_makes_of_the_whole_log(table, tmp_path):
     log, table = tmp_path / "log.csv", LogTable.model_validate(table)
     columns().to_csv(log, index=False)
     whole = read_record(log, table)
-    check_live(table, "log")
+    check_stream_table(table, "log")
     stream = Stream(FollowedFile(log), table, PERIOD)
     found = [rows for _ in range(100) for rows in stream.poll(0.0)]
     stream.source.close()
@@ -207,7 +207,7 @@ REFUSED = {
 @pytest.mark.parametrize(("key", "table"), REFUSED.items(), ids=list(REFUSED))
 def test_what_needs_the_whole_log_is_refused(key, table):
     with pytest.raises(InputError, match=rf"log.csv: \[log\] {key}"):
-        check_live(LogTable.model_validate(table), "log.csv")
+        check_stream_table(LogTable.model_validate(table), "log.csv")
 
 
 def test_a_file_is_followed_from_its_beginning_line_by_line(tmp_path):
@@ -319,10 +319,10 @@ def test_addresses_are_checked():
 
 
 def test_fields_without_a_header_follow_the_table():
-    assert needed(LogTable()) == NAMES
+    assert stream_columns(LogTable()) == NAMES
     table = LogTable.model_validate(TABLES["difference, words"] | {"where": {"on": 1}})
-    assert needed(table) == ["ms", "word", "sum", "deg", "on"]
-    assert needed(LogTable.model_validate(TABLES["numbers, without stamps"])) == [1, 5, 3]
+    assert stream_columns(table) == ["ms", "word", "sum", "deg", "on"]
+    assert stream_columns(LogTable.model_validate(TABLES["numbers, without stamps"])) == [1, 5, 3]
 
 
 def test_polling_waits_no_longer_than_asked(datagrams):

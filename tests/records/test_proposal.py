@@ -8,7 +8,7 @@ from measured import INERTIA, VISCOUS, axis, made, real
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
 from jaxbl.records import NominalDrive, read_log_table
-from jaxbl.records.proposal import guess_log_table, propose
+from jaxbl.records.proposal import guess_log_table, propose_study
 
 
 def test_names_and_units_of_columns_are_understood(tmp_path):
@@ -61,7 +61,7 @@ def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
     speed = np.gradient(frame["theta_e"], frame["t"])
     frame = frame.rename(columns={"theta_s": "load angle"}).drop(columns="theta_e").assign(**{"motor speed": speed})
     frame.to_csv(tmp_path / "log.csv", index=False)
-    study, _, _ = propose(tmp_path / "log.csv")
+    study, _, _ = propose_study(tmp_path / "log.csv")
     config, _ = read_model(study)
     assert config.log.omega_e is not None and config.log.theta_e is None
     assert config.log.theta_s.skew == pytest.approx(3.04e-3, abs=5e-4)
@@ -70,13 +70,13 @@ def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
 def test_the_model_that_is_given_stands(tmp_path):
     made().to_csv(tmp_path / "log.csv", index=False)
     given = NominalDrive(0.004, 0.02, 2.4, 12.0, 20.0, 1234.5)
-    study, _, _ = propose(tmp_path / "log.csv", {}, gear_ratio=20.0, nominal=given)
+    study, _, _ = propose_study(tmp_path / "log.csv", {}, gear_ratio=20.0, nominal=given)
     assert study["transmission"] == {"law": "linear_shaft", "stiffness": 1234.5}
     assert study["drive"]["load_inertia"] == 2.4 and study["drive"]["gear_ratio"] == 20.0
     with pytest.raises(InputError, match="theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
-        propose(tmp_path / "log.csv", {}, gear_ratio=5.0, nominal=given)
+        propose_study(tmp_path / "log.csv", {}, gear_ratio=5.0, nominal=given)
     with pytest.raises(InputError, match="--write proposes a drive; a transmission on a test rig has none"):
-        propose(tmp_path / "log.csv", {"kind": "element"})
+        propose_study(tmp_path / "log.csv", {"kind": "element"})
 
 
 def test_friction_that_does_not_show_is_a_placeholder_of_its_own_unit(tmp_path):
@@ -85,14 +85,14 @@ def test_friction_that_does_not_show_is_a_placeholder_of_its_own_unit(tmp_path):
     place = np.sin(20.0 * t)
     frame = pd.DataFrame({"t": t, "u": 0.01 * -400.0 * place - 1e-3 * 20.0 * np.cos(20.0 * t), "theta_e": place})
     frame.to_csv(tmp_path / "log.csv", index=False)
-    study, _, _ = propose(tmp_path / "log.csv")
+    study, _, _ = propose_study(tmp_path / "log.csv")
     assert study["drive"]["motor_viscous"] == pytest.approx(0.01 * 4.0 / 20.0, rel=0.05)
 
 
 def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
     frame = made().drop(columns="theta_s")
     frame.assign(t=1e3 * frame["t"], u=-frame["u"]).to_csv(tmp_path / "log.csv", index=False)
-    study, guesses, found = propose(tmp_path / "log.csv")
+    study, guesses, found = propose_study(tmp_path / "log.csv")
     assert study["log"]["u"]["sign"] == -1 and study["log"]["t"]["unit"] == "ms"
     assert any("u is reversed" in guess for guess in guesses)
     assert found.record.sample_period == pytest.approx(1e-3)
@@ -103,7 +103,7 @@ def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
 
 def test_two_encoders_with_a_clock_and_a_zero_of_their_own(tmp_path):
     axis(3.04e-3, 0.379).to_csv(tmp_path / "log.csv", index=False)
-    study, _, found = propose(tmp_path / "log.csv")
+    study, _, found = propose_study(tmp_path / "log.csv")
     config, _ = read_model(study)
     assert config.drive.gear_ratio == 20.0
     assert config.log.theta_e.offset == pytest.approx(-0.379, abs=3e-3)
@@ -115,17 +115,17 @@ def test_what_cannot_be_guessed_is_refused(tmp_path):
     frame = made()
     frame.to_csv(tmp_path / "bare.csv", index=False, header=False)
     with pytest.raises(InputError, match="--write goes by the names of columns, and the file has none"):
-        propose(tmp_path / "bare.csv")
+        propose_study(tmp_path / "bare.csv")
     frame[["t", "u"]].to_csv(tmp_path / "short.csv", index=False)
     with pytest.raises(InputError, match="no column is called like a position or a speed: t, u;"):
-        propose(tmp_path / "short.csv")
+        propose_study(tmp_path / "short.csv")
     frame[["u", "theta_e"]].to_csv(tmp_path / "timeless.csv", index=False)
     with pytest.raises(InputError, match="no column is called like a time"):
-        propose(tmp_path / "timeless.csv")
+        propose_study(tmp_path / "timeless.csv")
 
 
 def test_an_export_of_drive_software_gives_a_study():
-    study, guesses, _ = propose(real("screw_drives/experiments/driveNo2/start_stop/50.csv"))
+    study, guesses, _ = propose_study(real("screw_drives/experiments/driveNo2/start_stop/50.csv"))
     assert study["log"]["omega_e"] == {"column": "Velocity actual value averaged", "unit": "rpm"}
     assert study["log"]["u"]["factor"] == 0.01 and any("of one %" in guess for guess in guesses)
     read_model(study)
