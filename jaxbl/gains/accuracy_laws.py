@@ -12,18 +12,15 @@ Reference: A. Levant, Higher-order sliding modes, differentiation and output-fee
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, FigureTable
-from jaxbl.errors import InputError
+from jaxbl.config.figures import check_selection, filter_rows, resolve_where
 from jaxbl.files import to_jsonable
-from jaxbl.validation import suggest_word
-
-if TYPE_CHECKING:
-    from jaxbl.sweeps.sweep import StudyResult
+from jaxbl.sweeps.sweep import StudyResult
 
 NOISE, PERIOD = "encoders.noise", "run.sample_period"
 
@@ -203,7 +200,7 @@ def _bend(log_x: np.ndarray, log_y: np.ndarray, fit: PowerLawFit) -> tuple[float
     return fit.halves[1] - fit.halves[0], math.sqrt(variance * spread)
 
 
-def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = None) -> list[Law]:
+def accuracy_laws(result: StudyResult, figures: list[FigureTable] | None = None) -> list[Law]:
     """Fit every line of the figures that name a `theory`; by default the figures of the study.
 
     Raises:
@@ -217,85 +214,18 @@ def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = Non
         check_selection(config, figure, index)
         sizes = [name for name in sizes_for(figure.value) if name in result.columns]
         # a line is judged beside those without noise and at other periods
-        fixed = {path: value for path, value in fixed_values(config, figure).items() if path not in (NOISE, PERIOD)}
+        fixed = {path: value for path, value in resolve_where(config, figure).items() if path not in (NOISE, PERIOD)}
         parts = result.batches([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
-        frame = pd.concat([_rows(part, fixed) for part in parts], ignore_index=True)
+        frame = pd.concat([filter_rows(part, fixed) for part in parts], ignore_index=True)
         found += _of_figure(config, frame, figure, index)
     return found
-
-
-def selected(config: Config, frame: pd.DataFrame, figure: FigureTable) -> pd.DataFrame:
-    """The rows that a figure's `where` leaves."""
-    return _rows(frame, fixed_values(config, figure))
-
-
-def check_selection(config: Config, figure: FigureTable, index: int) -> None:
-    """Raise `InputError` where `where` names no value of an axis, or `theory` asks for a fit to more than one line."""
-    fixed = fixed_values(config, figure, index)
-    if figure.theory is None:
-        return
-    if figure.value.rpartition(".")[2] in ("finite", "converged"):
-        raise InputError(f"figures[{index}].theory: '{figure.value}' is true or false and has no slope; leave theory out")
-    named = {path for path in (figure.x, figure.series, figure.facet, *fixed) if path is not None}
-    labels = {axis.zip for axis in config.axes if axis.path in named and axis.zip}
-    for axis in config.axes:
-        one = axis.values is not None and len(axis.values) == 1
-        if axis.path not in named and axis.zip not in labels and not one:
-            raise InputError(
-                f"figures[{index}].theory: a fit needs single lines, and '{axis.path}' varies along them; "
-                "fix it by where, series or facet"
-            )
-
-
-def fixed_values(config: Config, figure: FigureTable, index: int = 0) -> dict[str, Any]:
-    """A figure's `where`, by path, with values as the axes have them; `index` is for the message.
-
-    Raises:
-        InputError: no such axis, or no such value of it.
-    """
-    axes = {axis.path: axis for axis in config.axes}
-    fixed = {}
-    for path, wanted in (figure.where or {}).items():
-        key = f"figures[{index}].where"
-        if path not in axes:
-            hint = suggest_word(path, axes) if axes else "the study has no axes"
-            raise InputError(f"{key}: '{path}' is not an axis of this study; {hint}")
-        axis = axes[path]
-        if axis.values is None and axis.num is None:
-            raise InputError(
-                f"{key}: '{path}' is sampled quasi-randomly and repeats no value; fix an axis with num or values"
-            )
-        values = axis.grid()
-        if values.dtype == object:
-            if wanted not in values.tolist():
-                raise InputError(f"{key}: '{path}' has no value {wanted!r}; {suggest_word(str(wanted), map(str, values))}")
-            fixed[path] = wanted
-        elif wanted in ("least", "largest"):
-            fixed[path] = float(values.min() if wanted == "least" else values.max())
-        elif isinstance(wanted, str):
-            raise InputError(f"{key}: '{path}' has no value {wanted!r}; use a number, 'least' or 'largest'")
-        else:
-            close = float(values[np.argmin(np.abs(values - wanted))])
-            if not math.isclose(close, wanted, rel_tol=1e-9):
-                raise InputError(f"{key}: '{path}' has no value {wanted:g}; the nearest is {close:g}")
-            fixed[path] = close
-    return fixed
-
-
-def _rows(frame: pd.DataFrame, fixed: dict[str, Any]) -> pd.DataFrame:
-    """Rows with some values; numbers to a relative 1e-9."""
-    keep = np.ones(len(frame), dtype=bool)
-    for path, value in fixed.items():
-        column = frame[path].to_numpy()
-        keep &= column == value if isinstance(value, str) else np.isclose(column.astype(float), value, rtol=1e-9, atol=0.0)
-    return frame[keep]
 
 
 def _of_figure(config: Config, frame: pd.DataFrame, figure: FigureTable, index: int) -> Iterator[Law]:
     """The laws of a figure: one a panel and series."""
     assert figure.theory is not None
-    fixed = fixed_values(config, figure)
-    chosen = _rows(frame, fixed)
+    fixed = resolve_where(config, figure)
+    chosen = filter_rows(frame, fixed)
     for facet in [None] if figure.facet is None else sorted(chosen[figure.facet].unique()):
         for name in [None] if figure.series is None else sorted(chosen[figure.series].unique()):
             where = fixed | ({} if figure.facet is None else {figure.facet: to_jsonable(facet)})
@@ -329,7 +259,7 @@ class _Line:
         if path in self._fixed:
             return float(self._fixed[path])
         if path in self._frame:
-            values = _rows(self._frame, self._fixed)[path].unique()
+            values = filter_rows(self._frame, self._fixed)[path].unique()
             return float(values[0]) if len(values) == 1 else math.nan
         section, key = path.split(".")
         return float(getattr(getattr(config, section), key))
@@ -337,7 +267,7 @@ class _Line:
     def _means(self, column: str, other: dict[str, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Geometric means over seeds at each x > 0 along the line, or along one with `other` values."""
         path = self._figure.x
-        rows = _rows(self._frame, self._fixed | (other or {}))
+        rows = filter_rows(self._frame, self._fixed | (other or {}))
         if path not in (other or {}):
             rows = rows[rows[path] > 0.0]
         values = np.abs(rows[column].astype(float)).where(rows["finite"].astype(bool))

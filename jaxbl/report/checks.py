@@ -1,8 +1,9 @@
 """What is wrong with the figures that a study asks for, said before anything is computed, and without loading what draws."""
 
 from jaxbl.config import AxisTable, Config, FigureTable
+from jaxbl.config.figures import check_selection
 from jaxbl.errors import InputError
-from jaxbl.gains.accuracy_laws import check_selection, sizes_for
+from jaxbl.gains.accuracy_laws import sizes_for
 from jaxbl.sweeps.metrics import no_metric
 from jaxbl.validation import suggest_word
 

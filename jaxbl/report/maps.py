@@ -21,7 +21,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
-from jaxbl.gains.accuracy_laws import Law, accuracy_laws, fixed_values, selected
+from jaxbl.config.figures import filter_rows, resolve_where
+from jaxbl.gains.accuracy_laws import Law, accuracy_laws
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import is_magnitude, metric_of
@@ -117,7 +118,7 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Ro
             frame = on_coarse_values(points, frame, keys)
         if dots is not None:
             frame = frame[frame[dots.name].isin(dots)]
-        return selected(config, frame, figure)
+        return filter_rows(frame, resolve_where(config, figure))
 
     needs = [*(figure.where or {}), *([] if dots is None else [dots.name]), *([] if points is None else columns)]
     return Rows(result, columns, shown, needs)
@@ -570,7 +571,7 @@ def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
 
 def _where(config: Config, spec: FigureTable) -> str:
     """What a figure fixes, for its caption."""
-    fixed = [_with_value(config, path, value) for path, value in fixed_values(config, spec).items()]
+    fixed = [_with_value(config, path, value) for path, value in resolve_where(config, spec).items()]
     return f" where {', '.join(fixed)}" if fixed else ""
 
 
