@@ -31,7 +31,10 @@ Number = Any  # a number of one lane: Float[Array, ""] inside a step
 
 
 class Run(eqx.Module):
-    """The grid of time, and the tolerances of the metric `converged`; `steps` is the number of samples."""
+    """The grid of time, and the tolerances of the metric `converged`.
+
+    `steps` is the number of samples of a run.
+    """
 
     sample_period: Scalar = parameter("s", "period of encoders, observers, identifier", default=1e-3, above=0.0, fixed=True)
     steps: int = eqx.field(static=True, default=20_000)

@@ -1,4 +1,4 @@
-"""Position sensors: Gaussian noise and quantisation, each side by itself."""
+"""Position encoders with Gaussian noise and quantisation."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +8,10 @@ from .parameters import Scalar, parameter
 
 
 class Encoders(eqx.Module):
-    """Encoders on motor and load shaft, sampled without delay."""
+    """Encoders on motor and load shaft, sampled without delay: y = q round((theta + sigma n) / q).
+
+    Here sigma is the rms noise of the side's encoder, q its count, and n a draw of a standard normal distribution.
+    """
 
     noise: Scalar = parameter("rad", "rms noise of the motor encoder", default=0.0, minimum=0.0)
     load_noise: Scalar | None = parameter(
@@ -18,7 +21,7 @@ class Encoders(eqx.Module):
     load_resolution: Scalar = parameter("rad", "load encoder count; 0 is ideal", default=0.0, minimum=0.0)
 
     def noise_of(self, side: str, ratio: Scalar) -> Scalar:
-        """Rms noise of a side's encoder in rad; `ratio` is motor angle per angle of the side."""
+        """Rms noise of a side's encoder, rad; `ratio` is the motor angle for one unit of the side's angle."""
         if side == "motor":
             return self.noise
         return self.noise / ratio if self.load_noise is None else self.load_noise
@@ -26,7 +29,17 @@ class Encoders(eqx.Module):
     def measure(
         self, side: str, position: Float[Array, ""], unit_noise: Float[Array, ""], ratio: Scalar
     ) -> Float[Array, ""]:
-        """Reading in rad for a true position in rad and one sample of unit noise."""
+        """Read a true position (rad).
+
+        Args:
+            side: "motor" or "load".
+            position: true position, rad, as the effects of encoders change it.
+            unit_noise: draw of a standard normal distribution.
+            ratio: motor angle for one unit of the side's angle.
+
+        Returns:
+            The reading, rad.
+        """
         noisy = position + self.noise_of(side, ratio) * unit_noise
         resolution = self.motor_resolution if side == "motor" else self.load_resolution
         count = jnp.where(resolution > 0.0, resolution, 1.0)

@@ -1,6 +1,7 @@
-"""Input torque u(t), evaluated once a sample and held until the next (zero-order hold, as a drive does it).
+"""Excitations: the input torque u(t), evaluated once a sample and held until the next (zero-order hold, as in a drive).
 
-Further packages add inputs through the entry-point group `jaxbl.excitations`; the entry's name is the input's.
+Installed packages add excitations by the entry-point group `jaxbl.excitations`; the entry point's name is the
+excitation's.
 """
 
 import abc
@@ -19,42 +20,49 @@ from .parameters import Scalar, option, parameter
 
 
 class AbstractExcitation(eqx.Module):
-    """An input signal."""
+    """An input signal; `name` is the key `kind` of the config."""
 
     name: ClassVar[str]
 
     @abc.abstractmethod
     def __call__(self, time: Float[Array, ""]) -> Float[Array, ""]:
-        """Torque in N m at a time in s."""
+        """Torque u, N m, at a time in s."""
 
     @classmethod
     def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
-        """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
-        what would be right; "" if nothing is."""
+        """Say what is wrong with a study's `numbers`, of which each is in its range, and what would be right.
+
+        Args:
+            numbers: of this excitation, by config key.
+            period: sampling period, s.
+
+        Returns:
+            One line, or "" if nothing is wrong.
+        """
         return ""
 
 
-def _too_fast(what: str, frequency: float, period: float) -> str:
-    """A wave is sampled before it is held: from half the sampling rate on, its samples are those of a slower one."""
+def _aliasing_fault(name: str, frequency: float, period: float) -> str:
+    # from half the sampling rate on, the samples of a wave are those of a slower one
     if frequency * period < 0.5:
         return ""
-    return f"{what} {frequency:g} Hz has to be below half the sampling rate, {0.5 / period:g} Hz; run.sample_period sets it"
+    return f"{name} {frequency:g} Hz has to be below half the sampling rate, {0.5 / period:g} Hz; run.sample_period sets it"
 
 
-def _too_short(hold: float, period: float) -> str:
-    """Levels that are shorter than a sample are mostly never seen."""
+def _hold_fault(hold: float, period: float) -> str:
+    # most levels that are shorter than a sample are never applied
     if hold > (1.0 - 1e-6) * period:
         return ""
     return f"hold {hold:g} s has to be at least run.sample_period, {period:g} s"
 
 
 EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractExcitation))
-"""The inputs by name: the built-in ones and those of installed packages."""
+"""Excitations by name, those of installed packages included."""
 
 
 @EXCITATIONS.add
 class Sine(AbstractExcitation):
-    """offset + amplitude sin(2 pi frequency t + phase)."""
+    """Sine: u = offset + amplitude sin(2 pi frequency t + phase)."""
 
     name: ClassVar[str] = "sine"
     amplitude: Scalar = parameter("N m", "amplitude")
@@ -64,7 +72,7 @@ class Sine(AbstractExcitation):
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _too_fast("frequency", numbers["frequency"], period)
+        return _aliasing_fault("frequency", numbers["frequency"], period)
 
     def __call__(self, time):
         return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * time + self.phase)
@@ -72,21 +80,21 @@ class Sine(AbstractExcitation):
 
 @EXCITATIONS.add
 class Multisine(AbstractExcitation):
-    """`count` harmonics of `frequency` with equal amplitudes and Schroeder phases -pi k (k - 1) / count.
+    """Multisine: u = amplitude / sqrt(n) sum_k cos(2 pi k frequency t - pi k (k - 1) / n), k = 1 ... n, with n = `count`.
 
-    `amplitude` is that of a sine of the same power: each harmonic has amplitude / sqrt(count).
+    Its power is that of a sine with this amplitude. The phases are Schroeder's, which keep peaks low.
     Reference: M. R. Schroeder, IEEE Trans. Inf. Theory 16 (1970).
     """
 
     name: ClassVar[str] = "multisine"
     amplitude: Scalar = parameter("N m", "amplitude of the sine of equal power")
     frequency: Scalar = parameter("Hz", "fundamental frequency", above=0.0)
-    # each is computed anew at every sample of every lane; more of them are a recorded input
+    # every harmonic is computed at every sample of every lane; an input with more harmonics should be recorded
     count: int = option("number of harmonics", default=8, minimum=1, maximum=10_000)
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _too_fast("the highest harmonic,", numbers["count"] * numbers["frequency"], period)
+        return _aliasing_fault("the highest harmonic,", numbers["count"] * numbers["frequency"], period)
 
     def __call__(self, time):
         k = jnp.arange(1, self.count + 1, dtype=jnp.result_type(time))
@@ -97,7 +105,7 @@ class Multisine(AbstractExcitation):
 
 @EXCITATIONS.add
 class Chirp(AbstractExcitation):
-    """Sine whose frequency moves linearly from `start_frequency` to `stop_frequency` over `sweep_time`, then stays."""
+    """Chirp: a sine whose frequency moves linearly from `start_frequency` to `stop_frequency` in `sweep_time` and stays."""
 
     name: ClassVar[str] = "chirp"
     amplitude: Scalar = parameter("N m", "amplitude")
@@ -107,29 +115,29 @@ class Chirp(AbstractExcitation):
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _too_fast("the highest frequency,", max(numbers["start_frequency"], numbers["stop_frequency"]), period)
+        return _aliasing_fault("the highest frequency,", max(numbers["start_frequency"], numbers["stop_frequency"]), period)
 
     def __call__(self, time):
-        swept = jnp.minimum(time, self.sweep_time)
+        sweep = jnp.minimum(time, self.sweep_time)
         rate = (self.stop_frequency - self.start_frequency) / self.sweep_time
-        turns = (self.start_frequency + 0.5 * rate * swept) * swept + self.stop_frequency * (time - swept)
+        turns = (self.start_frequency + 0.5 * rate * sweep) * sweep + self.stop_frequency * (time - sweep)
         return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
 
 
-def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
+def _rounding_bound(time: Float[Array, ""]) -> Float[Array, ""]:
     """Bound on the rounding error of a time (or a ratio of times) that is a multiple of a rounded period."""
-    return 4.0 * float(jnp.finfo(jnp.result_type(value)).eps) * value
+    return 4.0 * float(jnp.finfo(jnp.result_type(time)).eps) * time
 
 
-def _held(hold: Scalar, time: Float[Array, ""]) -> Array:
-    """Index of the hold interval; a little early rather than a sample late where rounding meets an edge."""
+def _hold_index(hold: Scalar, time: Float[Array, ""]) -> Array:
+    """Index of the hold interval at a time; at an edge a little early, since rounding must not make it a sample late."""
     holds = time / hold
-    return jnp.floor(holds + 1e-4 + _rounding(holds)).astype(jnp.int32)
+    return jnp.floor(holds + 1e-4 + _rounding_bound(holds)).astype(jnp.int32)
 
 
 @EXCITATIONS.add
 class Steps(AbstractExcitation):
-    """Random levels, uniform in [-amplitude, amplitude], each held for `hold` seconds."""
+    """Random steps: levels that are uniform in [-amplitude, amplitude], each held for `hold` seconds."""
 
     name: ClassVar[str] = "steps"
     amplitude: Scalar = parameter("N m", "largest level")
@@ -138,11 +146,11 @@ class Steps(AbstractExcitation):
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _too_short(numbers["hold"], period)
+        return _hold_fault(numbers["hold"], period)
 
     def __call__(self, time):
-        # a stream of its own: encoder noise is drawn from the plain key of its seed
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), _held(self.hold, time))
+        # 0x57E9 separates the levels from encoder noise of the same seed
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), _hold_index(self.hold, time))
         level = jax.random.uniform(key, (), jnp.float32, -1.0, 1.0)
         return self.amplitude * level.astype(jnp.result_type(time))
 
@@ -158,19 +166,19 @@ class Prbs(AbstractExcitation):
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _too_short(numbers["hold"], period)
+        return _hold_fault(numbers["hold"], period)
 
     def __call__(self, time):
-        from scipy.signal import max_len_seq  # half a second that only this input needs
+        from scipy.signal import max_len_seq  # its import takes half a second, which only this excitation needs
 
         bits, _ = max_len_seq(self.order)
         levels = 2.0 * jnp.asarray(bits, jnp.result_type(time)) - 1.0
-        return self.amplitude * levels[_held(self.hold, time) % len(levels)]
+        return self.amplitude * levels[_hold_index(self.hold, time) % len(levels)]
 
 
 @EXCITATIONS.add
 class Recorded(AbstractExcitation):
-    """Samples played back with zero-order hold; the last one is held on."""
+    """Recorded torque with zero-order hold; the last sample is held on. `times` are in s, `torques` in N m."""
 
     name: ClassVar[str] = "recorded"
     times: Float[Array, " samples"]
@@ -178,6 +186,6 @@ class Recorded(AbstractExcitation):
     gain: Scalar = parameter("", "factor on the recorded torque", default=1.0)
 
     def __call__(self, time):
-        # half a microsecond of slack: time stamps are decimal numbers
-        index = jnp.searchsorted(self.times, time + 5e-7 + _rounding(time), side="right") - 1
+        # half a microsecond of slack, as time stamps are rounded decimal numbers
+        index = jnp.searchsorted(self.times, time + 5e-7 + _rounding_bound(time), side="right") - 1
         return self.gain * self.torques[jnp.clip(index, 0)]

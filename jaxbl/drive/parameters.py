@@ -1,7 +1,7 @@
-"""Physical numbers as leaves: how modules declare them, and how a dotted config path finds them.
+"""Physical numbers as leaves of a tree: modules declare them, and dotted config paths find them.
 
-Every number of a drive, effect, sensor or observer is declared once, by :func:`parameter`, with its unit, its range
-and a line of text. The config validation, the axis labels of the figures and the reference pages are read from there.
+Every number of a drive, effect, encoder or observer is declared once, by :func:`parameter`, with its unit, its range
+and a line of text. Validation of a config, axis labels of figures and the reference are made from that.
 """
 
 import dataclasses
@@ -16,14 +16,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = float | Float[Array, ""]
-"""A number of a module: a Python float before, a zero-dimensional array after :func:`as_arrays`."""
+"""A number of a module: a Python float at first, a zero-dimensional array after :func:`as_arrays`."""
 
 Tree = TypeVar("Tree")
 
 
 class Parameter(NamedTuple):
-    """What is known of one number: SI unit, description, the range in which it makes sense, and the part that it plays in
-    an effect (:class:`jaxbl.drive.effects.Role`)."""
+    """The declaration of one number.
+
+    Attributes:
+        unit: SI unit; "" if dimensionless.
+        doc: description, one line.
+        minimum, above, maximum: its range: inclusive, exclusive, inclusive.
+        role: the part that it plays in an effect (:class:`jaxbl.drive.effects.Role`).
+    """
 
     unit: str
     doc: str
@@ -41,72 +47,77 @@ def parameter(
     fixed: bool = False,
     static: bool = False,
     kw_only: bool = False,
-    **about: Any,
+    **limits: Any,
 ) -> Any:
     """Declare a number of a module as an `equinox` field.
 
     Args:
-        unit: SI unit as printed on axes; "" where dimensionless.
+        unit: SI unit as printed on axes; "" if dimensionless.
         doc: one line for the reference.
-        default: value where the config gives none; without it the key is required.
-        fixed: what is compiled depends on the number, so that an axis over it has one program a value.
-        static: the number is no leaf at all.
-        kw_only: given by name alone; numbers of classes derived from this one then come first.
-        **about: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
+        default: used if the config lacks the key; without a default the key is required.
+        fixed: the compiled program depends on the number, so that an axis over it has one program a value.
+        static: the number is no leaf.
+        kw_only: passed by name only; numbers of derived classes then come first.
+        **limits: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
+
+    Example:
+        >>> class Damper(eqx.Module):
+        ...     damping: Scalar = parameter("N m s/rad", "damping D", minimum=0.0)
     """
-    metadata = {"parameter": Parameter(unit, doc, **about), "fixed": fixed}
+    metadata = {"parameter": Parameter(unit, doc, **limits), "fixed": fixed}
     return eqx.field(static=static, default=default, kw_only=kw_only, metadata=metadata)
 
 
-def option(doc: str, **about: Any) -> Any:
-    """Declare a choice that is fixed at compile time (a count, a seed, a name), not a leaf."""
-    return parameter("", doc, fixed=True, static=True, **about)
+def option(doc: str, **limits: Any) -> Any:
+    """Declare a choice that is fixed at compile time (a count, a seed, a name) and no leaf; arguments as of
+    :func:`parameter`."""
+    return parameter("", doc, fixed=True, static=True, **limits)
 
 
 def parameters(module: Any) -> Iterator[tuple[dataclasses.Field, Parameter]]:
-    """The declared fields of a module or module class, in order; those given by name alone last."""
+    """Yield the declared fields of a module or its class with their declarations; fields passed by name only come last."""
     for field in sorted(dataclasses.fields(module), key=lambda field: field.kw_only is True):
         if "parameter" in field.metadata:
             yield field, field.metadata["parameter"]
 
 
 def config_key(field_name: str) -> str:
-    """Config key of a field: `lambda_` is a Python name for `lambda`."""
+    """Return the config key of a field: `lambda` for `lambda_`, as the Python keyword cannot name a field."""
     return field_name[:-1] if field_name.endswith("_") and keyword.iskeyword(field_name[:-1]) else field_name
 
 
 def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
-    """Dotted paths of all numeric leaves that an axis may vary, e.g. `observer.motor.alpha`.
+    """Find the dotted paths of all numbers that an axis may vary, e.g. `observer.motor.alpha`, with their declarations.
 
     A member of a tuple is named by its `name` attribute (effects: `effects.load.coulomb_friction.torque`), or by its
-    position where two members share a name. Leaves that are `None` or static are left out.
+    position if two members share a name. Leaves that are `None`, fixed or static are left out.
     """
-    found: dict[str, Parameter] = {}
+    paths: dict[str, Parameter] = {}
     for field in dataclasses.fields(tree):
-        value, path, known = getattr(tree, field.name), f"{prefix}{config_key(field.name)}", field.metadata
-        parts = {f"{path}.{key}": one for key, one in _members(value).items()} if isinstance(value, tuple) else {path: value}
-        for path, part in parts.items():
-            if dataclasses.is_dataclass(part):
-                found |= leaf_paths(part, f"{path}.")
-            elif part is not None and "parameter" in known and not known["fixed"]:
-                found[path] = known["parameter"]
-    return found
+        path, branch = f"{prefix}{config_key(field.name)}", getattr(tree, field.name)
+        branches = {path: branch}
+        if isinstance(branch, tuple):
+            branches = {f"{path}.{name}": member for name, member in _members_by_name(branch).items()}
+        for path, branch in branches.items():
+            if dataclasses.is_dataclass(branch):
+                paths |= leaf_paths(branch, f"{path}.")
+            elif branch is not None and "parameter" in field.metadata and not field.metadata["fixed"]:
+                paths[path] = field.metadata["parameter"]
+    return paths
 
 
-def _members(values: tuple) -> dict[str, Any]:
-    names = [getattr(value, "name", str(i)) for i, value in enumerate(values)]
-    return {
-        name if names.count(name) == 1 else str(i): value for i, (name, value) in enumerate(zip(names, values, strict=True))
-    }
+def _members_by_name(members: tuple) -> dict[str, Any]:
+    names = [getattr(member, "name", str(i)) for i, member in enumerate(members)]
+    return {name if names.count(name) == 1 else str(i): members[i] for i, name in enumerate(names)}
 
 
 def get_leaf(tree: Any, path: str) -> Any:
-    """The leaf that a dotted path names. Raises `KeyError` where there is none."""
+    """Return the leaf at a dotted path. Raises `KeyError` if there is none."""
     keys = path.split(".")
     while keys:
         if isinstance(tree, tuple):
-            members = _members(tree)
-            # a member's own name may hold dots (`load.coulomb_friction`)
+            members = _members_by_name(tree)
+            # the name of a member may have dots (`load.coulomb_friction`)
             for count in range(1, len(keys) + 1):
                 if (name := ".".join(keys[:count])) in members:
                     tree, keys = members[name], keys[count:]
@@ -122,43 +133,48 @@ def get_leaf(tree: Any, path: str) -> Any:
 
 
 def set_leaves(tree: Tree, values: Mapping[str, Any]) -> Tree:
-    """A copy of `tree` in which the leaves named by dotted paths have new values. Raises `KeyError` where there is none."""
+    """Return a copy of `tree` with new values at some dotted paths. Raises `KeyError` for a path without a leaf.
+
+    Example:
+        >>> stiffer = set_leaves(experiment, {"transmission.stiffness": 2.0, "observer.motor.alpha": 30.0})
+    """
     by_member: dict[str, dict[str, Any]] = {}
-    members = _members(tree) if isinstance(tree, tuple) else None
+    members = _members_by_name(tree) if isinstance(tree, tuple) else None
     for path, value in values.items():
         if members is None:
-            key, _, rest = path.partition(".")
+            key, _, subpath = path.partition(".")
             key = f"{key}_" if keyword.iskeyword(key) else key
             if not hasattr(tree, key):
                 raise KeyError(path)
         else:
-            # a member's own name may hold dots (`load.coulomb_friction`)
+            # the name of a member may have dots (`load.coulomb_friction`)
             keys = path.split(".")
             splits = ((".".join(keys[:count]), ".".join(keys[count:])) for count in range(1, len(keys) + 1))
-            key, rest = next((one for one in splits if one[0] in members), ("", ""))
+            key, subpath = next((split for split in splits if split[0] in members), ("", ""))
             if not key:
                 raise KeyError(path)
-        by_member.setdefault(key, {})[rest] = value
+        by_member.setdefault(key, {})[subpath] = value
     if not by_member:
         return tree
 
-    def new(old: Any, inside: Mapping[str, Any]) -> Any:
-        return inside[""] if "" in inside else set_leaves(old, inside)
+    def change(member: Any, new: Mapping[str, Any]) -> Any:
+        return new[""] if "" in new else set_leaves(member, new)
 
     if members is None:
-        changed = {key: new(getattr(tree, key), inside) for key, inside in by_member.items()}
+        changed = {key: change(getattr(tree, key), new) for key, new in by_member.items()}
         return dataclasses.replace(tree, **changed)  # type: ignore[type-var]
-    return tuple(new(old, by_member[key]) if key in by_member else old for key, old in members.items())  # type: ignore[return-value]
+    changed = {key: change(members[key], new) for key, new in by_member.items()}
+    return tuple((members | changed).values())  # type: ignore[return-value]
 
 
 def as_arrays(tree: Tree, dtype: Any) -> Tree:
-    """Cast every inexact leaf to `dtype`, so that one compiled program serves all values."""
+    """Cast every floating-point leaf to an array of `dtype`, so that one compiled program serves all values."""
 
     def cast(leaf: Any) -> Any:
         if isinstance(leaf, float) or (eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.inexact)):
-            # of a number known here `jnp.asarray` makes a program
-            known = isinstance(leaf, float | np.ndarray | np.generic)
-            return jax.device_put(np.asarray(leaf, dtype)) if known else jnp.asarray(leaf, dtype)
+            # `jnp.asarray` would compile a program for a number that is no JAX array yet
+            on_host = isinstance(leaf, float | np.ndarray | np.generic)
+            return jax.device_put(np.asarray(leaf, dtype)) if on_host else jnp.asarray(leaf, dtype)
         return leaf
 
     return jax.tree.map(cast, tree)
