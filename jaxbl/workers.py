@@ -1,18 +1,20 @@
 """Independent jobs in worker processes, on all cores: progress, interrupts, and memory of compiled programs."""
 
 import gc
+import itertools
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -108,6 +110,29 @@ def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: 
                 for child in multiprocessing.active_children():
                     with suppress(ProcessLookupError):
                         os.kill(child.pid, signal.SIGINT)  # pyright: ignore[reportArgumentType]
+
+
+def map_in_threads(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+    """Return the results of a function for each of its arguments, as `map` does, in one thread a device.
+
+    The function should spend its time in compiled loops, which do not hold the interpreter.
+    """
+    import jax
+
+    devices = len(jax.local_devices())
+    return list((map if devices == 1 else _thread_pool(devices).map)(function, *arguments))
+
+
+@cache
+def _thread_pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that stay: to start one takes as long as a short loop."""
+    return ThreadPoolExecutor(threads, "jaxbl-loop")
+
+
+def make_stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
+    """Return a function to be called after each stage: it tells `progress` how many stages are finished."""
+    finished = itertools.count(1)
+    return lambda: progress(next(finished), stages) if progress is not None else None
 
 
 _job_running = _interrupted = False

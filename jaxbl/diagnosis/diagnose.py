@@ -17,10 +17,10 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
-from jaxbl.identification.logs import Logs, arrays, gains_for, stage_counter
+from jaxbl.identification.logs import Logs, arrays, gains_for
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress, announce, limit_blas_threads
+from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import (
@@ -125,7 +125,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         InputError: a model that diverges.
     """
     alone = task.config.drive.kind == "two_inertia" and "load" not in task.record.positions
-    done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
+    done = make_stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
     with jax.enable_x64(True), limit_blas_threads():
         if alone:
             found = diagnose_alone(task, done)

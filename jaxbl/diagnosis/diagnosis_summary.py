@@ -14,7 +14,6 @@ import pandas as pd
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import parameters
-from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
@@ -58,12 +57,12 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str
         for side, one in located.items():
             least, unit = (
                 SIGNIFICANT * one.coordinates["all"].regions[0].mean_error,
-                unit_on(record, f"{side}.torque", "N m"),
+                record.unit_of(f"{side}.torque", "N m"),
             )
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     if (noise := setup.input_noise.unfelt) > 0.0:
         notes.append(
-            f"The channel u carries noise of {noise:.2g} {unit_on(record, 'motor.torque', 'N m')} rms "
+            f"The channel u carries noise of {noise:.2g} {record.unit_of('motor.torque', 'N m')} rms "
             f"({noise / input_rms(record):.1%} of the input) that the drive does not feel: models are driven by u smoothed "
             "between its jumps."
         )
@@ -84,7 +83,7 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str
                 "value": values[one.path],
                 "standard_error": errors[one.path],
                 "nominal": one.nominal,
-                "unit": unit_on(record, one.path, one.unit),
+                "unit": record.unit_of(one.path, one.unit),
             }
             for one in setup.own
         },
@@ -103,7 +102,7 @@ def _finding(
         leaf: {
             "value": values.get(f"effects.{one.effect}.{leaf}", value),
             "standard_error": errors.get(f"effects.{one.effect}.{leaf}", 0.0),
-            "unit": unit_on(record, f"{one.effect}.{leaf}", units[leaf]),
+            "unit": record.unit_of(f"{one.effect}.{leaf}", units[leaf]),
         }
         for leaf, value in one.numbers.items()
     }
@@ -153,7 +152,7 @@ def tested(
 
 def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contradiction]) -> list[dict[str, Any]]:
     """Numbers that two logs show to be different, in the log's units."""
-    units = {one.path: unit_on(record, one.path, one.unit) for one in fitted.free}
+    units = {one.path: record.unit_of(one.path, one.unit) for one in fitted.free}
     return [
         {
             "parameter": one.path,
@@ -167,7 +166,7 @@ def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contr
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
     """Where a model lacks torque, by side, with sentences in the log's units."""
     return {
-        name: dataclasses.asdict(one) | {"sentence": sentence_of(one, unit_on(record, f"{name}.torque", "N m"))}
+        name: dataclasses.asdict(one) | {"sentence": sentence_of(one, record.unit_of(f"{name}.torque", "N m"))}
         for name, one in located.items()
     }
 

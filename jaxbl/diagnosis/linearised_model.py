@@ -24,7 +24,6 @@ from jaxtyping import Float
 from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused import in_threads
 from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
@@ -34,6 +33,7 @@ from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
+from jaxbl.workers import map_in_threads
 
 from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
@@ -510,7 +510,7 @@ class Linear:
         jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]
         total, power = np.zeros((at, at)), np.zeros(at)
         first = 1 + own
-        for gram, squares in in_threads(products, *zip(*jobs, strict=True)):
+        for gram, squares in map_in_threads(products, *zip(*jobs, strict=True)):
             last = first + len(squares)
             index = np.array([*range(1 + own), *range(first, last)])
             if first > 1 + own:

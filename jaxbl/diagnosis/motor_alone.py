@@ -18,12 +18,13 @@ from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.errors import InputError
 from jaxbl.identification.intervals import UNSEEN, Spread
-from jaxbl.identification.logs import default_paths, on_record, unit_on
+from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
-from jaxbl.identification.segments import reading_noise, segments_of, white_noise
+from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
 
@@ -225,7 +226,7 @@ def _summary(
     limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
     left, size = model.unexplained(alone.point), input_rms(record)
     # noise of the recorded torque, which is known within a factor of two
-    allowed = max(2.0 * white_noise([one.torque for one in model.segments]), _LEAST * size)
+    allowed = max(2.0 * estimate_white_noise([one.torque for one in model.segments]), _LEAST * size)
     far = {one.path: theta / task.config.uncertainty.relative for one, theta in _changes(search, alone)}
     far = {path: z for path, z in far.items() if abs(z) > _FAR}
     # a gap that the readings call for, or leave to be so wide that the load is never met, but do not show
@@ -233,7 +234,7 @@ def _summary(
     names = [name for name, i in search.effects.items() if name not in out and not (doubtful and is_gap(model.free[i]))]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
     verdict = "unknown_effect" if failed or remainder or far or doubtful else "explained" if names else "no_discrepancy"
-    force = unit_on(record, "motor.torque", "N m")
+    force = record.unit_of("motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
         f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); "
@@ -251,7 +252,7 @@ def _summary(
                     one.path.rpartition(".")[2]: {
                         "value": alone.values[one.path],
                         "standard_error": alone.values[one.path] * (deviation.get(one.path) or float("nan")),
-                        "unit": unit_on(record, one.path, one.unit),
+                        "unit": record.unit_of(one.path, one.unit),
                     }
                     for one in places
                 },
@@ -277,7 +278,7 @@ def _summary(
                 "value": values[one.path][1],
                 "standard_error": values[one.path][1] * (values[one.path][2] or float("nan")),
                 "nominal": one.nominal,
-                "unit": unit_on(record, one.path, one.unit),
+                "unit": record.unit_of(one.path, one.unit),
             }
             for one in _own(search)
         },

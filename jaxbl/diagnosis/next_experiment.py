@@ -21,7 +21,7 @@ from jaxbl.drive.effects import Backlash
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.logs import LogTask, default_paths, on_record, unit_on
+from jaxbl.identification.logs import LogTask, default_paths, on_record
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.unseen_load import GAPS
 from jaxbl.records import Record
@@ -138,7 +138,7 @@ def write_gap_experiment(
     with jax.enable_x64(True):
         models = [on_record(each, record) for each in (model, with_gap(model, said["path"], half))]
         found = _parting(models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0)
-    what = f"a half gap of {half:.3g} {unit_on(record, 'motor.position', 'rad')}"
+    what = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
     if found is None:
         return [f"No input stays within the torque and travel allowed that would show {what}: --max-torque, --max-travel."]
     return [f"To show {what}: {_written(found, record, path)}"]
@@ -164,7 +164,7 @@ def _written(found: Input, record: Record, path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}; name another file") from None
     clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
-    unit = unit_on(record, "motor.torque", "N m")
+    unit = record.unit_of("motor.torque", "N m")
     mean = f" about a mean of {found.mean:.3g} {unit}" if found.mean else ""
     return (
         f"{found.kind} of {found.amplitude:.3g} {unit}{mean}, {found.frequency:.3g} Hz, "

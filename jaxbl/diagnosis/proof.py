@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters
-from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
@@ -341,4 +340,4 @@ _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
 
 def _unit(record: Record, name: str) -> str:
     side = "load" if name in ("theta_s", "velocity_load", "torque_load") else "motor"
-    return unit_on(record, f"{side}.position", _UNITS[name.split("_")[0]])
+    return record.unit_of(f"{side}.position", _UNITS[name.split("_")[0]])

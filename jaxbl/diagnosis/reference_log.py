@@ -15,10 +15,11 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import simulate_plants
-from jaxbl.identification.segments import Segment, reading_noise, white_noise, windows_of
+from jaxbl.identification.segments import Segment, reading_noise, windows_of
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
 from .free_starts import Run, best_runs
@@ -113,7 +114,7 @@ class ReferenceLog:
         found = self.noise_floor(compared.torques) | _all_rms(self.slow(compared.torques, "deviation"))
         for side, noise in self.noise.items():
             position = POSITION_CHANNELS[side]
-            more = max(1.0, white_noise(list(compared.samples[position])) / noise)
+            more = max(1.0, estimate_white_noise(list(compared.samples[position])) / noise)
             for name in found:
                 if name == position or name.partition(" ")[0].endswith(f"_{side}"):
                     found[name] *= more

@@ -22,8 +22,9 @@ from scipy.ndimage import gaussian_filter1d
 from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
-from jaxbl.identification.segments import Segment, white_noise
+from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
@@ -222,7 +223,7 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     found: dict[str, list[Residual]] = {side: [] for side in experiment.sides}
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
-        sensor = 0.0 if part.transmitted is None else white_noise([np.asarray(part.transmitted)])
+        sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])
         equations = _along(experiment, segment)
         for side, pieces in found.items():
             one, slopes = equations[side], (equations[side].by_position, equations[side].by_velocity)

@@ -8,9 +8,10 @@ import numpy as np
 
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import Segment, segments_of, white_noise
+from jaxbl.identification.segments import Segment, segments_of
 from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues, all_coordinates
@@ -118,7 +119,7 @@ def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
 def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> InputNoise:
     """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
     `size`, that is not asked."""
-    noise = white_noise([one.torque for one in segments])
+    noise = estimate_white_noise([one.torque for one in segments])
     if not _NOISY * size < noise:
         return InputNoise(0.0, noise)
     # the model as given: numbers that may change would absorb some of the noise

@@ -7,11 +7,9 @@ either; `single_plant` does what a log asks for, one plant's path and the deriva
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
 
 import jax
 
@@ -39,15 +37,3 @@ def raising_unsupported(what: str = f"compilation with JAX {jax.__version__}") -
 def warn_of_scan(why: str) -> None:
     """On stderr, once; for what has no report that could say it."""
     logging.getLogger(__name__).warning(SCAN_MESSAGE, why)
-
-
-def in_threads(function: Callable[..., Any], *jobs: Iterable[Any]) -> list[Any]:
-    """Results of a function that calls loops, which do not hold the interpreter, for each job: one thread a device."""
-    count = len(jax.local_devices())
-    return list((map if count == 1 else _threads(count).map)(function, *jobs))
-
-
-@cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    """They stay: to start one takes as long as a short loop."""
-    return ThreadPoolExecutor(count, "jaxbl-loop")

@@ -13,7 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from . import Unsupported, in_threads, program_cache, raising_unsupported, warn_of_scan
+from jaxbl.workers import map_in_threads
+
+from . import Unsupported, program_cache, raising_unsupported, warn_of_scan
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 _NOTHING = 1e-60
@@ -74,7 +76,7 @@ class LinearPredictor:
                 self.loop([ArrayRows(one) for one in given], count, 0, self.whole)
             return carry[:, : self.width], errors[:, :, : self.width]
 
-        found = [one(changes[0], gains[0])] if len(gains) == 1 else in_threads(one, changes, gains)
+        found = [one(changes[0], gains[0])] if len(gains) == 1 else map_in_threads(one, changes, gains)
         return [change for change, _ in found], [errors for _, errors in found]
 
 

@@ -17,8 +17,9 @@ import numpy as np
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, correct_by_readings, move_plant
+from jaxbl.workers import map_in_threads
 
-from . import Unsupported, in_threads, program_cache, raising_unsupported, warn_of_scan
+from . import Unsupported, program_cache, raising_unsupported, warn_of_scan
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -99,7 +100,7 @@ def _run(
         given = ArrayRows(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
         loop([*carry, *given], samples, 0, 1)
 
-    in_threads(one, range(runs))
+    map_in_threads(one, range(runs))
     return shape.unflatten(kept)
 
 
@@ -191,7 +192,7 @@ def step_derivatives(
         # all find the same new state
         loop([*values, ArrayRows(numbers), ArrayRows(way), ArrayRows(change), ArrayRows(new)], 1, 0, whole)
 
-    in_threads(along, ways, changes)
+    map_in_threads(along, ways, changes)
     return changes[:, :, :count], new[:, :count]
 
 

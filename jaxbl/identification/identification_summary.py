@@ -15,7 +15,7 @@ from jaxbl.simulate import Experiment
 
 from .compilation import jit
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
-from .logs import LogTask, decimation, unit_on
+from .logs import LogTask, decimation
 from .regression import Kinematics, errors, regress
 from .search import Found
 from .segments import long_enough, reading_noise, segments_of, windows_of
@@ -27,7 +27,7 @@ def torque_errors(
 ) -> dict[str, dict[str, Any]]:
     """How far a model misses the torques of a log after decimation, by equation, with units."""
     found = errors(experiment, parts, factor) if parts else {}
-    return {name: one | {"unit": unit_on(record, name, "N m")} for name, one in found.items()}
+    return {name: one | {"unit": record.unit_of(name, "N m")} for name, one in found.items()}
 
 
 def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def _parameters(record: Record, free: Sequence[Free], fit: Fit, width: Spread) -
             "value": float(one.value(theta[i])),
             "standard_error": float(one.slope(theta[i])) * deviation[i],
             "interval": list(interval(one, theta[i], deviation[i])),
-            "unit": unit_on(record, one.path, one.unit),
+            "unit": record.unit_of(one.path, one.unit),
             "nominal": one.nominal,
         }
         for i, one in enumerate(free)

@@ -19,12 +19,12 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.files import to_jsonable
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress, limit_blas_threads
+from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
-from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout, stage_counter
+from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .regression import remembers_input
 from .search import ParameterSearch
@@ -117,7 +117,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     config, record, settings = task.config, task.record, task.config.identify
     assert record.torque is not None
     alone = config.drive.kind == "two_inertia" and "load" not in record.positions
-    done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
+    done = make_stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
     with jax.enable_x64(True), limit_blas_threads():
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))

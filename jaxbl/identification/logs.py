@@ -5,9 +5,8 @@
 
 import dataclasses
 import hashlib
-import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,6 @@ from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
-from jaxbl.units import on_a_line
-from jaxbl.workers import Progress
 
 from .observer_gains import ChosenGains, choose_gains
 from .segments import Segment
@@ -81,12 +78,6 @@ _MOST_STEPS = 1000
 
 _NEAR = 1e-2
 """Relative difference of the sampling periods of a log and what is held out that changes no result."""
-
-
-def stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
-    """A function to be called after each stage, which tells `progress` how many of them are finished."""
-    finished = itertools.count(1)
-    return lambda: progress(next(finished), stages) if progress is not None else None
 
 
 def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Record | None = None) -> Record:
@@ -304,12 +295,3 @@ def gains_for(
     for side in sides:
         values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}
     return {side: chosen[side] for side in sides}, values
-
-
-def unit_on(record: Record, path: str, unit: str) -> str:
-    """The unit of a number on a log: N and m where its side moves in m."""
-    side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
-    channels = record.findings.channels
-    if POSITION_CHANNELS[side] in channels and channels[POSITION_CHANNELS[side]].unit == "m":
-        return on_a_line(unit)
-    return unit

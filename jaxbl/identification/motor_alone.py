@@ -14,12 +14,12 @@ from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
 from .intervals import UNSEEN, Refusal, Spread, refusals
-from .logs import unit_on
 from .search import Found
-from .segments import Segment, reading_noise, segments_of, white_noise
+from .segments import Segment, reading_noise, segments_of
 from .trajectory import Free, Windows
 from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, inverse, is_known, widths
 
@@ -116,17 +116,17 @@ went wrong."""
 def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     """Why a fit cannot be right, in a clause: a torque moves the motor that is in neither; "" if there is none."""
     left, size = model.unexplained(point), model.torque
-    if left <= max(_FACTOR * white_noise([one.torque for one in model.segments]), _LEFT * size):
+    if left <= max(_FACTOR * estimate_white_noise([one.torque for one in model.segments]), _LEFT * size):
         return ""
     return (
-        f"a torque of {left:.2g} {unit_on(record, 'motor.torque', 'N m')} rms ({100.0 * left / size:.2g} % of the driving "
+        f"a torque of {left:.2g} {record.unit_of('motor.torque', 'N m')} rms ({100.0 * left / size:.2g} % of the driving "
         "torque) is left unexplained; the model lacks something else, or its nominal numbers are too far off"
     )
 
 
 def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     """Why a log does not show a gap, and what would, in one clause; "" where it does."""
-    noise, unit = reading_noise(model.segments)["motor"], unit_on(record, "motor.position", "rad")
+    noise, unit = reading_noise(model.segments)["motor"], record.unit_of("motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
     if wrong := not_met(model, gap.best if gap.needed else gap.without, record):
         return wrong

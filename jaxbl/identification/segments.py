@@ -124,13 +124,6 @@ def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
     return {side: float(np.mean([float(one.smoothed[side].noise) for one in segments])) for side in segments[0].smoothed}
 
 
-def white_noise(parts: Sequence[np.ndarray]) -> float:
-    """Standard deviation of white noise on a signal in parts, by its fourth differences: what is smooth is not in them, nor
-    are jumps, of which there are few."""
-    fourth = np.concatenate([np.diff(part, n=4) for part in parts])
-    return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
-
-
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
     """Kinematics of the segments that are long enough to be decimated by a factor."""
     return [one.kinematics for one in segments if len(one) >= max(2 * shortest(factor), _FEWEST)]

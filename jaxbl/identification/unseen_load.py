@@ -27,13 +27,14 @@ from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
+from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
 from .regression import begun
-from .segments import Segment, white_noise
+from .segments import Segment
 from .trajectory import WIDE, Fit, Free
 
 _STEP, _SHORTEST = 1e-2, 1e-6
@@ -394,7 +395,7 @@ class UnseenLoad:
 
     def _noisier(self, point: Point, held: np.ndarray | None) -> list[Point]:
         """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
-        noise = white_noise([one.torque for one in self.segments])
+        noise = estimate_white_noise([one.torque for one in self.segments])
         if noise < _QUIET * self.torque:
             return []
         found = []

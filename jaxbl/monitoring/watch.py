@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from jaxbl.config import Config, prepare, read_model
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
-from jaxbl.identification.logs import on_record, read_logs, unit_on
+from jaxbl.identification.logs import on_record, read_logs
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import (
     Datagrams,
@@ -193,7 +193,7 @@ def _units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
     found = {}
     for side, channel in POSITION_CHANNELS.items():
         if record is not None:
-            found[side] = {name: unit_on(record, side, unit) for name, unit in units.items()}
+            found[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
         else:
             line = config.log.position(channel)[1].si_unit == "m"
             found[side] = {name: on_a_line(unit) if line else unit for name, unit in units.items()}

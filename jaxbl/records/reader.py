@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
+from jaxbl.units import on_a_line
 from jaxbl.validation import check_sizes, explain_first_error
 
 from .alignment import NominalDrive, Skew, find_encoder_offset, judge_clock_skew, max_windup_delay
@@ -91,6 +92,12 @@ class Record:
     findings: LogStatistics
     intervals: np.ndarray
     logs: tuple[tuple[Path, slice], ...]
+
+    def unit_of(self, path: str, unit: str) -> str:
+        """The unit of a number of one side in this log: N and m in place of N m and rad, if the side moves along a line."""
+        side = "load" if any(name.startswith("load") for name in path.split(".")) else "motor"
+        channel = self.findings.channels.get(POSITION_CHANNELS[side])
+        return on_a_line(unit) if channel is not None and channel.unit == "m" else unit
 
 
 def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> LogTable:

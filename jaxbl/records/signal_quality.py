@@ -113,6 +113,15 @@ def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
     return float(np.median(density[frequency >= 2.0 / 3.0 * frequency[-1]]))
 
 
+def estimate_white_noise(parts: Sequence[np.ndarray]) -> float:
+    """Estimate the standard deviation of white noise on a signal, which may be in several parts.
+
+    Fourth differences hold nothing of what is smooth, and their median nothing of jumps, of which there are few.
+    """
+    fourth = np.concatenate([np.diff(part, n=4) for part in parts])
+    return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
+
+
 def find_bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
     """Frequency in Hz below which 95 % of the power lies that stands out of the noise, of values or their slope; 0: none."""
     frequency, density = power_spectrum(values, period)

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
-from jaxbl.identification.logs import unit_on
 from jaxbl.lines import NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
@@ -337,7 +336,7 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     if not found.located:
         return [_verdict(found.summary), *draw_motor_alone(found)]
-    unit = unit_on(found.record, "motor.torque", "N m")
+    unit = found.record.unit_of("motor.torque", "N m")
     residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
     tables = [_tables(found)] if "torque_tables" in found.summary else []
     return [_verdict(found.summary), _over_time(found), *tables, *residuals]
@@ -354,8 +353,8 @@ def _tables(found: Diagnosis) -> Drawn:
         ax.fill_between(points, torques - 2.0 * errors, torques + 2.0 * errors, color=FAINT, alpha=0.35, lw=0.0)
         ax.plot(points, torques, "o-", color=_AFTER, ms=4, lw=1.4)
         ax.axhline(0.0, color=FAINT, lw=0.8)
-        unit = unit_on(found.record, f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
-        force = unit_on(found.record, f"{side}.torque", "N m")
+        unit = found.record.unit_of(f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
+        force = found.record.unit_of(f"{side}.torque", "N m")
         ax.set(
             xlabel=with_unit(f"{side} {_OVER[one['over']]}", unit),
             ylabel=with_unit(f"{side}: resisting {missing_quantity(force)}", force),
@@ -457,7 +456,7 @@ def _over_time(found: Diagnosis) -> Drawn:
     """Missing torque of each side, before and after."""
     figure, axes = stacked(len(found.pairs), 2.4)
     for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
-        unit = unit_on(found.record, f"{side}.torque", "N m")
+        unit = found.record.unit_of(f"{side}.torque", "N m")
         bandwidth = found.located[side].bandwidth
         for before, after, held in pieces:
             plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=2.6, alpha=0.6, label="before")

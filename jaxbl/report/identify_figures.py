@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from jaxbl.drive.parameters import parameters
 from jaxbl.identification.identify import Identification
-from jaxbl.identification.logs import unit_on
 
 from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, outline, stacked, style, subplots, with_unit
 from .log_signals import LogSignals
@@ -359,7 +358,7 @@ def _path(log: LogSignals) -> Drawn:
             ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
             ends.append(np.array(fitted["interval"]))
             lines.append(fitted["value"])
-        label = with_unit(name.replace("_", " "), unit_on(found.record, path, units.get(name, "rad")))
+        label = with_unit(name.replace("_", " "), found.record.unit_of(path, units.get(name, "rad")))
         ax.set(ylabel=label, ylim=limits(*ends, share=0.02, room=0.25, shown=lines))
     legend(axes[0], 3, of=axes)
     caption = (

@@ -5,7 +5,6 @@ import numpy as np
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.identify import Identification
-from jaxbl.identification.logs import unit_on
 
 from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, style, subplots
 
@@ -23,8 +22,8 @@ def draw_motor_alone(found: Identification | Diagnosis) -> list[Drawn]:
 
 
 def _hysteresis(found: Identification | Diagnosis) -> Drawn:
-    trace, unit = found.trace, unit_on(found.record, "motor.position", "rad")
-    force = unit_on(found.record, "motor.torque", "N m")
+    trace, unit = found.trace, found.record.unit_of("motor.position", "rad")
+    force = found.record.unit_of("motor.torque", "N m")
     plant = found.model.build().plant
     twist = trace["theta_e"].to_numpy() - float(plant.drive.ratio("load")) * trace["load.modelled_position"].to_numpy()
     by_motor, law = trace["torque_by_motor"].to_numpy(), trace["torque"].to_numpy()
@@ -58,7 +57,7 @@ def _hysteresis(found: Identification | Diagnosis) -> Drawn:
 
 
 def _profile(found: Identification | Diagnosis) -> Drawn:
-    said, unit = found.summary["backlash"], unit_on(found.record, "motor.position", "rad")
+    said, unit = found.summary["backlash"], found.record.unit_of("motor.position", "rad")
     figure, (ax,) = subplots(9.0, 3.6)
     half, deviance = np.array(said["starts"], float).T
     ax.loglog(half, np.maximum(deviance, 0.1), "o-", color=FAINT, ms=4, lw=1.0, label="begun at this half gap, first fits")

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from jaxbl.diagnosis.input_noise import _smooth_curve, input_jumps, smoothed_input, unfelt
-from jaxbl.identification.segments import white_noise
+from jaxbl.records.signal_quality import estimate_white_noise
 
 PERIOD, SAMPLES = 1e-3, 8000
 TIME = PERIOD * np.arange(SAMPLES)
@@ -24,13 +24,13 @@ def true(request):
 @pytest.mark.parametrize("noise", [3e-3, 1e-2, 3e-2])
 def test_noise_is_measured_and_smoothed_away(true, noise):
     noisy = true + noise * np.random.default_rng(1).standard_normal(SAMPLES)
-    assert white_noise([noisy]) == pytest.approx(noise, rel=0.05)
-    left = smoothed_input(noisy, white_noise([noisy])) - true
+    assert estimate_white_noise([noisy]) == pytest.approx(noise, rel=0.05)
+    left = smoothed_input(noisy, estimate_white_noise([noisy])) - true
     assert np.sqrt(np.mean(left**2)) < 0.3 * noise
 
 
 def test_an_input_without_noise_has_none(true):
-    assert white_noise([true]) < 1e-6
+    assert estimate_white_noise([true]) < 1e-6
 
 
 def test_jumps_stay_where_they_are():

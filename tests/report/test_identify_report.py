@@ -13,7 +13,6 @@ from small_study import rigid, small
 
 from jaxbl.config import read_config
 from jaxbl.identification.identify import Identification
-from jaxbl.identification.logs import unit_on
 from jaxbl.identification.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.report.figures import save
@@ -84,7 +83,7 @@ def made(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
     numbers = {"drive.motor_inertia": ("kg m²", 0.05), "drive.motor_viscous": ("N m s/rad", 0.15)}
     parameters = {
         path: {"value": value, "standard_error": 1e-3, "interval": [value - 2e-3, value + 2e-3],
-               "unit": unit_on(record, path, kind),
+               "unit": record.unit_of(path, kind),
                "nominal": 1.1 * value} for path, (kind, value) in numbers.items()
     }  # fmt: skip
     if "half_gap" in names:
