@@ -1,9 +1,9 @@
-"""Transmission laws: torque over the gear as a function of the deflection z = theta_e - N_0 theta_s.
+"""Transmission laws: the torque C that gear and shaft transmit at a twist z = theta_e - N_0 theta_s.
 
-Each law also knows itself as a linear regression, torque = regressors(z) . theta, which is what the recursive
-identifier of eqs. (18)-(28) works on, and how theta reads in the law's own parameters.
+For the recursive identifier (18)-(28) a law is also a linear regression, C = regressors(z) . theta, and converts the
+coefficients theta into its own parameters.
 
-Further packages add laws through the entry-point group `jaxbl.transmissions`; the entry's name is the law's.
+Installed packages add laws by the entry-point group `jaxbl.transmissions`; the entry point's name is the law's.
 """
 
 import abc
@@ -23,13 +23,13 @@ from .parameters import Scalar, parameter
 
 
 class AbstractTransmission(eqx.Module):
-    """A transmission law. `deflection` is what of z is left once contact is made; torque follows from it.
+    """A transmission law C(z): :meth:`deflection` of a twist, then :meth:`torque` of the deflection.
 
     Attributes:
         name: key `law` of the config.
-        errors: metrics that the law adds, and the parameter in `truth` of whose identified value each is the relative error.
+        errors: names of metrics that the law adds, each with the key of `truth` whose relative identification error it is.
         stiffness: largest slope of the law, N m/rad; the plant's steps have to resolve it.
-        half_gap: half of the free play, rad on the motor side; 0 where there is none.
+        half_gap: half of the free play, rad on the motor side; 0 without any.
     """
 
     name: ClassVar[str]
@@ -38,24 +38,24 @@ class AbstractTransmission(eqx.Module):
     half_gap: eqx.AbstractVar[Scalar]
 
     def deflection(self, z: Float[Array, ""]) -> Float[Array, ""]:
-        """Elastic deflection in rad that the twist z (rad) leaves; z itself unless the law has a free gap."""
+        """Elastic deflection (rad) at a twist z (rad): the part of z beyond the free play."""
         return z
 
     @abc.abstractmethod
     def torque(self, deflection: Float[Array, ""]) -> Float[Array, ""]:
-        """Transmitted torque C in N m on the motor shaft, for a deflection in rad."""
+        """Transmitted torque C (N m) on the motor shaft, at a deflection (rad)."""
 
     @abc.abstractmethod
     def regressors(self, z: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
-        """Functions of z, linear in the unknowns theta: C = sum(r_i theta_i)."""
+        """Functions r_i of the twist z (rad) such that C = sum_i r_i(z) theta_i, with unknown coefficients theta_i."""
 
     @abc.abstractmethod
     def from_theta(self, theta: tuple[Float[Array, ""], ...]) -> dict[str, Float[Array, ""]]:
-        """The law's parameters, and what else `truth` has, from regression coefficients."""
+        """Convert regression coefficients theta into the numbers of :meth:`truth`."""
 
     @abc.abstractmethod
     def truth(self) -> dict[str, Scalar]:
-        """The same parameters as they are in this law."""
+        """Parameters of this law by name, and further numbers that are identified."""
 
     def to_mujoco(self, parts: MujocoParts) -> Said:
         """Add the law to the parts of a MuJoCo model, as springs between the sides, and say how well that has it.
@@ -66,15 +66,16 @@ class AbstractTransmission(eqx.Module):
 
 
 TRANSMISSIONS = Registry("jaxbl.transmissions", partial(check_module, base=AbstractTransmission))
-"""The laws by name: the built-in ones and those of installed packages."""
+"""Laws by name, those of installed packages included."""
 
 
 @TRANSMISSIONS.add
 class SigmoidBacklash(AbstractTransmission):
     """Smooth backlash, eq. (3): C = K (z - 4 j_0 (1 - e^{-gamma z}) / (1 + e^{-gamma z})), with tanh(gamma z / 2).
 
-    Far from zero C tends to K (z -+ 4 j_0): the gap has half-width 4 j_0, not j_0. Where 2 gamma j_0 > 1 the stiffness
-    at z = 0, K (1 - 2 gamma j_0), is negative and C changes sign near +-4 j_0; below that the law is only softer there.
+    Far from zero C tends to K (z -+ 4 j_0): half of the gap is 4 j_0, not j_0. If 2 gamma j_0 > 1, the stiffness
+    K (1 - 2 gamma j_0) at z = 0 is negative, and C changes sign near +-4 j_0; otherwise the law is only softer there.
+    As a regression, C = K z - K j_0 4 tanh(gamma z / 2) has the coefficients K and K j_0 (21), with nominal gamma.
     """
 
     name: ClassVar[str] = "sigmoid_backlash"
@@ -127,7 +128,7 @@ def _chords() -> tuple[list[float], list[float], float]:
 
 @TRANSMISSIONS.add
 class LinearShaft(AbstractTransmission):
-    """Flexible shaft without play, eq. (5): C = K z."""
+    """Flexible shaft without play (5): C = K z."""
 
     name: ClassVar[str] = "linear_shaft"
     errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness"}
@@ -155,8 +156,8 @@ class LinearShaft(AbstractTransmission):
 class DeadZone(AbstractTransmission):
     """Hard dead zone: C = K (z - clip(z, -half_gap, half_gap)).
 
-    Its regression, C = K z - K b sign(z) in contact and 0 in the gap, takes the contact from the nominal half gap, as
-    the paper takes gamma: with a true half gap b near the nominal one, K and K b follow.
+    As a regression, C = K z - K b sign(z) in contact and 0 in the gap has the coefficients K and K b, where b is the half
+    gap. Whether there is contact is taken from the nominal half gap, as gamma is nominal in law (3).
     """
 
     name: ClassVar[str] = "dead_zone"

@@ -334,7 +334,7 @@ def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, found
 
 @pytest.mark.parametrize("name", VALUES)
 def test_built_in_effects_would_pass_the_check_of_other_packages(name):
-    base._check_entry(name, EFFECTS[name])
+    base._check_effect(name, EFFECTS[name])
 
 
 def test_no_other_module_holds_the_name_of_an_effect():

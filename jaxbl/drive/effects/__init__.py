@@ -1,12 +1,12 @@
-"""Physical effects beyond the nominal drive, each written once and known by its full name (`load.coulomb_friction`).
+"""Physical effects beyond the nominal drive: one class each, with a full name such as `load.coulomb_friction`.
 
-One file a family. Further packages add effects through the entry-point group `jaxbl.effects`: the entry's name is the
-effect's name, its object a subclass of :class:`SideEffect`, :class:`TransmissionEffect`, :class:`ActuatorEffect` or
-:class:`EncoderEffect`.
+Each family has a file. Installed packages add effects by the entry-point group `jaxbl.effects`: the entry point's name is
+the effect's full name, its object a subclass of :class:`SideEffect`, :class:`TransmissionEffect`, :class:`ActuatorEffect`
+or :class:`EncoderEffect`.
 """
 
 # ruff: noqa: I001
-# families, and the effects of one, in the order in which a model with all effects has them
+# families, and the effects of each, stand in the order in which a model with all effects has them
 from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, DriftingFriction
 from .friction import ViscousFriction, AsymmetricFriction, QuadraticDrag
 from .loads import (

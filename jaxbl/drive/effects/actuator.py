@@ -1,4 +1,4 @@
-"""The actuator: what becomes of the commanded torque."""
+"""Effects of the actuator, which turns the commanded torque into the one that acts."""
 
 from typing import ClassVar
 
@@ -9,18 +9,18 @@ from ..parameters import Scalar, parameter
 from .base import EFFECTS, ActuatorEffect, shape, size
 
 _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
-"""Limits tried, over the largest commanded torque."""
+"""Trial values of a torque limit, over the largest commanded torque."""
 DELAY_SAMPLES = 16
-"""Samples that a delay may last: each is a state. Of buses and controllers, few last longer than 4."""
+"""Most samples of a delay, each of which is a state. Few buses and controllers need more than 4."""
 _DELAYS = 0.5, 1.0, 2.0, 4.0, 8.0
-"""Delays tried, in samples."""
+"""Trial values of a delay, in samples."""
 _LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
-"""Time constants tried, in samples: by factors of about 2."""
+"""Trial values of a time constant, in samples, apart by factors of about 2."""
 
 
 @EFFECTS.add
 class Delay(ActuatorEffect):
-    """Dead time of the torque, exact for an input held from sample to sample: u(t - T); before t = 0 it was zero."""
+    """Dead time of the torque: u(t - T), exact for an input held from sample to sample. Before t = 0 the input was zero."""
 
     kind: ClassVar[str] = "delay"
     state_from_input: ClassVar[bool] = True
@@ -37,13 +37,14 @@ class Delay(ActuatorEffect):
 
     def receive(self, state, torque, period):
         commanded = (torque, *state)
-        late = jnp.clip(self.delay / period, 0.0, DELAY_SAMPLES)
-        # of the commands kept, the last to have arrived when the sample begins, and the next one
-        whole = jnp.minimum(jnp.floor(late), DELAY_SAMPLES - 1.0)
+        samples = jnp.clip(self.delay / period, 0.0, DELAY_SAMPLES)
+        full_samples = jnp.minimum(jnp.floor(samples), DELAY_SAMPLES - 1.0)
+        # the command that has arrived when the sample begins, and the one that arrives within it
         first, then = (
-            sum(jnp.where(whole == k, one, 0.0) for k, one in enumerate(some)) for some in (commanded[1:], commanded[:-1])
+            sum(jnp.where(full_samples == k, command, 0.0) for k, command in enumerate(commands))
+            for commands in (commanded[1:], commanded[:-1])
         )
-        return commanded[:-1], first, then, (late - whole) * period
+        return commanded[:-1], first, then, (samples - full_samples) * period
 
     def to_mujoco(self, parts, side):
         parts.actuator.delay += self.delay
@@ -51,14 +52,15 @@ class Delay(ActuatorEffect):
 
     @classmethod
     def find_fault(cls, numbers, period):
-        longest = DELAY_SAMPLES * period
-        text = f"delay: {numbers['delay']:g} s is longer than {DELAY_SAMPLES} samples; it should be at most {longest:g} s"
-        return text if numbers["delay"] > longest * (1.0 + 1e-9) else ""
+        limit = DELAY_SAMPLES * period
+        if numbers["delay"] <= limit * (1.0 + 1e-9):
+            return ""
+        return f"delay: {numbers['delay']:g} s is longer than {DELAY_SAMPLES} samples; it should be at most {limit:g} s"
 
 
 @EFFECTS.add
 class GainError(ActuatorEffect):
-    """Torque constant off by a relative error: u (1 + e)."""
+    """Relative error e of the torque constant: u (1 + e)."""
 
     kind: ClassVar[str] = "gain_error"
     rank: ClassVar[int] = 1
@@ -92,7 +94,7 @@ class Saturation(ActuatorEffect):
 
 @EFFECTS.add
 class Lag(ActuatorEffect):
-    """First-order lag of the torque: T du_a/dt = u - u_a, advanced exactly for a held u; starts at zero torque."""
+    """First-order lag of the torque: T du_a/dt = u - u_a, exact for a held input; u_a is zero at t = 0."""
 
     kind: ClassVar[str] = "lag"
     state_from_measurement: ClassVar[bool] = True
@@ -109,10 +111,10 @@ class Lag(ActuatorEffect):
 
     def actuate(self, state, torque, step):
         (lagged,) = state
-        steps = step / self.time_constant
-        new = torque + (lagged - torque) * jnp.exp(-steps)
-        # the mean over the step keeps the impulse
-        return (new,), torque + (lagged - torque) * -jnp.expm1(-steps) / steps
+        ratio = step / self.time_constant
+        new = torque + (lagged - torque) * jnp.exp(-ratio)
+        # the mean over the step has the impulse of the lagged torque
+        return (new,), torque + (lagged - torque) * -jnp.expm1(-ratio) / ratio
 
     def to_mujoco(self, parts, side):
         if parts.actuator.lag is not None:
@@ -124,8 +126,8 @@ class Lag(ActuatorEffect):
 
 @EFFECTS.add
 class BackEmf(ActuatorEffect):
-    """A motor fed by voltage, the input u in V: torque k_t / R (u - k_t omega), without inductance (`actuator.lag` has it).
-    Of a log in V, `[log] u` has the factor 1. A diagnosis does not try it: back-EMF acts as a viscous friction of the motor.
+    """A motor fed by a voltage, the input u in V: torque k_t / R (u - k_t omega), without inductance (see `actuator.lag`).
+    For a log in V, `[log] u` has the factor 1. A diagnosis does not try it: back-EMF acts as viscous friction of the motor.
     """
 
     kind: ClassVar[str] = "back_emf"

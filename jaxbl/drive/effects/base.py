@@ -1,10 +1,12 @@
-"""What an effect is, and what it says of itself.
+"""Base classes of effects: hooks that a plant calls, roles of numbers, and checks of effects from other packages.
 
-An effect is a module that overrides the hooks that concern it; the plant asks every effect of its tuple at every step,
-and the neutral answers (the Python number 0.0, or the argument itself) cost nothing after compilation. Its numbers say
-what part they play (:class:`Role`), and with a few class attributes that is all that a config, a sweep, an
-identification, a diagnosis, a report and the reference ask for. Sign convention: `resist` torques are subtracted on
-their side, J dv/dt = ... - resist, so that a positive number always opposes a positive drive torque.
+An effect is a module that overrides some hooks. The plant calls the hooks of every effect at every step; those that are
+not overridden return the Python number 0.0 or their argument, which costs nothing after compilation. Each number of an
+effect declares the part that it plays (:class:`Role`). Tables of a config, sweeps, identification, diagnosis, reports and
+the reference need no more than these roles and a few class attributes.
+
+Sign convention: `resist` torques are subtracted on their side, J dv/dt = ... - resist, so that a positive number always
+opposes a positive drive torque.
 """
 
 import inspect
@@ -20,41 +22,45 @@ from jaxbl.registry import Registry, check_text
 from ..mujoco_parts import MujocoParts, Said, unsaid
 from ..parameters import Parameter, parameter, parameters
 
-Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
+Number = Any  # a float or an array: hooks are duck-typed, and neutral ones return the Python number 0.0
 Numbers = dict[str, float]
 """Numbers of one effect, by name."""
 PLACES = ("motor", "load", "transmission", "actuator", "encoder")
 
 
 class Motion(NamedTuple):
-    """What the torque of an effect may depend on: time in s, position in rad, velocity in rad/s.
+    """The motion that an effect sees.
 
-    Of its side (of an effect of the actuator, the motor); for an effect in the gear, the elastic deflection and its rate (to
-    `advance`, in the middle of the step). `torque` is the input that acts, N m, in :meth:`AbstractEffect.resist` and
-    :meth:`AbstractEffect.dry_friction` of an effect on the motor; elsewhere 0.
+    Attributes:
+        time: s.
+        position: of the effect's side (of the motor for an effect of the actuator), rad. For an effect in the gear, the
+            elastic deflection.
+        velocity: its rate, rad/s. In :meth:`AbstractEffect.advance` of an effect in the gear, in the middle of the step.
+        torque: input that acts on the motor, N m, in :meth:`AbstractEffect.resist` and
+            :meth:`AbstractEffect.dry_friction` of an effect on the motor; elsewhere 0.
     """
 
-    time: Value
-    position: Value
-    velocity: Value
-    torque: Value = 0.0
+    time: Number
+    position: Number
+    velocity: Number
+    torque: Number = 0.0
 
 
 class Scales(NamedTuple):
-    """How large things are on a log, as an effect at one place sees them; trial values are chosen by it.
+    """Sizes of a log's signals at the place of an effect, from which trial values of its numbers are chosen.
 
     Attributes:
         torque: largest input, N m.
-        period: of the samples, s.
+        period: sampling period, s.
         duration: of all samples, s.
         twist: rms of z = theta_e - N_0 theta_s, rad; 0 on a rigid drive.
         largest_twist: rad.
-        speed: rms of the effect's side (the motor's for gear and actuator), rad/s.
+        speed: rms velocity of the effect's side (of the motor for gear and actuator), rad/s.
         spread: standard deviation of that side's position, rad.
-        travel: range of that side's position, rad; for an effect in the gear, the load's.
+        travel: range of that side's position, rad; for an effect in the gear, of the load's.
         ratio: motor turns for one load turn; 1 on a rigid drive.
-        harmonics: periods a turn of the waves over position that the model has on the side.
-        frequencies: at which a torque on the side would explain most of what the model leaves, Hz.
+        harmonics: periods a turn of the waves over position that the model already has on the side.
+        frequencies: of torques on the side that would explain most of the residual torque, Hz.
     """
 
     torque: float
@@ -74,13 +80,13 @@ class Role(NamedTuple):
     """The part that a number plays in its effect.
 
     Attributes:
-        kind: `size`: the torque is proportional to it. `angle`: a phase in rad. `harmonic`: a number of periods a turn,
-            which is chosen and not fitted. `frequency`: in Hz. `shape`: any other number, positive. `held`: one that is not
-            sought: it stays neutral.
-        neutral: its value where the effect does nothing.
-        trials: the values to try on a log of given scales. Of a size: one, small enough for its torque to be linear.
+        kind: `size`: the torque is proportional to the number. `angle`: a phase, rad. `harmonic`: a number of periods a
+            turn, which is chosen among trial values and not fitted. `frequency`: Hz. `shape`: any other positive number.
+            `held`: a diagnosis leaves it neutral.
+        neutral: the number with which the effect does nothing.
+        trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
-        sought: number of values that a harmonic was sought among; left out: the number of trials.
+        trial_count: number of values among which a harmonic was chosen, if that is not the number of `trials`.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
@@ -91,12 +97,15 @@ class Role(NamedTuple):
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
-    """Declare a number that the torque is proportional to. Arguments as of :func:`jaxbl.drive.parameters.parameter`."""
+    """Declare a number that the torque is proportional to; arguments of :func:`jaxbl.drive.parameters.parameter`.
+
+    `trial` gives its trial value on a log with some :class:`Scales`.
+    """
     return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),)), **limits)
 
 
 def angle(doc: str) -> Any:
-    """Declare a phase in rad, 0 unless given. Its prior is that of any angle: standard deviation pi / sqrt(3)."""
+    """Declare a phase (rad), by default 0. Its prior is uniform over the circle: standard deviation pi / sqrt(3)."""
     return parameter("rad", doc, default=0.0, role=Role("angle", 0.0, lambda log: (0.0,), 1.8))
 
 
@@ -107,12 +116,12 @@ def harmonic(
     sought: Callable[[Scales], int] | None = None,
     **limits: Any,
 ) -> Any:
-    """Declare a number of periods a turn."""
+    """Declare a number of periods a turn, which is chosen among the values of `trials`."""
     return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=sought), **limits)
 
 
 def frequency(doc: str) -> Any:
-    """Declare a frequency in Hz; those are tried at which a torque on the effect's side explains most."""
+    """Declare a frequency (Hz); tried are those at which a torque on the effect's side explains most."""
     return parameter("Hz", doc, minimum=0.0, role=Role("frequency", 1.0, lambda log: log.frequencies))
 
 
@@ -122,33 +131,33 @@ def shape(unit: str, doc: str, trials: Callable[[Scales], Sequence[float]], *, n
 
 
 def held(unit: str, doc: str, neutral: float, **limits: Any) -> Any:
-    """Declare a number for simulations, `neutral` unless given. A diagnosis leaves it there, an identification too unless it
-    is given or asked for."""
+    """Declare a number for simulations, by default `neutral`. A diagnosis leaves it neutral; an identification fits it only
+    if the study sets it or asks for it."""
     return parameter(unit, doc, default=neutral, role=Role("held", neutral, lambda log: (neutral,)), **limits)
 
 
 def table(unit: str, doc: str) -> Any:
-    """Declare a list of numbers, empty unless given. No axis and no fit changes them."""
+    """Declare a list of numbers, by default empty, which no axis and no fit changes."""
     return parameter(unit, doc, default=(), fixed=True)
 
 
 class AbstractEffect(eqx.Module):
-    """Base of all effects; every hook has a neutral default.
+    """Base class of all effects; every hook is neutral unless it is overridden.
 
-    A hook's `state` is the effect's own: what :meth:`init` gives, moved on by :meth:`actuate` and :meth:`advance`.
+    The `state` of a hook is the effect's own: :meth:`init` makes it; :meth:`receive`, :meth:`actuate` and :meth:`advance`
+    change it.
 
     Attributes:
         kind: its name without the place.
         places: where it may act: motor, load, transmission, actuator, encoder.
-        velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
-            corrector), which keeps the integrator's second order.
-        input_alone: whether its own state is what was commanded, whatever its numbers and the motion: it is then known.
-        follows: whether its own state follows, by its numbers, from the input or from the motion as it is measured: within
-            a log it is then as known as these.
-        in_time: whether it depends on the time since a log began.
-        corrects: the drive's number that it is the error of: `inertia` or `viscous`.
-        exclusive: of effects with the same word here, a place has one.
-        special_cases: simpler kinds at the same place that it contains, and their numbers from its own.
+        velocity_dependent: True if a hook that gives a torque uses a velocity. It is then evaluated twice a step (predictor
+            and corrector), which keeps the integrator's second order.
+        state_from_input: True if its state is the commanded input, whatever its numbers and the motion.
+        state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
+        in_time: True if it depends on the time since a log began.
+        corrects: the number of the drive whose error it is: `inertia` or `viscous`.
+        exclusive: a word; a place has at most one effect with the same word.
+        special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
     """
 
     kind: ClassVar[str]
@@ -163,7 +172,7 @@ class AbstractEffect(eqx.Module):
 
     @property
     def place(self) -> str:
-        """Where it acts."""
+        """The place where it acts."""
         return self.places[0]
 
     @property
@@ -172,75 +181,79 @@ class AbstractEffect(eqx.Module):
         return f"{self.place}.{self.kind}"
 
     def init(self) -> Any:
-        """The effect's own state at t = 0: a tuple of numbers (or of tuples of them), each a scalar array."""
+        """State at t = 0: a tuple of numbers (or of tuples of numbers), each a scalar array."""
         return ()
 
-    def settled(self, torque: Value) -> Any:
-        """The own state after a commanded torque (N m) that has lasted; at t = 0 unless the effect says otherwise."""
+    def settled(self, torque: Number) -> Any:
+        """State after a commanded torque (N m) that has lasted; :meth:`init` unless it is overridden."""
         return type(self).init(self)
 
-    def set_in_motion(self, state: Any, velocity: Value) -> Any:
-        """The own state :meth:`init` on a side that moves (rad/s) when a log begins, as far as that says anything."""
+    def set_in_motion(self, state: Any, velocity: Number) -> Any:
+        """State that :meth:`init` made, on a side that moves with `velocity` (rad/s) when a log begins."""
         return state
 
-    def advance(self, state: Any, motion: Motion, step: Value) -> Any:
-        """The own state after `step` seconds at a steady velocity. The plant calls it for both halves of a step."""
+    def advance(self, state: Any, motion: Motion, step: Number) -> Any:
+        """State after `step` seconds at a steady velocity. The plant calls it for both halves of a step."""
         return state
 
-    def receive(self, state: Any, torque: Value, period: Value) -> tuple[Any, Value, Value, Value]:
-        """What arrives of an input (N m) that is commanded for a sample of `period` seconds, before :meth:`actuate`: the own
-        state, the torque that goes on at first, the one after it, and the time in s at which they change."""
+    def receive(self, state: Any, torque: Number, period: Number) -> tuple[Any, Number, Number, Number]:
+        """Delay an input (N m) that is commanded for a sample of `period` seconds, before :meth:`actuate`.
+
+        Returns:
+            The new state, the torque that arrives first, the torque that arrives then, and the time of the change since the
+            sample began (s).
+        """
         return state, torque, torque, 0.0
 
-    def actuate(self, state: Any, torque: Value, step: Value) -> tuple[Any, Value]:
-        """Turn the commanded torque (N m) into the one that acts over the next `step` seconds."""
+    def actuate(self, state: Any, torque: Number, step: Number) -> tuple[Any, Number]:
+        """New state, and the torque (N m) that acts over the next `step` seconds for a commanded torque (N m)."""
         return state, torque
 
-    def transmission_error(self, state: Any, load_position: Value) -> Value:
-        """Kinematic error in rad on the motor side, added to z = theta_e - N_0 theta_s."""
+    def transmission_error(self, state: Any, load_position: Number) -> Number:
+        """Kinematic error (rad on the motor side) that is added to z = theta_e - N_0 theta_s."""
         return 0.0
 
-    def deflect(self, state: Any, z: Value) -> Value:
-        """Elastic deflection in rad for a twist of z."""
+    def deflect(self, state: Any, z: Number) -> Number:
+        """Elastic deflection (rad) at a twist z (rad)."""
         return z
 
-    def free_play(self) -> Value:
-        """Half of the free play in rad that :meth:`deflect` takes off a twist."""
+    def free_play(self) -> Number:
+        """Half of the free play (rad) that :meth:`deflect` takes off a twist."""
         return 0.0
 
-    def transmit(self, state: Any, deflection: Value, rate: Value) -> Value:
-        """Torque in N m added to the transmitted one, from deflection (rad) and its rate (rad/s)."""
+    def transmit(self, state: Any, deflection: Number, rate: Number) -> Number:
+        """Torque (N m) that is added to the transmitted one, at a deflection (rad) and its rate (rad/s)."""
         return 0.0
 
-    def resist(self, state: Any, motion: Motion) -> Value:
-        """Torque in N m subtracted on the effect's side."""
+    def resist(self, state: Any, motion: Motion) -> Number:
+        """Torque (N m) that is subtracted on the effect's side."""
         return 0.0
 
-    def dry_friction(self, state: Any, motion: Motion) -> Value:
-        """Level in N m of set-valued dry friction on the effect's side: it holds up to it, and opposes motion with it."""
+    def dry_friction(self, state: Any, motion: Motion) -> Number:
+        """Level (N m) of set-valued dry friction on the effect's side: the torque that holds it, and that opposes motion."""
         return 0.0
 
-    def holds(self) -> Value:
-        """Torque in N m up to which :meth:`resist` may hold a side that is not seen to move.
+    def holds(self) -> Number:
+        """Torque (N m) up to which :meth:`resist` may hold a side that is not seen to move.
 
-        Of a friction with a memory whose contacts bend by less than readings show: its own state is then not known.
+        For a friction with a memory whose contacts bend by less than readings show, so that its state is unknown.
         """
         return 0.0
 
-    def gear_friction(self, state: Any, torque: Value) -> Value:
-        """Level in N m of set-valued dry friction that a transmitted torque (N m) causes on the motor's side of the gear."""
+    def gear_friction(self, state: Any, torque: Number) -> Number:
+        """Level (N m) of set-valued dry friction that a transmitted torque (N m) causes on the motor's side of the gear."""
         return 0.0
 
-    def bent(self, torque: Value) -> Any:
-        """The own state in which :meth:`resist` is nearest to a torque (N m), of an effect that :meth:`holds`."""
+    def bent(self, torque: Number) -> Any:
+        """State in which :meth:`resist` is nearest to a torque (N m), for an effect that :meth:`holds`."""
         return self.init()
 
-    def read(self, position: Value, velocity: Value) -> Value:
-        """What an encoder reads (rad) at a position (rad) and velocity (rad/s) of its side, before noise and counts."""
+    def read(self, position: Number, velocity: Number) -> Number:
+        """Reading (rad) of an encoder at a position (rad) and velocity (rad/s), before noise and quantisation."""
         return position
 
-    def added_inertia(self) -> Value:
-        """Inertia in kg m^2 added to the side's nominal one. It has no state: one that varies needs a torque as well."""
+    def added_inertia(self) -> Number:
+        """Inertia (kg m^2) that is added to the nominal one. It is constant: one that varies needs a torque as well."""
         return 0.0
 
     def to_mujoco(self, parts: MujocoParts, side: str) -> Said:
@@ -250,49 +263,56 @@ class AbstractEffect(eqx.Module):
         """
         return unsaid("its class does not say how")
 
-    # what a diagnosis asks of the class
+    # class methods for a diagnosis
 
     @classmethod
     def roles(cls) -> dict[str, Role]:
-        """The part that each number plays; empty for an effect that a diagnosis does not try."""
-        found = {field.name: about.role for field, about in parameters(cls)}
-        return {} if None in found.values() else found  # type: ignore[return-value]
+        """Role of each number; empty for an effect that a diagnosis does not try."""
+        roles = {field.name: declaration.role for field, declaration in parameters(cls)}
+        return {} if None in roles.values() else roles  # type: ignore[return-value]
 
     @classmethod
     def neutral(cls) -> Numbers:
-        """Numbers with which the effect does nothing; empty where it is not known (:meth:`roles`)."""
+        """Numbers with which the effect does nothing; empty for an effect without :meth:`roles`."""
         return {name: role.neutral for name, role in cls.roles().items()}
 
     @classmethod
     def sizes(cls) -> list[str]:
-        """Numbers that its torque is proportional to."""
+        """Names of the numbers that its torque is proportional to."""
         return [name for name, role in cls.roles().items() if role.kind == "size"]
 
     @classmethod
     def directions(cls) -> Sequence[Numbers]:
-        """Sets of sizes whose torques are fitted, each with a factor: one for each size unless the effect says otherwise."""
+        """Combinations of sizes that are fitted, each with factors of the sizes; one for each size unless overridden."""
         return [{name: 1.0} for name in cls.sizes()]
 
     @classmethod
     def possible(cls, numbers: Mapping[str, float]) -> bool:
-        """Whether numbers that were fitted are those of such an effect: sizes above their least value."""
-        limits = {field.name: about.minimum for field, about in parameters(cls) if field.name in cls.sizes()}
-        return all(least is None or numbers[name] > least for name, least in limits.items())
+        """True if fitted numbers may be those of such an effect: each size is above its minimum."""
+        minima = {field.name: declaration.minimum for field, declaration in parameters(cls) if field.name in cls.sizes()}
+        return all(minimum is None or numbers[name] > minimum for name, minimum in minima.items())
 
     @classmethod
     def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
-        """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
-        what would be right; "" if nothing is."""
+        """Say what is wrong with a study's `numbers`, of which each is in its range, and what would be right.
+
+        Args:
+            numbers: of this effect, by config key.
+            period: sampling period, s.
+
+        Returns:
+            One line, or "" if nothing is wrong.
+        """
         return ""
 
     @classmethod
     def suits(cls, transmission: Any) -> bool:
-        """Whether it may stand beside a transmission law (None on a rigid drive)."""
+        """True if it may stand beside a transmission law (None on a rigid drive)."""
         return True
 
 
 class SideEffect(AbstractEffect):
-    """An effect on the motor or on the load."""
+    """An effect on the motor or the load; `side` says on which."""
 
     places: ClassVar[tuple[str, ...]] = ("motor", "load")
     side: str = eqx.field(static=True, kw_only=True)
@@ -309,14 +329,13 @@ class TransmissionEffect(AbstractEffect):
 
 
 class ActuatorEffect(AbstractEffect):
-    """An effect on the input torque. Several act one after the other, in the order of the config; what it resists is taken
-    off the motor's torque.
+    """An effect on the input torque. Several act one after the other, in the order of the config.
 
-    Those that a config does not list are put in the order of `rank`.
+    Its :meth:`resist` torque is subtracted on the motor.
 
     Attributes:
-        rank: place in that order.
-        input_unit: of the input, if the effect decides it; "" otherwise.
+        rank: place in the order of effects that a config does not list.
+        input_unit: unit of the input, if the effect determines it; otherwise "".
     """
 
     places: ClassVar[tuple[str, ...]] = ("actuator",)
@@ -325,11 +344,11 @@ class ActuatorEffect(AbstractEffect):
 
 
 class EncoderEffect(AbstractEffect):
-    """An effect on what an encoder reads: the load's, or the motor's on a rigid drive, unless the class says otherwise.
+    """An effect on the readings of an encoder.
 
     Attributes:
-        encoder: whose.
-        in_log: how a log without it is had, in words: models of logs have none.
+        encoder: side of the encoder, "motor" or "load"; on a rigid drive it is always the motor's.
+        in_log: a sentence that says how a log is corrected for it, since models of logs have no such effects.
     """
 
     places: ClassVar[tuple[str, ...]] = ("encoder",)
@@ -341,7 +360,7 @@ class EncoderEffect(AbstractEffect):
 
 
 class _Effects(Registry):
-    """Effects by full name: a class stands there once for each place where it may act."""
+    """Effects by full name; a class has one name for each place where it may act."""
 
     def add(self, cls: type) -> type:
         for place in cls.places:
@@ -350,46 +369,52 @@ class _Effects(Registry):
 
 
 def make_effect(name: str, **numbers: float) -> AbstractEffect:
-    """The effect of a full name (`load.coulomb_friction`) with given numbers. Raises `KeyError` for an unknown name."""
+    """Make an effect from its full name and its numbers. Raises `KeyError` for an unknown name.
+
+    Example:
+        >>> make_effect("load.coulomb_friction", torque=0.5).name
+        'load.coulomb_friction'
+    """
     cls: Any = EFFECTS[name]
     return cls(side=name.partition(".")[0], **numbers) if issubclass(cls, SideEffect) else cls(**numbers)
 
 
 def correction_of(number: str, side: str) -> tuple[str, str]:
-    """The effect that is the error of the drive's `inertia` or `viscous` friction on a side: its name, and its size."""
+    """Return the name of the effect that is the error of the drive's `inertia` or `viscous` friction on a side, and the name
+    of its size."""
     name = next(name for name, cls in EFFECTS.items() if cls.corrects == number and name.startswith(f"{side}."))
     return name, EFFECTS[name].sizes()[0]
 
 
-def _check_entry(name: str, found: Any) -> None:
-    """Check what an installed package adds. Raises an exception whose text says in one line what is wrong."""
-    if not (isinstance(found, type) and issubclass(found, AbstractEffect)):
+def _check_effect(name: str, cls: Any) -> None:
+    """Check an effect that an installed package adds. Raises an exception whose text says in one line what is wrong."""
+    if not (isinstance(cls, type) and issubclass(cls, AbstractEffect)):
         raise TypeError("should be a class derived from AbstractEffect")
     place, _, kind = name.partition(".")
-    if kind != getattr(found, "kind", None) or place not in getattr(found, "places", ()):
-        own = [f"{where}.{getattr(found, 'kind', '?')}" for where in getattr(found, "places", ())]
-        raise ValueError(f"its class acts as {' or '.join(own) or 'nothing'}; the entry should have that name")
-    if not set(found.places) <= set(PLACES) or not re.fullmatch(r"[a-z][a-z0-9_]*", kind):
+    if kind != getattr(cls, "kind", None) or place not in getattr(cls, "places", ()):
+        names = [f"{class_place}.{getattr(cls, 'kind', '?')}" for class_place in getattr(cls, "places", ())]
+        raise ValueError(f"its class acts as {' or '.join(names) or 'nothing'}; the entry should have that name")
+    if not set(cls.places) <= set(PLACES) or not re.fullmatch(r"[a-z][a-z0-9_]*", kind):
         raise ValueError(f"places should be among {', '.join(PLACES)}, and kind a lower-case word")
-    if issubclass(found, SideEffect) != (place in ("motor", "load")):
+    if issubclass(cls, SideEffect) != (place in ("motor", "load")):
         raise TypeError("effects on motor or load, and no others, should be derived from SideEffect")
-    for hook, of_base in inspect.getmembers(AbstractEffect, inspect.isfunction):
-        expected, given = (list(inspect.signature(one).parameters) for one in (of_base, getattr(found, hook)))
-        if not hook.startswith("_") and given != expected:
-            raise TypeError(f"{hook} should take ({', '.join(expected)}), not ({', '.join(given)})")
-    _check_numbers(found)
-    if neutral := found.neutral():
-        side = {"side": place} if issubclass(found, SideEffect) else {}
-        _check_neutral(found(**side, **neutral))  # type: ignore[arg-type]
+    for hook, base_method in inspect.getmembers(AbstractEffect, inspect.isfunction):
+        expected, actual = (list(inspect.signature(method).parameters) for method in (base_method, getattr(cls, hook)))
+        if not hook.startswith("_") and actual != expected:
+            raise TypeError(f"{hook} should take ({', '.join(expected)}), not ({', '.join(actual)})")
+    _check_numbers(cls)
+    if neutral := cls.neutral():
+        side = {"side": place} if issubclass(cls, SideEffect) else {}
+        _check_neutral(cls(**side, **neutral))  # type: ignore[arg-type]
 
 
 def _check_numbers(cls: type[AbstractEffect]) -> None:
-    for field, about in parameters(cls):
-        if not isinstance(about, Parameter) or not isinstance(about.unit, str):
+    for field, declaration in parameters(cls):
+        if not isinstance(declaration, Parameter) or not isinstance(declaration.unit, str):
             raise TypeError(f"{field.name} should be declared with a unit")
-        check_text(f"{field.name}: unit", about.unit)
-        check_text(f"{field.name}: description", about.doc)
-    roles = [about.role for _, about in parameters(cls)]
+        check_text(f"{field.name}: unit", declaration.unit)
+        check_text(f"{field.name}: description", declaration.doc)
+    roles = [declaration.role for _, declaration in parameters(cls)]
     kinds = [role.kind for role in roles if role is not None]
     if kinds and len(kinds) < len(roles):
         raise TypeError("either all numbers or none should have a role (size, angle, harmonic, frequency, shape, held)")
@@ -400,13 +425,13 @@ def _check_numbers(cls: type[AbstractEffect]) -> None:
 
 
 def _check_neutral(effect: AbstractEffect) -> None:
-    """Check that at neutral numbers nothing is added, at a few motions."""
+    """Check that an effect with neutral numbers does nothing, at a few motions."""
     state: Any = effect.init()
     for time, position, velocity in ((0.0, 0.3, 2.0), (0.1, -1.7, -0.5), (0.2, 4.0, 0.0)):
         motion = Motion(*map(np.float64, (time, position, velocity, 0.7)))
         state = effect.advance(state, motion, 1e-3)
         state, first, then, switch = effect.receive(state, motion.position, 1e-3)
-        off = {
+        deviations = {
             "receive": then + (first - then) * switch / 1e-3 - motion.position,
             "resist": effect.resist(state, motion),
             "dry_friction": effect.dry_friction(state, motion),
@@ -418,13 +443,15 @@ def _check_neutral(effect: AbstractEffect) -> None:
             "transmit": effect.transmit(state, motion.position, motion.velocity),
             "actuate": effect.actuate(state, motion.position, 1e-3)[1] - motion.position,
         }
-        for hook, value in off.items():
-            if not abs(float(value)) < _NEUTRAL:
-                raise ValueError(f"its neutral numbers {effect.neutral()} are not neutral: {hook} adds {float(value):.3g}")
+        for hook, deviation in deviations.items():
+            if not abs(float(deviation)) < _ROUNDING:
+                raise ValueError(
+                    f"its neutral numbers {effect.neutral()} are not neutral: {hook} adds {float(deviation):.3g}"
+                )
 
 
-_NEUTRAL = 1e-6
+_ROUNDING = 1e-6
 """Largest torque or angle of a neutral effect at motions of size 1: rounding in float32."""
 
-EFFECTS = _Effects("jaxbl.effects", _check_entry)
-"""All effects by full name: the built-in ones and those of installed packages."""
+EFFECTS = _Effects("jaxbl.effects", _check_effect)
+"""Effects by full name, those of installed packages included."""

@@ -1,6 +1,7 @@
-"""What encoders read beside the position: zero point, clock, eccentricity.
+"""Errors of encoders: zero point, clock, eccentricity.
 
-They change no motion. On a log they are corrected when it is read (`[log]`), so that no model of a log has them.
+They change readings, not the motion. A log is corrected for them when it is read (`[log]`), so that no model of a log has
+them.
 """
 
 from typing import ClassVar
@@ -13,7 +14,7 @@ from .base import EFFECTS, EncoderEffect
 
 @EFFECTS.add
 class Offset(EncoderEffect):
-    """Zero point of the motor's encoder against the load's: theta_e reads more by the offset."""
+    """Zero point of the motor's encoder: the reading is theta_e + offset."""
 
     kind: ClassVar[str] = "offset"
     encoder: ClassVar[str] = "motor"
@@ -26,7 +27,7 @@ class Offset(EncoderEffect):
 
 @EFFECTS.add
 class Skew(EncoderEffect):
-    """Clock of the load's encoder: its readings are older than their stamps by the skew, theta - skew dtheta/dt."""
+    """Clock of the load's encoder: readings are older than their time stamps, theta - skew dtheta/dt."""
 
     kind: ClassVar[str] = "skew"
     in_log: ClassVar[str] = "[log] theta_s.skew takes it off"

@@ -1,5 +1,4 @@
-"""Friction of a side: dry, falling with speed, with contacts that bend before they slide, drifting, viscous, different by
-direction, and drag."""
+"""Friction of a side: dry friction in four forms, viscous friction, friction that differs by direction, and fluid drag."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -17,7 +16,7 @@ over the way of a step at the Stribeck speed, at least; stiffer ones lag behind 
 
 @EFFECTS.add
 class CoulombFriction(SideEffect):
-    """Dry friction of constant level: sticks below it, F_c sign(v) in motion."""
+    """Dry friction of constant level: F_c sign(v) in motion; at rest it holds against torques up to F_c."""
 
     kind: ClassVar[str] = "coulomb_friction"
     exclusive: ClassVar[str | None] = "dry friction"
@@ -38,7 +37,7 @@ class CoulombFriction(SideEffect):
 
 @EFFECTS.add
 class StribeckFriction(SideEffect):
-    """Dry friction that falls from break-away F_s to F_c with speed: F_c + (F_s - F_c) exp(-(v / v_s)^2)."""
+    """Dry friction whose level falls with speed, from break-away F_s to F_c: F_c + (F_s - F_c) exp(-(v / v_s)^2)."""
 
     kind: ClassVar[str] = "stribeck_friction"
     velocity_dependent: ClassVar[bool] = True
@@ -49,7 +48,7 @@ class StribeckFriction(SideEffect):
     stribeck_velocity: Scalar = shape(
         "rad/s",
         "speed v_s over which friction falls",
-        # from a fall that only starts of motion show to one that all of the motion shows
+        # from a fall that shows only where motion starts to one that shows in all of the motion
         lambda log: [share * log.speed for share in (0.05, 0.1, 0.2, 0.3, 0.45, 0.7, 1.0)],
         above=0.0,
     )
@@ -60,7 +59,7 @@ class StribeckFriction(SideEffect):
 
     @classmethod
     def directions(cls):
-        # sliding friction, and what break-away has more than that
+        # sliding friction alone, and the excess of break-away
         return [{"torque": 1.0, "breakaway_torque": 1.0}, {"breakaway_torque": 1.0}]
 
     @classmethod
@@ -79,19 +78,21 @@ class StribeckFriction(SideEffect):
 
 
 _LENGTHS = 0.001, 0.003, 0.01, 0.03, 0.1
-"""Pre-sliding lengths tried, over the position's standard deviation: a shorter one is dry friction on most logs, a longer
-one a spring."""
+"""Trial values of the pre-sliding length, over the position's standard deviation. On most logs a shorter length looks like
+dry friction, a longer one like a spring."""
 
 
 @EFFECTS.add
 class PreslidingFriction(SideEffect):
     """Dry friction of contacts that bend before they slide (LuGre): torque F_c w + sigma_1 l dw/dt with
-    l dw/dt = v - |v| w / s(v), s = 1 + (F_s / F_c - 1) exp(-(v / v_s)^2); stiffness F_c / l at a reversal. By its torque
-    and length alone it is Dahl's model.
+    l dw/dt = v - |v| w / s(v), s = 1 + (F_s / F_c - 1) exp(-(v / v_s)^2). Its stiffness at a reversal is F_c / l. With
+    torque and length alone it is Dahl's model.
+
+    In the notation of Canudas de Wit, sigma_0 = F_c / l and z = l w. Steps must resolve the bending of the contacts:
+    step * sqrt(F_c / (l J)) < 2, where J is the side's inertia.
 
     References: P. R. Dahl, Solid friction damping of mechanical vibrations, AIAA Journal 14 (1976); C. Canudas de Wit et
-    al., A new model for control of systems with friction, IEEE TAC 40 (1995). There sigma_0 = F_c / l, z = l w.
-    Steps must resolve the bending: step * sqrt(F_c / (l J)) < 2, J the side's inertia.
+    al., A new model for control of systems with friction, IEEE TAC 40 (1995).
     """
 
     kind: ClassVar[str] = "presliding_friction"
@@ -105,7 +106,7 @@ class PreslidingFriction(SideEffect):
         lambda log: [share * log.spread for share in _LENGTHS],
         above=0.0,
     )
-    # seen only in how a drive comes to rest or leaves it
+    # these numbers show only where a drive comes to rest or starts to move
     breakaway_ratio: Scalar = held("", "break-away torque over F_c", 1.0, above=0.0)
     stribeck_velocity: Scalar = held("rad/s", "speed v_s over which friction falls from break-away to F_c", 1.0, above=0.0)
     damping: Scalar = held("N m s/rad", "damping sigma_1 of the bending contacts", 0.0, minimum=0.0)
@@ -114,26 +115,26 @@ class PreslidingFriction(SideEffect):
         return (jnp.zeros_like(self.length),)
 
     def advance(self, state, motion, step):
-        # exact at a steady velocity: w tends to +-s exponentially over the way
+        # exact at a steady velocity: w tends to +-s exponentially with the distance
         forward = jnp.where(motion.velocity < 0.0, -1.0, 1.0)
-        most = self._most(motion.velocity)
-        left = jnp.exp(-forward * motion.velocity * step / (self.length * most))
-        return (forward * most + (state[0] - forward * most) * left,)
+        steady = self._steady_friction(motion.velocity)
+        decay = jnp.exp(-forward * motion.velocity * step / (self.length * steady))
+        return (forward * steady + (state[0] - forward * steady) * decay,)
 
     def resist(self, state, motion):
         v = motion.velocity
-        return self.torque * state[0] + self.damping * (v - jnp.abs(v) * state[0] / self._most(v))
+        return self.torque * state[0] + self.damping * (v - jnp.abs(v) * state[0] / self._steady_friction(v))
 
     def holds(self):
         return self.torque * jnp.maximum(self.breakaway_ratio, 1.0)
 
     def bent(self, torque):
-        most = jnp.maximum(self.breakaway_ratio, 1.0)
-        # at the neutral torque, zero, any state does
-        return (jnp.clip(torque / jnp.where(self.torque == 0.0, 1.0, self.torque), -most, most),)
+        limit = jnp.maximum(self.breakaway_ratio, 1.0)
+        # with the neutral torque, zero, all states are alike
+        return (jnp.clip(torque / jnp.where(self.torque == 0.0, 1.0, self.torque), -limit, limit),)
 
-    def _most(self, velocity):
-        """Steady friction over F_c."""
+    def _steady_friction(self, velocity):
+        """Friction s at a steady velocity, over F_c."""
         return 1.0 + (self.breakaway_ratio - 1.0) * jnp.exp(-((velocity / self.stribeck_velocity) ** 2))
 
     def to_mujoco(self, parts, side):
@@ -146,7 +147,7 @@ class PreslidingFriction(SideEffect):
 
 @EFFECTS.add
 class DriftingFriction(SideEffect):
-    """Dry friction that changes as the machine warms up: F + (F_0 - F) exp(-t / tau).
+    """Dry friction whose level changes as the machine warms up: F + (F_0 - F) exp(-t / tau).
 
     Reference: L. Simoni, M. Beschi, G. Legnani, A. Visioli, Friction modeling with temperature effects for industrial robot
     manipulators, IROS (2015): one thermal time constant.
@@ -155,13 +156,15 @@ class DriftingFriction(SideEffect):
     kind: ClassVar[str] = "drifting_friction"
     in_time: ClassVar[bool] = True
     exclusive: ClassVar[str | None] = "dry friction"
-    special_cases: ClassVar = {"coulomb_friction": lambda one: {"torque": 0.5 * (one["torque"] + one["initial_torque"])}}
+    special_cases: ClassVar = {
+        "coulomb_friction": lambda numbers: {"torque": 0.5 * (numbers["torque"] + numbers["initial_torque"])}
+    }
     torque: Scalar = size("N m", "friction torque F in the end, when warm", minimum=0.0)
     initial_torque: Scalar = size("N m", "friction torque F_0 at t = 0", minimum=0.0)
     time_constant: Scalar = shape(
         "s",
         "time constant tau of the change",
-        # from a change over the log's first part to one that is all but linear in time
+        # from a change at the beginning of the log to one that is nearly linear in time
         lambda log: [share * log.duration for share in (0.1, 0.3, 1.0)],
         above=0.0,
     )
@@ -171,7 +174,7 @@ class DriftingFriction(SideEffect):
 
     @classmethod
     def directions(cls):
-        # steady friction, and what there is more at the start
+        # steady friction alone, and the excess at the start
         return [{"torque": 1.0, "initial_torque": 1.0}, {"initial_torque": 1.0}]
 
     def to_mujoco(self, parts, side):
@@ -180,7 +183,7 @@ class DriftingFriction(SideEffect):
 
 @EFFECTS.add
 class ViscousFriction(SideEffect):
-    """Error of the nominal viscous friction: an additional torque f v."""
+    """Error f of the nominal viscous friction: torque f v."""
 
     kind: ClassVar[str] = "viscous_friction"
     velocity_dependent: ClassVar[bool] = True
@@ -197,11 +200,11 @@ class ViscousFriction(SideEffect):
 
 @EFFECTS.add
 class AsymmetricFriction(SideEffect):
-    """Friction that differs by direction: forwards half of each difference more than the drive and other effects say,
-    backwards half less, (d_F + d_f |v|) / 2.
+    """Friction that differs by direction: torque (d_F + d_f |v|) / 2, beside the friction of the drive and other effects.
 
-    For F+ + f+ v forwards and F- + f- |v| backwards: viscous friction (f+ + f-) / 2 of the drive, dry friction
-    (F+ + F-) / 2, and the differences f+ - f- and F+ - F- here. A difference of dry friction alone is a constant torque.
+    Friction of F+ + f+ v forwards and F- + f- |v| backwards is the sum of viscous friction (f+ + f-) / 2, dry friction
+    (F+ + F-) / 2, and this effect with d_f = f+ - f- and d_F = F+ - F-. A difference of dry friction alone is a constant
+    torque.
     """
 
     kind: ClassVar[str] = "asymmetric_friction"
@@ -221,7 +224,7 @@ class AsymmetricFriction(SideEffect):
 
 @EFFECTS.add
 class QuadraticDrag(SideEffect):
-    """Fluid drag b v |v|."""
+    """Fluid drag: torque b v |v|."""
 
     kind: ClassVar[str] = "quadratic_drag"
     velocity_dependent: ClassVar[bool] = True

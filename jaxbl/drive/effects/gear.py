@@ -1,4 +1,4 @@
-"""The gear beyond its law: free play, hardening, damping, hysteresis, kinematic error, friction under load."""
+"""Effects of the gear beyond its law: free play, hardening, damping, hysteresis, kinematic error, friction under load."""
 
 from typing import ClassVar
 
@@ -9,19 +9,19 @@ from ..parameters import Scalar
 from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, shape, size
 
 _GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
-"""Half gaps tried, over the largest twist: a larger one leaves no contact, a smaller one next to no free play."""
+"""Trial values of the half gap, over the largest twist: a larger gap leaves no contact, a smaller one hardly any play."""
 
 
-def _eccentric(log: Scales) -> list[float]:
-    """Once a turn is what eccentricity means, of the load's wheel or of the motor's, and twice what an angled coupling does;
-    of all but the first half a radian of the wave must be seen."""
-    others = {*map(float, range(2, 9)), log.ratio, 2.0 * log.ratio}
-    return [1.0, *(n for n in sorted(others - {1.0}) if n * log.travel > 0.5)]
+def _trial_harmonics(log: Scales) -> list[float]:
+    """Periods a load turn: 1 for an eccentric wheel of the load, the ratio for one of the motor, twice that for an angled
+    coupling. Except for the first, the motion must cover half a radian of the wave."""
+    higher = {*map(float, range(2, 9)), log.ratio, 2.0 * log.ratio} - {1.0}
+    return [1.0, *(n for n in sorted(higher) if n * log.travel > 0.5)]
 
 
 @EFFECTS.add
 class Backlash(TransmissionEffect):
-    """A hard gap in series with the law: contact only outside of +-half_gap."""
+    """A hard gap in series with the law: deflection z - clip(z, -b, b), where b is the half gap."""
 
     kind: ClassVar[str] = "backlash"
     half_gap: Scalar = shape(
@@ -44,13 +44,13 @@ class Backlash(TransmissionEffect):
 
     @classmethod
     def suits(cls, transmission):
-        # beside a law with a gap of its own the two cannot be told apart
+        # the gap of a law and this one cannot be told apart
         return "half_gap" not in transmission.truth()
 
 
 @EFFECTS.add
 class Hardening(TransmissionEffect):
-    """Stiffness that grows with deflection: + K_3 z^3."""
+    """Stiffness that grows with the deflection z: torque K_3 z^3 beside the law."""
 
     kind: ClassVar[str] = "hardening"
     cubic_stiffness: Scalar = size("N m/rad³", "cubic stiffness K_3")
@@ -65,7 +65,7 @@ class Hardening(TransmissionEffect):
 
 @EFFECTS.add
 class Damping(TransmissionEffect):
-    """Damping of the shaft: + D dz/dt of the elastic deflection (none inside a hard gap)."""
+    """Damping of the shaft: torque D dz/dt beside the law, where z is the elastic deflection (none inside a hard gap)."""
 
     kind: ClassVar[str] = "damping"
     velocity_dependent: ClassVar[bool] = True
@@ -85,8 +85,8 @@ class Damping(TransmissionEffect):
 
 @EFFECTS.add
 class Hysteresis(TransmissionEffect):
-    """Friction within the shaft (Bouc-Wen, n = 2), beside the law: T w. With the deflection z, dw/dz = 1 / length where w
-    returns to 0, and (1 - w²) / length where it grows. Small swings see a stiffness of T / length more."""
+    """Friction within the shaft (Bouc-Wen, n = 2): torque T w beside the law. With the deflection z, dw/dz is 1 / length
+    while w returns to 0, and (1 - w²) / length while it grows. For small swings the stiffness is higher by T / length."""
 
     kind: ClassVar[str] = "hysteresis"
     torque: Scalar = size("N m", "largest hysteretic torque T", minimum=0.0)
@@ -103,11 +103,11 @@ class Hysteresis(TransmissionEffect):
     def advance(self, state, motion, step):
         # exact at a steady rate: linear up to w = 0, a hyperbolic tangent from there on
         forward = jnp.where(motion.velocity < 0.0, -1.0, 1.0)
-        way = jnp.abs(motion.velocity) * step / self.length
+        distance = jnp.abs(motion.velocity) * step / self.length
         w = forward * state[0]
-        rise = jnp.tanh(jnp.maximum(way + jnp.minimum(w, 0.0), 0.0))
+        rise = jnp.tanh(jnp.maximum(distance + jnp.minimum(w, 0.0), 0.0))
         base = jnp.maximum(w, 0.0)
-        return (forward * jnp.where(w + way < 0.0, w + way, (base + rise) / (1.0 + base * rise)),)
+        return (forward * jnp.where(w + distance < 0.0, w + distance, (base + rise) / (1.0 + base * rise)),)
 
     def transmit(self, state, deflection, rate):
         return self.torque * state[0]
@@ -120,13 +120,13 @@ class Hysteresis(TransmissionEffect):
 
 @EFFECTS.add
 class Eccentricity(TransmissionEffect):
-    """Eccentric gear: a transmission error A sin(n theta_s + phase); the torque ratio follows it (no power is lost). Of the
-    pinion, once a motor turn: n is the gear ratio."""
+    """Eccentric gear: transmission error A sin(n theta_s + phase). The torque ratio changes with it, so that no power is
+    lost. For an eccentric pinion, which turns with the motor, n is the gear ratio."""
 
     kind: ClassVar[str] = "eccentricity"
-    # small beside the twist: the torque is linear in it there
+    # a small part of the twist, for which the torque is linear in the amplitude
     amplitude: Scalar = size("rad", "amplitude A, on the motor side", trial=lambda log: 0.02 * log.twist)
-    harmonic: Scalar = harmonic("periods n a load turn", _eccentric, default=1.0)
+    harmonic: Scalar = harmonic("periods n a load turn", _trial_harmonics, default=1.0)
     phase: Scalar = angle("phase at theta_s = 0")
 
     def transmission_error(self, state, load_position):
@@ -138,10 +138,11 @@ class Eccentricity(TransmissionEffect):
 
 @EFFECTS.add
 class LoadFriction(TransmissionEffect):
-    """Friction of gear teeth or a screw under load: dry friction mu |C| on the motor's side, C the transmitted torque.
-    Efficiency 1 / (1 + mu) where the motor drives, 1 - mu where the load does; from mu = 1 on the gear locks itself.
+    """Friction of gear teeth or a screw under load: dry friction mu |C| on the motor's side, where C is the transmitted
+    torque. The efficiency is 1 / (1 + mu) while the motor drives, and 1 - mu while the load drives; with mu >= 1 the gear
+    is self-locking.
 
-    A rigid drive has none: what its gear carries depends on how its inertia is shared, which it does not say.
+    A rigid drive has no such effect, as the torque in its gear depends on how its inertia is divided between the sides.
     Reference: M. Duclusaud, G. Passault, V. Padois, O. Ly, Extended friction models for the physics simulation of servo
     actuators, arXiv:2410.08650 (2024): their load-dependent friction.
     """

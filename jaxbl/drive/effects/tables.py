@@ -1,4 +1,4 @@
-"""Torque from tables: what was measured, or what has no name."""
+"""A torque that is interpolated in tables, as it was measured."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -8,12 +8,13 @@ import jax.numpy as jnp
 
 from ..mujoco_parts import exactly, unsaid
 from ..parameters import Scalar, option
-from .base import EFFECTS, SideEffect, Value, table
+from .base import EFFECTS, Number, SideEffect, table
 
 
 @EFFECTS.add
 class Tabulated(SideEffect):
-    """A torque from tables over position, speed, or both (the sum): linear between points, constant beyond the last ones."""
+    """A torque from tables over position, over speed, or the sum of both. It is linear between points, and constant beyond
+    the first and last ones."""
 
     kind: ClassVar[str] = "tabulated"
     velocity_dependent: ClassVar[bool] = True
@@ -27,8 +28,8 @@ class Tabulated(SideEffect):
         position = motion.position
         if self.turn:
             position = position - 2.0 * jnp.pi * jnp.floor(position / (2.0 * jnp.pi))
-        of_position = _interpolated(position, self.positions, self.position_torques)
-        return of_position + _interpolated(motion.velocity, self.speeds, self.speed_torques)
+        position_torque = _interpolate(position, self.positions, self.position_torques)
+        return position_torque + _interpolate(motion.velocity, self.speeds, self.speed_torques)
 
     def to_mujoco(self, parts, side):
         if self.speeds:
@@ -42,20 +43,20 @@ class Tabulated(SideEffect):
     @classmethod
     def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
         for points, torques in (("positions", "position_torques"), ("speeds", "speed_torques")):
-            given = numbers[points]
-            if len(given) != len(numbers[torques]):
-                return f"{torques} has {len(numbers[torques])} numbers; it should have one for each of {len(given)} {points}"
-            if any(later <= one for one, later in itertools.pairwise(given)):
+            count = len(numbers[points])
+            if count != len(numbers[torques]):
+                return f"{torques} has {len(numbers[torques])} numbers; it should have one for each of {count} {points}"
+            if any(second <= first for first, second in itertools.pairwise(numbers[points])):
                 return f"{points} should increase"
         return ""
 
 
-def _interpolated(at: Value, points: Sequence[Scalar], values: Sequence[Scalar]) -> Value:
-    """Piecewise linear through points, written out so that it runs in every loop."""
+def _interpolate(x: Number, points: Sequence[Scalar], torques: Sequence[Scalar]) -> Number:
+    """Interpolate linearly between points; 0 without points. It has no arrays, which not every compiled loop can index."""
     if not points:
         return 0.0
-    total = values[0]
+    torque = torques[0]
     for i in range(len(points) - 1):
         width = points[i + 1] - points[i]
-        total = total + (values[i + 1] - values[i]) / width * jnp.clip(at - points[i], 0.0, width)
-    return total
+        torque = torque + (torques[i + 1] - torques[i]) / width * jnp.clip(x - points[i], 0.0, width)
+    return torque
