@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.fused.lane_simulator import HostSimulator
-from jaxbl.sweeps.metrics import metrics
+from jaxbl.sweeps.metrics import metrics_reducer
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import sweep
 
@@ -48,9 +48,9 @@ def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> 
     chosen = np.linspace(0, points.group_size - 1, min(lanes, points.group_size)).round().astype(int)
     with precision(config):
         experiment, columns = prepare(config), points.columns(chosen)
-        asked = metrics(names)
+        asked = metrics_reducer(names)
         reducers = {
-            "all metrics": metrics(),
+            "all metrics": metrics_reducer(),
             ", ".join(names): asked,
             f"{', '.join(names)}, none may leave": asked._replace(done=None),
         }

@@ -23,7 +23,7 @@ from jaxbl.drive.excitation import Sine
 from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run
-from jaxbl.sweeps.metrics import METRICS
+from jaxbl.sweeps.metrics import ALL_METRICS
 
 PATH, SANE = "transmission.stiffness", 60.0
 SHARE, TIME = 0.9, 0.1
@@ -86,8 +86,8 @@ def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
     whole = experiment(steps, dtype)
     least = limit(whole, int(TIME * steps))
     threads = len(jax.local_devices())
-    leaving = HostSimulator(whole, (METRICS,), (PATH,), lanes, threads)
-    staying = HostSimulator(whole, (METRICS._replace(done=None),), (PATH,), lanes, threads)
+    leaving = HostSimulator(whole, (ALL_METRICS,), (PATH,), lanes, threads)
+    staying = HostSimulator(whole, (ALL_METRICS._replace(done=None),), (PATH,), lanes, threads)
     sane, gone = SANE * np.linspace(1.0, 1.1, lanes), np.arange(lanes) < SHARE * lanes
     mixed = np.random.default_rng(0).permutation(gone)
     cases = {

@@ -31,7 +31,7 @@ from jaxbl import simulate  # noqa: E402
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays, set_leaves  # noqa: E402
 from jaxbl.drive.excitation import Sine  # noqa: E402
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers  # noqa: E402
-from jaxbl.sweeps.metrics import METRICS  # noqa: E402
+from jaxbl.sweeps.metrics import ALL_METRICS  # noqa: E402
 
 
 class Variant(NamedTuple):
@@ -72,7 +72,7 @@ def compile_variant(variant: Variant, steps: int):
         values["transmission.dead_zone"] = jnp.linspace(0.001, 0.03, n, dtype=dtype)
 
     def lane(values, seed):
-        return simulate.scan(set_leaves(experiment, values), seed, (METRICS,))[0]
+        return simulate.scan(set_leaves(experiment, values), seed, (ALL_METRICS,))[0]
 
     sweep = jax.vmap(jax.vmap(lane, (0, None)), (None, 0))
     if variant.devices > 1:

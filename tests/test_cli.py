@@ -185,7 +185,7 @@ BAD = {
     ),
     "nothing to tune for": (
         ["tune", "rest.toml"],
-        "rest.toml: motor: nothing acts on it that its observer does not know (f⁺ = 0), so that gains have nothing to meet; "
+        "rest.toml: motor: f⁺ = 0: nothing disturbs the observer's model, so that gains have nothing to overcome; "
         "add a transmission, an effect, or an excitation that moves the drive",
     ),
     "foreign folder, tune": (

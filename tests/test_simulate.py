@@ -14,7 +14,7 @@ from jaxbl.drive.effects import ConstantTorque, CoulombFriction
 from jaxbl.identification.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
-from jaxbl.sweeps.metrics import METRICS
+from jaxbl.sweeps.metrics import ALL_METRICS
 
 SEED = jnp.asarray(3)
 
@@ -25,7 +25,7 @@ def everything(state, signals):
 
 @jit
 def figures(experiment, seed=SEED):
-    return scan(experiment, seed, (METRICS,))[0]
+    return scan(experiment, seed, (ALL_METRICS,))[0]
 
 
 @jit
@@ -41,7 +41,7 @@ def identification_errors(result):
 
 
 def test_torque_of_the_implicit_observer_needs_no_low_pass():
-    result, torque = jit(lambda e: scan(e, SEED, (METRICS,), record=lambda s, g: g.torque))(paper())
+    result, torque = jit(lambda e: scan(e, SEED, (ALL_METRICS,), record=lambda s, g: g.torque))(paper())
     rms = np.sqrt(np.mean(np.square(torque[15_000:])))
     assert result["motor.torque_rmse"] < 0.01 * rms
     assert result["load.torque_rmse"] < 0.01 * rms
@@ -209,7 +209,7 @@ def test_lanes_equal_single_runs(discretisation):
     experiment = paper(discretisation, time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
     few = [dict(list(lane_values(7).items())[:3])] if discretisation == "implicit" else []
     for values in (lane_values(7), *few):
-        lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (METRICS,))[0]))(values)
+        lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (ALL_METRICS,))[0]))(values)
         for i in (0, 3, 6):
             single = figures(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
             for name, value in single.items():
@@ -221,7 +221,7 @@ def test_lanes_equal_single_runs(discretisation):
 def test_a_diverging_lane_leaves_its_neighbours_alone():
     experiment = paper(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
-    run = jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (METRICS,))[0]))
+    run = jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (ALL_METRICS,))[0]))
     lanes, calm = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
     np.testing.assert_array_equal(lanes["finite"], [True, False, True])
     assert np.all(calm["finite"])

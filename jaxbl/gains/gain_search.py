@@ -13,7 +13,7 @@ from jaxbl.config import TUNE_NAMES, TuneTable
 from jaxbl.errors import NoResult
 from jaxbl.files import to_jsonable
 from jaxbl.observer.conditions import judge_gains
-from jaxbl.sweeps.metrics import undisturbed
+from jaxbl.sweeps.metrics import no_disturbance_error
 
 from .pilot import Scenarios
 from .stages import Stages
@@ -74,7 +74,7 @@ class GainSearch:
         self.f_plus = {side: float(pilot_values["f_plus"]) for side, pilot_values in pilot.items()}
         for side, bound in self.f_plus.items():
             if not bound > 0.0:
-                raise undisturbed(side)
+                raise no_disturbance_error(side)
         self.limits: Window = {
             gain: (span.start, span.stop) for gain, span in (("alpha", table.alpha_ratio), ("lambda", table.lambda_ratio))
         }

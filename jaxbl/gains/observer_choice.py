@@ -19,7 +19,7 @@ import pandas as pd
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import to_jsonable
 from jaxbl.observer import OBSERVERS, OperatingConditions
-from jaxbl.sweeps.metrics import SIDE_METRICS, undisturbed
+from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points
 
 from .pilot import Scenarios, pilot, scenarios_of
@@ -200,7 +200,7 @@ class _Search:
         for side in self.sides:
             bound = place.pilot[side]["f_plus"]
             if not bound > 0.0:
-                raise undisturbed(side)
+                raise no_disturbance_error(side)
             encoders = at.encoders
             noise = math.hypot(encoders.noise, _WHITE * getattr(encoders, f"{side}_resolution"))
             period = at.run.sample_period

@@ -13,7 +13,7 @@ from jaxbl.drive.effects import correction_of
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError, NoResult
 from jaxbl.simulate import Experiment, Reducer, Signals, scan
-from jaxbl.sweeps.metrics import NOTHING
+from jaxbl.sweeps.metrics import ROUNDING
 
 
 class Scenarios(NamedTuple):
@@ -125,7 +125,7 @@ def _seen(scenarios: Scenarios, excitation: Any = None) -> dict[str, dict[str, f
         if not all(map(math.isfinite, values.values())):
             raise NoResult(f"{side}: the drive itself diverges in the pilot run, so that there is nothing to observe")
         for name in ("disturbance", "at_start"):
-            if values[name] <= NOTHING[config.run.precision] * values["largest_acceleration"]:
+            if values[name] <= ROUNDING[config.run.precision] * values["largest_acceleration"]:
                 values[name] = 0.0
     return out
 

@@ -21,7 +21,7 @@ from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable, write_atomic, write_table
-from jaxbl.sweeps.metrics import NOTHING, undisturbed
+from jaxbl.sweeps.metrics import ROUNDING, no_disturbance_error
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
@@ -105,8 +105,8 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
         levels[level] = frame = stages.run(study, level).frame
         for side in sides:
             size = frame[f"{side}.f_plus_acceleration"].max()
-            if frame[f"{side}.f_plus"].max() <= NOTHING[config.run.precision] * size:
-                raise undisturbed(side)
+            if frame[f"{side}.f_plus"].max() <= ROUNDING[config.run.precision] * size:
+                raise no_disturbance_error(side)
     summaries, found = [judge_error_system(config, normalised)], []
     for level, frame in levels.items():
         for side in sides:

@@ -4,7 +4,7 @@ from jaxbl.config import AxisTable, Config, FigureTable
 from jaxbl.config.figures import check_selection
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import sizes_for
-from jaxbl.sweeps.metrics import no_metric
+from jaxbl.sweeps.metrics import explain_missing_metric
 from jaxbl.validation import suggest_word
 
 MOST_PARTS = 60
@@ -48,5 +48,5 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
         for key, names in needed.items():
             for name in names:
                 if name not in metrics:
-                    raise InputError(f"figures[{i}].{key}: {no_metric(name, config.build(), metrics)}")
+                    raise InputError(f"figures[{i}].{key}: {explain_missing_metric(name, config.build(), metrics)}")
         check_selection(config, figure, i)

@@ -21,7 +21,7 @@ from jaxbl.config import Config, is_boolean, numeric_paths
 from jaxbl.files import json_with_checksum, write_atomic
 from jaxbl.lines import TERMINAL_WIDTH, format_table
 from jaxbl.sweeps.compare import FALSE, Comparison, MetricChange
-from jaxbl.sweeps.metrics import metric_of
+from jaxbl.sweeps.metrics import find_metric
 
 from .figures import COLOURS, MISSING, Drawn, style, subplots, with_unit
 from .maps import cell_edges, hatch_failures, is_log
@@ -121,7 +121,7 @@ def _changed_most(comparison: Comparison, one: MetricChange) -> list[str]:
     place = {path: one.most[path] for path in comparison.axes}
     at = ", ".join(f"{path} = {_value(value)}" for path, value in place.items())
     beyond = "rounding" if one.differs is None else "noise"
-    unit = metric_of(one.metric).unit
+    unit = find_metric(one.metric).unit
     lines = [
         _wrapped(
             f"Changed most: {one.metric}, beyond {beyond} at {one.count} of {one.points} points"
@@ -198,7 +198,7 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
             _map(figure, ax, config, one, frame, axes[-2:])
         else:
             _line(ax, config, frame, axes[0])
-        ax.set_title(with_unit(one.metric, "" if len(axes) > 1 else metric_of(one.metric).unit))
+        ax.set_title(with_unit(one.metric, "" if len(axes) > 1 else find_metric(one.metric).unit))
     beyond = "noise" if comparison.knows_noise else "rounding"
     drawn = {labels.get(path, path) for path in axes[-2:]}
     others = ", ".join(path for path, one in values.items() if labels.get(path, path) not in drawn and len(one.unique()) > 1)

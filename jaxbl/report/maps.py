@@ -25,7 +25,7 @@ from jaxbl.config.figures import filter_rows, resolve_where
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.sweeps.elementwise import apply_elementwise
-from jaxbl.sweeps.metrics import is_magnitude, metric_of
+from jaxbl.sweeps.metrics import find_metric, is_magnitude
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -151,7 +151,7 @@ def _text(value: Any) -> str:
 def value_label(value: str) -> str:
     """What an axis or a colour bar says of a metric: side, label, unit."""
     side, _, _ = value.rpartition(".")
-    about = metric_of(value)
+    about = find_metric(value)
     label = f"|{about.label}|" if is_magnitude(value) else about.label
     return with_unit(f"{side}: {label}" if side else label, about.unit)
 
@@ -341,7 +341,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
         under = []
         if gridded and (best := _best(panel, spec)) is not None:
             ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
-            under.append(f"best ★ {best[2]:.2g} {metric_of(spec.value).unit}".rstrip())
+            under.append(f"best ★ {best[2]:.2g} {find_metric(spec.value).unit}".rstrip())
         if panel.bound is not None:
             alpha_is_x = spec.x.endswith(".alpha")
             alphas = xs if alpha_is_x else ys

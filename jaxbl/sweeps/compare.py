@@ -25,7 +25,7 @@ from scipy import stats
 from jaxbl.config import Config, is_boolean
 from jaxbl.files import to_jsonable
 
-from .metrics import NOTHING, is_magnitude, metric_of
+from .metrics import ROUNDING, find_metric, is_magnitude
 from .store import Store
 from .sweep import StudyResult, open_study
 
@@ -343,10 +343,10 @@ class _Values:
 
     def _rounding(self, first: _Side, second: _Side) -> np.ndarray:
         """Differences that roundings make: relative, and of what is far below the usual size."""
-        precision = max((one.study.config.run.precision for one in (first, second)), key=NOTHING.__getitem__)
+        precision = max((one.study.config.run.precision for one in (first, second)), key=ROUNDING.__getitem__)
         sizes = np.maximum(*(np.abs(one) for one in self.means))
         usual = np.nanmedian(sizes) if np.isfinite(sizes).any() else 0.0
-        return NOTHING[precision] * sizes + np.finfo(precision).eps * usual
+        return ROUNDING[precision] * sizes + np.finfo(precision).eps * usual
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
@@ -411,7 +411,7 @@ def _changed(metric: str, first: _Side, second: _Side, paired: bool) -> MetricCh
         most = {**first.places.iloc[i].to_dict(), "first": float(a[i]), "second": float(b[i])}
     return MetricChange(
         metric=metric,
-        better=metric_of(metric).better,
+        better=find_metric(metric).better,
         points=compared,
         only=values.only,
         changed=int(values.changed.sum()),

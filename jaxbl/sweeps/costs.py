@@ -21,7 +21,7 @@ from jaxbl.fused import program_cache
 from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import announce
 
-from .metrics import Names, metrics
+from .metrics import MetricNames, metrics_reducer
 from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
 
 
@@ -137,7 +137,7 @@ def faster(
     return min(BACKENDS, key=total)
 
 
-def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
+def work_of(config: Config, paths: Sequence[str], names: MetricNames = None) -> Work:
     """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
@@ -167,9 +167,9 @@ _WEIGHTS = {
 """What an operation takes of a processor, about, where that is not as much as a sum."""
 
 
-def _counted(experiment: Experiment, paths: Sequence[str], names: Names) -> Work:
+def _counted(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Work:
     def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
-        return scan(set_leaves(experiment, values), seed, (metrics(names),))[0]
+        return scan(set_leaves(experiment, values), seed, (metrics_reducer(names),))[0]
 
     one = jax.ShapeDtypeStruct((_COUNTED,), jnp.result_type(experiment.run.sample_period))
     traced = jax.make_jaxpr(jax.vmap(lane, (0, None), axis_size=_COUNTED))(

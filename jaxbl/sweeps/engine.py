@@ -20,7 +20,7 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare
 
 from .costs import Work, costs, faster, lanes_at_once, work_of
-from .metrics import Names, ObserverGains, compile_conditions, needs_conditions, with_conditions
+from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
 from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, computed, not_put_into_cache
 
@@ -140,7 +140,7 @@ class Engine:
     def _works(self) -> dict[Backend, Work]:
         """Of a sample by either backend, in the group that has most of them."""
         config = max(self.points.groups, key=lambda group: group.config.run.steps).config
-        asked: dict[Backend, Names] = {backend: computed(backend, config.sweep.asked) for backend in BACKENDS}
+        asked: dict[Backend, MetricNames] = {backend: computed(backend, config.sweep.asked) for backend in BACKENDS}
         found = {names: work_of(config, self._varied, names) for names in set(asked.values())}
         return {backend: found[names] for backend, names in asked.items()}
 
@@ -219,7 +219,7 @@ class Engine:
             found = jax.block_until_ready(program.run(*given))
             self.run_seconds += time.perf_counter() - start
             # only now, as the first lanes need not wait for them
-            self._compile_conditions(group.config.run.precision)
+            self._compile_gain_metrics(group.config.run.precision)
             start = time.perf_counter()
             figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
@@ -277,13 +277,13 @@ class Engine:
 
     def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
         """Figures of a chunk with those that follow from them, if any of these is asked for."""
-        return with_conditions(figures, gains) if needs_conditions(self.config.sweep.asked) else figures
+        return add_gain_metrics(figures, gains) if needs_gain_metrics(self.config.sweep.asked) else figures
 
-    def _compile_conditions(self, dtype: str) -> None:
-        if dtype not in self._judging and needs_conditions(self.config.sweep.asked):
+    def _compile_gain_metrics(self, dtype: str) -> None:
+        if dtype not in self._judging and needs_gain_metrics(self.config.sweep.asked):
             self._judging.add(dtype)
             start = time.perf_counter()
-            compile_conditions(dtype, self.layout.seeds * self.layout.points)
+            compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
             self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
@@ -295,7 +295,7 @@ class Engine:
             program = self._compile(config)
             a_program = self.compile_seconds
             with precision(config):
-                self._compile_conditions(config.run.precision)
+                self._compile_gain_metrics(config.run.precision)
         compiling = a_program * len(groups) + self.compile_seconds - a_program
         backend: Backend = "scan" if program.instead is not None else self.backend
         # long enough for what a call costs not to count

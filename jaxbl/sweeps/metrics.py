@@ -1,10 +1,9 @@
 """Metrics of a run, computed in the loop over time: observation errors, convergence, gain margins, identification.
 
-A metric is one class: its column, unit, label and meaning, and how it is computed. Those that differ from others in a
-signal or a formula alone are made by :meth:`Metric.of`. Further packages add classes derived from :class:`RunMetric` or
-:class:`GainMetric`, or made so, through the entry-point group `jaxbl.metrics`; the entry's name is the metric's. RMS values
-are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are those of the motor
-divided by the gear ratio.
+A metric is a class: its column, unit, label and meaning, and how it is computed. :meth:`Metric.of` makes metrics that
+differ from others only in a signal or a formula. Other packages add subclasses of :class:`RunMetric` or :class:`GainMetric`
+through the entry-point group `jaxbl.metrics`; the entry's name is the metric's. RMS values are over the last quarter of the
+run, in SI units. Position and velocity tolerances of the load are those of the motor divided by the gear ratio.
 """
 
 import abc
@@ -33,32 +32,32 @@ class Metric(abc.ABC):
     name: ClassVar[str]
     unit: ClassVar[str] = ""
     label: ClassVar[str]
-    """Short name for axes of figures; what it means is in `doc`."""
+    """Short name for axes of figures; `doc` has the meaning."""
     doc: ClassVar[str]
     better: ClassVar[str] = ""
-    """Which is better of two values: `less` or `more`, or neither."""
+    """The better one of two values: `less` or `more`; empty if neither is."""
 
     @classmethod
-    def of(cls, name: str, unit: str, label: str, doc: str, **rest: Any) -> type[Self]:
-        """A metric of this kind, with what the kind leaves open (`signal` of an rms or peak, `factor` of a
-        peak, `judge` of gains)."""
-        found: Any = type(name, (cls,), {"name": name, "unit": unit, "label": label, "doc": doc, **rest})
-        return found
+    def of(cls, name: str, unit: str, label: str, doc: str, **options: Any) -> type[Self]:
+        """Make a metric of this kind; `options` are the attributes that the kind leaves open (`signal` of an rms or peak,
+        `factor` of a peak, `judge` of gains)."""
+        metric: Any = type(name, (cls,), {"name": name, "unit": unit, "label": label, "doc": doc, **options})
+        return metric
 
     def applies(self, experiment: Experiment) -> bool:
-        """Whether an experiment has this metric."""
+        """True if an experiment has this metric."""
         return True
 
 
-def _check(name: str, found: Any) -> None:
-    base = GainMetric if isinstance(found, type) and issubclass(found, GainMetric) else RunMetric
-    check_subclass(name, found, base)
-    for about in ("unit", "label", "doc"):
-        check_text(about, getattr(found, about, None))
+def _check_metric(name: str, metric: Any) -> None:
+    base = GainMetric if isinstance(metric, type) and issubclass(metric, GainMetric) else RunMetric
+    check_subclass(name, metric, base)
+    for attribute in ("unit", "label", "doc"):
+        check_text(attribute, getattr(metric, attribute, None))
 
 
 class _Metrics(Registry):
-    """Laws of installed packages may report errors of parameters of their own."""
+    """Metrics by name, with errors of identified parameters that transmission laws of other packages add."""
 
     def _load_all(self) -> dict[str, Any]:
         if not self._loaded:
@@ -71,18 +70,18 @@ class _Metrics(Registry):
         return self._members
 
 
-SIDE_METRICS = _Metrics("jaxbl.metrics", _check)
+SIDE_METRICS = _Metrics("jaxbl.metrics", _check_metric)
 """The metrics of each side by name, in the order of the columns."""
 
 
 class SideSample(NamedTuple):
-    """What a metric sees of a side at one sample, SI units: errors are true values less estimates."""
+    """Signals of a side at one sample, as a metric gets them, in SI units; errors are true values minus estimates."""
 
     time: Number
     inside: Number
     """1 in the last quarter of the run, else 0."""
     within: Array
-    """Whether position and velocity errors are within tolerance."""
+    """True if position and velocity errors are within tolerance."""
     true: TrueSide
     position_error: Number
     velocity_error: Number
@@ -90,35 +89,35 @@ class SideSample(NamedTuple):
 
 
 class SideEnd(NamedTuple):
-    """What a metric sees of a side at the end of the run."""
+    """A side at the end of the run, as a metric gets it."""
 
     experiment: Experiment
     state: State
     start: Any
     """Time of the first sample of the last quarter, s."""
     count: int
-    """Samples of the last quarter."""
-    identified: Mapping[str, Number]
+    """Number of samples of the last quarter."""
+    identified_parameters: Mapping[str, Number]
     """Identified parameters of the transmission; none without an identifier."""
 
 
 class RunMetric(Metric):
-    """A metric with a state that each sample moves on; metrics with the same `carry` share that of the first of them."""
+    """A metric with a state that each sample updates; metrics with the same `carry` share the state of the first of them."""
 
     carry: ClassVar[str | None] = None
 
     def init(self, zero: Number) -> Any:
-        """State before the first sample, of zeros of the run's precision."""
+        """The state before the first sample, made of `zero`, which has the run's precision."""
         return ()
 
     def update(self, carry: Any, sample: SideSample) -> Any:
-        """State after a sample."""
+        """The state after a sample."""
         return carry
 
     def known(self, carry: Any, experiment: Experiment, start: Number) -> Array | None:
-        """Whether no further sample can change the result, from the state so far; None if that is never known.
+        """True if no further sample can change the result, by the state so far; None if that is never known.
 
-        `start` is the time of the first sample of the last quarter, s. A lane whose metrics are all known need not go on.
+        `start` is the time of the first sample of the last quarter, s. A lane may stop once all its metrics are known.
         """
         return None
 
@@ -128,7 +127,7 @@ class RunMetric(Metric):
 
 
 class ObserverGains(NamedTuple):
-    """What the gain conditions ask of an observer: its gains and its errors at t = 0."""
+    """Gains of an observer and its errors at t = 0, for the gain conditions."""
 
     lambda_: Array
     alpha: Array
@@ -137,19 +136,21 @@ class ObserverGains(NamedTuple):
 
 
 class GainMetric(Metric):
-    """A metric of a super-twisting observer's gains and f_plus alone, computed after the loop over time by a program that
-    serves all studies."""
+    """A metric that follows from a super-twisting observer's gains and f_plus alone.
+
+    It is computed after the loop over time, by a program that all studies share.
+    """
 
     def applies(self, experiment):
         return bool(observer_gains(experiment))
 
     @abc.abstractmethod
     def judge(self, gains: ObserverGains, f_plus: Array) -> Array:
-        """The metric of many lanes, from arrays of one shape."""
+        """The metric of many lanes; all arrays have one shape."""
 
 
 class SignalMetric(RunMetric):
-    """A number that follows from one signal, and is zero at first."""
+    """A metric of one signal; its state is a number that begins at zero."""
 
     @abc.abstractmethod
     def signal(self, sample: SideSample) -> Number:
@@ -160,7 +161,7 @@ class SignalMetric(RunMetric):
 
 
 class Rms(SignalMetric):
-    """Root of the mean square of a signal over the last quarter."""
+    """Root mean square of a signal over the last quarter."""
 
     def update(self, carry, sample):
         return carry + sample.inside * self.signal(sample) * self.signal(sample)
@@ -170,7 +171,7 @@ class Rms(SignalMetric):
 
 
 class Peak(SignalMetric):
-    """Largest size of a signal along the run, times a factor."""
+    """Largest absolute value of a signal along the run, times a factor."""
 
     factor: ClassVar[float] = 1.0
 
@@ -196,7 +197,7 @@ class IdentificationError(RunMetric):
 
 
 class Converged(RunMetric):
-    """The state is the last time at which an error was out of tolerance, -1 before any."""
+    """Convergence; the state is the last time at which an error was out of tolerance, or -1."""
 
     name = "converged"
     label = "converged"
@@ -218,7 +219,7 @@ class Converged(RunMetric):
 
 
 class ConvergenceTime(Converged):
-    """As :class:`Converged`, whose state it shares."""
+    """Convergence time; it shares the state of :class:`Converged`."""
 
     name = "convergence_time"
     unit = "s"
@@ -232,7 +233,7 @@ class ConvergenceTime(Converged):
 
 
 class Chatter(RunMetric):
-    """The state is the sum of squares, and the velocity error of the last sample."""
+    """Chatter of the velocity; the state is the sum of squares, and the velocity error of the last sample."""
 
     name = "chatter"
     unit = "rad/s"
@@ -253,7 +254,7 @@ class Chatter(RunMetric):
 
 
 class Excitation(RunMetric):
-    """How well the input tells the unknowns of the law apart."""
+    """Smallest eigenvalue of the identifier's information: small if the input cannot separate the parameters of the law."""
 
     name = "excitation"
     label = "excitation"
@@ -267,17 +268,17 @@ class Excitation(RunMetric):
         return end.experiment.identifier.excitation(end.state.identifier)
 
 
-def _time(of: Callable[..., Array]) -> Callable[[GainMetric, ObserverGains, Array], Array]:
-    """A convergence time that follows from gains, f_plus and the errors at the start."""
-    return lambda _, g, f_plus: of(g.lambda_, g.alpha, f_plus, g.position_error, g.velocity_error)
+def _convergence_time(formula: Callable[..., Array]) -> Callable[[GainMetric, ObserverGains, Array], Array]:
+    """Make the method `judge` of a convergence time from its formula in gains, f_plus and initial errors."""
+    return lambda _, gains, f_plus: formula(gains.lambda_, gains.alpha, f_plus, gains.position_error, gains.velocity_error)
 
 
-def _margin(name: str, condition: conditions.Condition) -> type[GainMetric]:
+def _make_margin(name: str, condition: conditions.Condition) -> type[GainMetric]:
     def judge(self: Any, gains: ObserverGains, f_plus: Array) -> Array:
         return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
 
-    about = f"margin to {condition.title}", f"λ over the least λ of {condition.title}"
-    return GainMetric.of(f"margin_{name}", "", *about, judge=judge)
+    label, doc = f"margin to {condition.title}", f"λ over the least λ of {condition.title}"
+    return GainMetric.of(f"margin_{name}", "", label, doc, judge=judge)
 
 
 for _metric in (
@@ -286,47 +287,47 @@ for _metric in (
     GainMetric.of(
         "convergence_time_bound", "s", "bound on convergence time",
         "bound (42) on it for the noise-free observer; inf where (32) fails",
-        judge=_time(conditions.convergence_time_bound),
+        judge=_convergence_time(conditions.convergence_time_bound),
     ),
     GainMetric.of(
         "convergence_time_worst", "s", "worst convergence time",
         "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1",
-        judge=_time(conditions.convergence_time_worst),
+        judge=_convergence_time(conditions.convergence_time_worst),
     ),
     Rms.of("position_rmse", "rad", "position error, rms", "rms position error", better="less",
-           signal=lambda _, at: at.position_error),
+           signal=lambda _, sample: sample.position_error),
     Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", better="less",
-           signal=lambda _, at: at.velocity_error),
+           signal=lambda _, sample: sample.velocity_error),
     Rms.of(
         "torque_rmse", "N m", "torque error, rms",
         "rms error of the transmitted torque from this side's equivalent control",
         better="less",
-        signal=lambda _, at: at.torque_error,
+        signal=lambda _, sample: sample.torque_error,
     ),
     Rms.of(
         "position_size", "rad", "position, rms", "rms true position: the size that its errors compare with",
-        signal=lambda _, at: at.true.position,
+        signal=lambda _, sample: sample.true.position,
     ),
     Rms.of(
         "velocity_size", "rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with",
-        signal=lambda _, at: at.true.velocity,
+        signal=lambda _, sample: sample.true.velocity,
     ),
     Chatter,
     Peak.of(
         "f_plus", "rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run",
-        signal=lambda _, at: at.true.perturbation,
+        signal=lambda _, sample: sample.true.perturbation,
     ),
     Peak.of(
         "f_plus_acceleration", "rad/s²", "twice the largest acceleration",
         "twice the largest acceleration: the paper's text for f⁺",
-        signal=lambda _, at: at.true.acceleration,
+        signal=lambda _, sample: sample.true.acceleration,
         factor=2.0,
     ),
     GainMetric.of(
         "margin_alpha", "", "α / f⁺", "gain alpha over the true bound f_plus",
         judge=lambda _, gains, f_plus: gains.alpha / f_plus,
     ),
-    *(_margin(name, condition) for name, condition in conditions.CONDITIONS.items()),
+    *(_make_margin(name, condition) for name, condition in conditions.CONDITIONS.items()),
     IdentificationError.of("stiffness_error", "", "error of K", "relative error of the identified stiffness"),
     IdentificationError.of(
         "dead_zone_error", "", "error of the dead zone",
@@ -337,33 +338,33 @@ for _metric in (
     SIDE_METRICS.add(_metric)
 
 
-Names = tuple[str, ...] | None
-"""The metrics that a study asks for; None asks for all."""
+MetricNames = tuple[str, ...] | None
+"""Names of the metrics that a study requests; None requests all."""
 
-_OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
-"""Metrics that overflow with the lane: they show whether it stayed finite."""
+_OVERFLOW_METRICS = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
+"""Metrics that overflow if the lane does: they show whether it stayed finite."""
 
 
 @functools.cache
-def _metrics(kind: type[Metric], names: Names = None) -> dict[str, Any]:
-    """The metrics of a kind that are asked for, by name."""
+def _select_metrics(kind: type[Metric], names: MetricNames = None) -> dict[str, Any]:
+    """The requested metrics of a kind by name."""
     return {name: cls() for name, cls in SIDE_METRICS.items() if issubclass(cls, kind) and (names is None or name in names)}
 
 
-def _given(experiment: Experiment, names: Names) -> dict[str, RunMetric]:
-    """The metrics of a side that the loop gives: those asked for, and f_plus where others follow from it."""
-    if names is not None and needs_conditions(names):
+def _loop_metrics(experiment: Experiment, names: MetricNames) -> dict[str, RunMetric]:
+    """Metrics of a side that the loop over time gives: those requested, and f_plus if gain metrics follow from it."""
+    if names is not None and needs_gain_metrics(names):
         names = (*names, "f_plus")
-    return {name: metric for name, metric in _metrics(RunMetric, names).items() if metric.applies(experiment)}
+    return {name: metric for name, metric in _select_metrics(RunMetric, names).items() if metric.applies(experiment)}
 
 
-def _carries(experiment: Experiment, names: Names) -> dict[str, RunMetric]:
-    """The states of a side: by name, the metric that moves each on."""
-    found: dict[str, RunMetric] = {}
-    for name, metric in _metrics(RunMetric).items():
-        if name in _OVERFLOW or name in _given(experiment, names):
-            found.setdefault(metric.carry or name, metric)
-    return found
+def _carried_metrics(experiment: Experiment, names: MetricNames) -> dict[str, RunMetric]:
+    """The metric that updates each state of a side, by the state's name."""
+    carry_metrics: dict[str, RunMetric] = {}
+    for name, metric in _select_metrics(RunMetric).items():
+        if name in _OVERFLOW_METRICS or name in _loop_metrics(experiment, names):
+            carry_metrics.setdefault(metric.carry or name, metric)
+    return carry_metrics
 
 
 def window_start(steps: int) -> int:
@@ -371,31 +372,31 @@ def window_start(steps: int) -> int:
     return steps - max(steps // 4, 1)
 
 
-def _start(experiment: Experiment) -> Number:
+def _window_start_time(experiment: Experiment) -> Number:
     """Time of the first sample of the last quarter."""
     return window_start(experiment.run.steps) * experiment.run.sample_period
 
 
-def _init(names: Names, experiment: Experiment) -> dict[str, tuple]:
+def _init_carries(names: MetricNames, experiment: Experiment) -> dict[str, tuple]:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    carries = _carries(experiment, names).values()
-    return {side: tuple(metric.init(zero) for metric in carries) for side in experiment.sides}
+    metrics = _carried_metrics(experiment, names).values()
+    return {side: tuple(metric.init(zero) for metric in metrics) for side in experiment.sides}
 
 
-def _known(names: Names, experiment: Experiment, totals: tuple) -> Array | None:
-    """Whether all that is asked for of a side is known from its states so far; None if that is never known."""
-    if names is None or needs_conditions(names):
+def _all_known(names: MetricNames, experiment: Experiment, carry: tuple) -> Array | None:
+    """True if no further sample can change any requested metric of a side; None if that is never known."""
+    if names is None or needs_gain_metrics(names):
         return None
-    carries = dict(zip(_carries(experiment, names), totals, strict=True))
-    start = _start(experiment)
-    each = [
-        metric.known(carries[metric.carry or name], experiment, start) for name, metric in _given(experiment, names).items()
-    ]
-    found = [one for one in each if one is not None]
-    return functools.reduce(jnp.logical_and, found) if found and len(found) == len(each) else None
+    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
+    start = _window_start_time(experiment)
+    metrics = _loop_metrics(experiment, names)
+    is_known = [metric.known(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    if not is_known or any(known is None for known in is_known):
+        return None
+    return functools.reduce(jnp.logical_and, is_known)
 
 
-def identified(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
+def identified_parameters(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
     """Identified parameters of the transmission by side; none without an identifier."""
     if state.identifier is None:
         return {}
@@ -403,13 +404,14 @@ def identified(experiment: Experiment, state: State) -> Mapping[str, Mapping[str
     return experiment.identifier.estimate(state.identifier, experiment.transmission)
 
 
-def _update(
-    names: Names, experiment: Experiment, totals: dict[str, tuple], index: Int[Array, ""], signals: Signals
+def _update_carries(
+    names: MetricNames, experiment: Experiment, carries: dict[str, tuple], index: Int[Array, ""], signals: Signals
 ) -> dict[str, tuple]:
+    """Carries after a sample, by side."""
     run = experiment.run
     inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
-    new = {}
-    for side, old in totals.items():
+    new_carries = {}
+    for side, carry in carries.items():
         s = signals.side(side)
         true = s.true
         assert true is not None
@@ -421,168 +423,187 @@ def _update(
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
         )
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
-        metrics = _carries(experiment, names).values()
-        moved = tuple(metric.update(carry, sample) for metric, carry in zip(metrics, old, strict=True))
-        known = _known(names, experiment, old)
+        metrics = _carried_metrics(experiment, names).values()
+        new_carry = tuple(metric.update(state, sample) for metric, state in zip(metrics, carry, strict=True))
+        known = _all_known(names, experiment, carry)
         if known is not None:
-            # whether it stays finite is not asked any more, be the lane taken further or not
-            moved = jax.tree.map(functools.partial(jnp.where, known), old, moved)
-        new[side] = moved
-    return new
+            # the result must not depend on whether the lane stops here: a later overflow does not count
+            new_carry = jax.tree.map(functools.partial(jnp.where, known), carry, new_carry)
+        new_carries[side] = new_carry
+    return new_carries
 
 
-def _found(
-    names: Names, experiment: Experiment, totals: dict[str, tuple], state: State, side: str, wanted: Iterable[str]
+def _compute_results(
+    names: MetricNames, experiment: Experiment, carry: tuple, state: State, side: str, result_names: Iterable[str]
 ) -> dict[str, Any]:
-    """Some metrics of a side, from its states so far."""
+    """Metrics of a side by name, from its states so far."""
     run = experiment.run
-    parameters = identified(experiment, state).get(side, {})
-    end = SideEnd(experiment, state, _start(experiment), run.steps - window_start(run.steps), parameters)
-    carries = dict(zip(_carries(experiment, names), totals[side], strict=True))
-    metrics = _metrics(RunMetric)
-    return {name: metrics[name].result(carries[metrics[name].carry or name], end) for name in wanted}
+    parameters = identified_parameters(experiment, state).get(side, {})
+    end = SideEnd(experiment, state, _window_start_time(experiment), run.steps - window_start(run.steps), parameters)
+    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
+    metrics = _select_metrics(RunMetric)
+    return {name: metrics[name].result(states[metrics[name].carry or name], end) for name in result_names}
 
 
-def _finite(found: dict[str, Any]) -> Array:
-    return jnp.isfinite(sum(found[name] for name in _OVERFLOW))
+def _is_finite(results: dict[str, Any]) -> Array:
+    return jnp.isfinite(sum(results[name] for name in _OVERFLOW_METRICS))
 
 
-def _done(names: Names, experiment: Experiment, totals: dict[str, tuple], state: State) -> Array:
-    """Whether of each side all that is asked for is known, or it did not stay finite: none of the metrics that show that
-    becomes finite again, and all others are NaN then."""
-    goes_on = []
-    for side, own in totals.items():
-        finite, known = _finite(_found(names, experiment, totals, state, side, _OVERFLOW)), _known(names, experiment, own)
-        goes_on.append(finite if known is None else finite & ~known)
-    return ~functools.reduce(jnp.logical_or, goes_on)
+def _is_done(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> Array:
+    """True if the requested metrics of each side are known, or the side has overflowed.
+
+    A metric that has overflowed does not become finite again, and all metrics of its side are then NaN.
+    """
+    undecided = []
+    for side, carry in carries.items():
+        finite = _is_finite(_compute_results(names, experiment, carry, state, side, _OVERFLOW_METRICS))
+        known = _all_known(names, experiment, carry)
+        undecided.append(finite if known is None else finite & ~known)
+    return ~functools.reduce(jnp.logical_or, undecided)
 
 
-def _result(names: Names, experiment: Experiment, totals: dict[str, tuple], state: State) -> dict[str, Array]:
-    figures: dict[str, Array] = {}
-    finite = jnp.asarray(True)
-    given = _given(experiment, names)
-    for side in totals:
-        out = _found(names, experiment, totals, state, side, dict.fromkeys([*given, *_OVERFLOW]))
-        ok = _finite(out)
-        out = {name: jnp.where(ok, out[name], False if name == "converged" else jnp.nan) for name in given}
-        finite = finite & ok
-        figures |= {f"{side}.{name}": value for name, value in out.items()}
-    return {"finite": finite, **figures}
+def _finish_metrics(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> dict[str, Array]:
+    """`finite` and the metrics of both sides by column, from the last carries."""
+    columns: dict[str, Array] = {}
+    all_finite = jnp.asarray(True)
+    metrics = _loop_metrics(experiment, names)
+    for side, carry in carries.items():
+        results = _compute_results(names, experiment, carry, state, side, dict.fromkeys([*metrics, *_OVERFLOW_METRICS]))
+        finite = _is_finite(results)
+        for name in metrics:
+            columns[f"{side}.{name}"] = jnp.where(finite, results[name], False if name == "converged" else jnp.nan)
+        all_finite = all_finite & finite
+    return {"finite": all_finite, **columns}
 
 
 @functools.cache
-def metrics(names: Names = None) -> Reducer:
-    """What computes `finite` and the metrics asked for in the loop over time; the same object for the same names."""
-    own = functools.partial
-    return Reducer(own(_init, names), own(_update, names), own(_result, names), own(_done, names))
+def metrics_reducer(names: MetricNames = None) -> Reducer:
+    """The reducer that computes `finite` and the requested metrics in the loop over time.
+
+    It is the same object for the same names, so that programs are compiled once.
+    """
+    functions = _init_carries, _update_carries, _finish_metrics, _is_done
+    return Reducer(*(functools.partial(function, names) for function in functions))
 
 
-METRICS = metrics()
-"""All metrics."""
+ALL_METRICS = metrics_reducer()
+"""The reducer of all metrics."""
 
 
-def needs_conditions(names: Names) -> bool:
-    """Whether some of the metrics asked for are left to :func:`with_conditions`."""
-    return bool(_metrics(GainMetric, names))
+def needs_gain_metrics(names: MetricNames) -> bool:
+    """True if requested metrics are left to :func:`add_gain_metrics`."""
+    return bool(_select_metrics(GainMetric, names))
 
 
 def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
-    """Gains of the experiment's observers by side; none of observers that the conditions are not for."""
+    """Gains of the experiment's observers by side; empty unless they are super-twisting observers."""
     fields = ObserverGains._fields
     if not isinstance(experiment.observer.motor, AbstractSuperTwisting):
         return {}
     return {s: ObserverGains(*(getattr(getattr(experiment.observer, s), f) for f in fields)) for s in experiment.sides}
 
 
-def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains]) -> dict[str, np.ndarray]:
-    """Figures together with those that follow from gains and f_plus alone: margins to conditions, convergence times.
+def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> dict[str, np.ndarray]:
+    """Metrics by column together with those that follow from gains and f_plus alone: margins and convergence times.
 
-    Apart from the loop over time, by programs that serve all studies.
+    They are computed apart from the loop over time, by programs that all studies share.
+
+    Args:
+        metrics: columns of the loop over time, `(seeds, points)` or numbers.
+        gains: gains by side, of shapes that broadcast to that.
     """
-    found = {name: np.asarray(value) for name, value in figures.items()}
+    columns = {name: np.asarray(metric) for name, metric in metrics.items()}
     if not gains:
-        return found
-    f_plus = np.stack([found[f"{side}.f_plus"] for side in gains])
-    columns = [[np.asarray(x, f_plus.dtype) for x in given] for given in zip(*gains.values(), strict=True)]
-    for side, *given in zip(gains, *columns, f_plus, strict=True):
-        # gains and f_plus of all seeds and points, and which of those that differ each is
-        rows = np.stack([np.broadcast_to(one, f_plus.shape[1:]).ravel() for one in given], axis=1)
-        different, which = _different(rows)
-        # the program that the study's chunks have compiled, however few of the lanes differ
-        judged = apply_elementwise(_judged, list(different.T), largest=f_plus[0].size)
-        found |= {f"{side}.{name}": value[which].reshape(f_plus.shape[1:]) for name, value in judged.items()}
-    return found
+        return columns
+    f_plus = np.stack([columns[f"{side}.f_plus"] for side in gains])
+    arguments = [[np.asarray(gain, f_plus.dtype) for gain in sides] for sides in zip(*gains.values(), strict=True)]
+    for side, *side_arguments in zip(gains, *arguments, f_plus, strict=True):
+        rows = np.stack([np.broadcast_to(argument, f_plus.shape[1:]).ravel() for argument in side_arguments], axis=1)
+        # lanes share the numbers that no axis varies
+        unique, row_index = _unique_rows(rows)
+        # the program that the study's chunks have compiled, however few of the rows differ
+        results = apply_elementwise(_compute_gain_metrics, list(unique.T), largest=f_plus[0].size)
+        columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape[1:]) for name, result in results.items()}
+    return columns
 
 
-def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that differ in a bit, and the place among them of each: lanes share what their axes leave alone."""
-    whole = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]
-    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
-    return rows[first], which
+def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows without repetitions, compared bit by bit, and for each row its index among them."""
+    row_bytes = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]
+    _, first, index = np.unique(row_bytes, return_index=True, return_inverse=True)
+    return rows[first], index
 
 
-def compile_conditions(dtype: str, lanes: int) -> None:
-    """Compile what :func:`with_conditions` computes of so many lanes, for all studies of a precision."""
-    apply_elementwise(_judged, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
+def compile_gain_metrics(dtype: str, lanes: int) -> None:
+    """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision; all studies share it."""
+    apply_elementwise(_compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit
-def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error: Array, f_plus: Array) -> dict[str, Array]:
+def _compute_gain_metrics(
+    lambda_: Array, alpha: Array, position_error: Array, velocity_error: Array, f_plus: Array
+) -> dict[str, Array]:
     gains = ObserverGains(lambda_, alpha, position_error, velocity_error)
-    out = {name: metric.judge(gains, f_plus) for name, metric in _metrics(GainMetric).items()}
+    results = {name: metric.judge(gains, f_plus) for name, metric in _select_metrics(GainMetric).items()}
     # a lane that overflowed has no bound
-    return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
+    return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, result) for name, result in results.items()}
 
 
-_FINITE = Metric.of(
+_FINITE_METRIC = Metric.of(
     "finite", "", "finite", "no number of the lane overflowed, as far as metrics were not known yet", better="more"
 )
-"""The one column that is not of a side."""
+"""The only column that belongs to no side."""
 
 
-def metric_of(column: str) -> type[Metric]:
+def find_metric(column: str) -> type[Metric]:
     """The metric of a column such as `motor.velocity_rmse`."""
-    return _FINITE if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
+    return _FINITE_METRIC if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
 
 
 def is_magnitude(column: str) -> bool:
-    """Whether a metric counts by its size: a median or mean of signed relative errors must not cancel them."""
+    """True for columns whose sign does not count: signed errors must not cancel in a mean or median."""
     return column.endswith("_error")
 
 
 def metric_columns(
-    experiment: Experiment, names: Iterable[str] | None = None, others: Iterable[Experiment] = ()
+    experiment: Experiment, names: Iterable[str] | None = None, variants: Iterable[Experiment] = ()
 ) -> list[str]:
-    """The columns of this experiment, or of any of several with the same sides, of the metrics asked for or of all: what
-    :func:`metrics` and :func:`with_conditions` give.
+    """Columns that :func:`metrics_reducer` and :func:`add_gain_metrics` give, in their order.
+
+    Args:
+        experiment: experiment whose metrics apply.
+        names: requested metrics; left out, all.
+        variants: experiments with the same sides whose metrics apply as well.
 
     Raises:
-        InputError: there is no such metric, or no experiment has it.
+        InputError: there is no such metric, or it applies to no experiment.
     """
-    each = [experiment, *others]
-    own = [name for name, metric in _metrics(Metric).items() if any(metric.applies(one) for one in each)]
-    wanted = own if names is None else list(names)
-    for i, name in enumerate(wanted):
-        if name not in own:
-            what = "does not apply to this study" if name in SIDE_METRICS else "is no metric"
-            raise InputError(f"sweep.metrics[{i}]: '{name}' {what}; {suggest_word(name, own)}")
-    return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in own if name in wanted)]
+    experiments = [experiment, *variants]
+    available = [
+        name for name, metric in _select_metrics(Metric).items() if any(metric.applies(variant) for variant in experiments)
+    ]
+    requested = available if names is None else list(names)
+    for i, name in enumerate(requested):
+        if name not in available:
+            fault = "does not apply to this study" if name in SIDE_METRICS else "is no metric"
+            raise InputError(f"sweep.metrics[{i}]: '{name}' {fault}; {suggest_word(name, available)}")
+    return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in available if name in requested)]
 
 
-def no_metric(column: str, experiment: Experiment, columns: Iterable[str]) -> str:
-    """What to say of a metric that is not among a study's columns."""
+def explain_missing_metric(column: str, experiment: Experiment, columns: Iterable[str]) -> str:
+    """The message for a metric that is not among a study's columns."""
     if column in metric_columns(experiment):
         return f"'{column}' is not computed; add '{column.rpartition('.')[2]}' to sweep.metrics"
     return f"'{column}' is no metric; {suggest_word(column, columns)}"
 
 
-NOTHING = {"float64": 1e-9, "float32": 1e-4}
-"""By precision: a right-hand side error this small against the acceleration is rounding."""
+ROUNDING = {"float64": 1e-9, "float32": 1e-4}
+"""Relative errors below this are rounding, by precision; for f_plus relative to the acceleration."""
 
 
-def undisturbed(side: str) -> InputError:
-    """What to say where f_plus is zero."""
+def no_disturbance_error(side: str) -> InputError:
+    """The error to raise where f_plus is zero."""
     return InputError(
-        f"{side}: nothing acts on it that its observer does not know (f⁺ = 0), so that gains have nothing to meet; "
+        f"{side}: f⁺ = 0: nothing disturbs the observer's model, so that gains have nothing to overcome; "
         "add a transmission, an effect, or an excitation that moves the drive"
     )

@@ -20,7 +20,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.simulate import Experiment
 
-from .metrics import metric_columns, no_metric
+from .metrics import explain_missing_metric, metric_columns
 from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
@@ -270,7 +270,7 @@ def _build_criterion(config: Config, base: Config, metrics: list[str], refined: 
         ]
         return Criterion.of(of_gains or converged, TOLERANCE)
     if metric not in metrics:
-        raise InputError(f"sweep.refine_metric: {no_metric(metric, base.build(), metrics)}")
+        raise InputError(f"sweep.refine_metric: {explain_missing_metric(metric, base.build(), metrics)}")
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 

@@ -17,7 +17,7 @@ from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, raising_unsupported
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import METRICS, Names, ObserverGains, metric_columns, metrics, observer_gains
+from .metrics import ALL_METRICS, MetricNames, ObserverGains, metric_columns, metrics_reducer, observer_gains
 
 if TYPE_CHECKING:
     from jaxbl.fused.lane_simulator import LaneSimulator
@@ -33,7 +33,7 @@ def backend_of(name: str | None, given: str = "backend") -> Backend | None:
     return name
 
 
-def computed(backend: Backend, names: Names) -> Names:
+def computed(backend: Backend, names: MetricNames) -> MetricNames:
     """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
     computes all, so that those asked for are to the bit what they are beside the others."""
     return names if backend == "fused" else None
@@ -111,7 +111,7 @@ def compile_program(
     backend: Backend,
     columns: dict[str, np.ndarray],
     *,
-    names: Names = None,
+    names: MetricNames = None,
     insist: bool = False,
 ) -> Program:
     """Compile one, inside :func:`jaxbl.config.precision`, or take a :func:`shared` one; `columns` is an example of the
@@ -139,16 +139,18 @@ def compile_program(
     return shared(experiment, columns, (layout, tuple(devices), backend, dtypes, names, insist), compiled)
 
 
-def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
+def _fused(
+    experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: MetricNames
+) -> Program:
     if not paths:
         raise Unsupported("lanes that differ only in their seed")
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
     if devices[0].platform == "cpu":
-        passage: LaneSimulator = HostSimulator(experiment, (metrics(names),), paths, layout.points, len(devices))
+        passage: LaneSimulator = HostSimulator(experiment, (metrics_reducer(names),), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:
         with jax.default_device(devices[0]):
-            passage = DeviceSimulator(experiment, (metrics(names),), paths, layout.points)
+            passage = DeviceSimulator(experiment, (metrics_reducer(names),), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 
@@ -173,7 +175,7 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
 def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
     def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
         experiment_of_lane = set_leaves(experiment, values)
-        figures, _ = scan(experiment_of_lane, seed, (METRICS,))
+        figures, _ = scan(experiment_of_lane, seed, (ALL_METRICS,))
         return figures, observer_gains(experiment_of_lane)
 
     # shards along the longer side that divides evenly; one device does the rest

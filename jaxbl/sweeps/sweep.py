@@ -19,7 +19,7 @@ from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, hand_over
 from .engine import Engine, SweepEstimate
-from .metrics import metric_of
+from .metrics import find_metric
 from .programs import Backend
 from .run import Run, begun, joined
 from .status import Status, status
@@ -154,7 +154,7 @@ class StudyResult:
             first = {other: 0 for other in dataset.dims if other != dim}
             dataset = dataset.assign_coords({path: dataset[path].isel(first, drop=True) for path in paths}).drop_vars(dim)
         for name in dataset.data_vars:
-            about = metric_of(str(name))
+            about = find_metric(str(name))
             dataset[name].attrs = {"units": about.unit, "long_name": about.doc}
         assert isinstance(dataset, xarray.Dataset)
         return dataset

@@ -19,7 +19,7 @@ from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
-from .metrics import METRICS, identified, observer_gains, with_conditions
+from .metrics import ALL_METRICS, add_gain_metrics, identified_parameters, observer_gains
 from .programs import Backend
 from .store import identity
 
@@ -63,7 +63,7 @@ def run(
             figures, kept = _scanned(experiment, seed, every)
         else:
             figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
-        figures = with_conditions(figures, observer_gains(experiment))
+        figures = add_gain_metrics(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: to_jsonable(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: to_jsonable(value) for name, value in figures.items()}
@@ -103,7 +103,7 @@ def _scanned(experiment: Experiment, seed: Any, every: int) -> tuple[dict[str, A
 
 def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
     figures = {"last.largest_torque": largest}
-    for side, found in identified(experiment, state).items():
+    for side, found in identified_parameters(experiment, state).items():
         figures |= {f"last.{side}.{name}": value for name, value in found.items()}
     return figures
 
@@ -114,7 +114,7 @@ _LAST = Reducer(
     lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
     _last,
 )
-_REDUCERS = METRICS, _LAST
+_REDUCERS = ALL_METRICS, _LAST
 
 
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
         true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}
         estimates = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
         row |= true | {f"{side}.{name}": getattr(s, name) for name in estimates}
-    found = identified(experiment, state)
+    found = identified_parameters(experiment, state)
     for side in experiment.sides:
         row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
     # compiled programs sort the names of other dicts

@@ -23,7 +23,7 @@ from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.shared_part import SharedPartLoop
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
-from jaxbl.sweeps.metrics import METRICS, metrics
+from jaxbl.sweeps.metrics import ALL_METRICS, metrics_reducer
 from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
 
 HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
@@ -78,7 +78,7 @@ def parts(half, precision):
     names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
     whole = experiment(names, law, steps=200, precision=precision)
     return Parts(
-        whole, (metrics(asked),), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES
+        whole, (metrics_reducer(asked),), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES
     )
 
 
@@ -98,8 +98,8 @@ def test_figures_are_those_of_the_scan(names, law, options):
     whole = experiment(names, law, **options)
     effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
     values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
-    fused, expected = HostSimulator(whole, (METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, METRICS, 3)
-    device = DeviceSimulator(whole, (METRICS,), tuple(values), 150, interpret=True)(values, 3)
+    fused, expected = HostSimulator(whole, (ALL_METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, ALL_METRICS, 3)
+    device = DeviceSimulator(whole, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
@@ -110,7 +110,7 @@ def test_figures_are_those_of_the_scan(names, law, options):
 def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
     whole = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
     values = spread(whole, [path for path in leaf_paths(whole) if path.startswith("effects.")], 37)
-    asked = METRICS, metrics(("chatter", "f_plus", "torque_rmse"))
+    asked = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
     every, some = (HostSimulator(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
     assert len(some) < len(every)
     for name, figure in some.items():
@@ -122,13 +122,13 @@ def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))
     values = spread(whole, ["observer.motor.alpha", "observer.motor.lambda"], 7)
-    passage = HostSimulator(whole, (METRICS,), tuple(values), 7, 1)
-    varied = Parts(whole, (METRICS,), ("transmission.half_gap",), 7, 1)
+    passage = HostSimulator(whole, (ALL_METRICS,), tuple(values), 7, 1)
+    varied = Parts(whole, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
     assert passage.carried < varied.carried
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(passage._ahead, SharedPartLoop)
     assert passage._ahead._loop is not None
-    expected = scanned(whole, values, METRICS, 3)
+    expected = scanned(whole, values, ALL_METRICS, 3)
     for name, figure in passage(values, 3).items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-9, err_msg=name)
 
@@ -156,8 +156,8 @@ def test_the_kernel_of_accelerators_in_single_precision():
     with jax.enable_x64(False):
         whole = work.experiment()
         passages = [
-            HostSimulator(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
-            DeviceSimulator(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
+            HostSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, 1),
+            DeviceSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
     for name, figure in device.items():
@@ -186,7 +186,7 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
 )
 def test_a_processor_has_no_kernel_of_accelerators():
     with pytest.raises(Unsupported, match="compilation for this device"):
-        DeviceSimulator(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)
+        DeviceSimulator(experiment([], LinearShaft(60.0)), (ALL_METRICS,), ("transmission.stiffness",), 5)
 
 
 @pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
@@ -245,10 +245,10 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
     with jax.enable_x64(precision == "float64"):
         whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness}
-        staying = METRICS._replace(done=None)
+        staying = ALL_METRICS._replace(done=None)
         expected = HostSimulator(whole, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        passage = HostSimulator(whole, (METRICS,), tuple(values), lanes, threads)
+        passage = HostSimulator(whole, (ALL_METRICS,), tuple(values), lanes, threads)
         assert len(passage._threads) == threads
         loop = passage._loop
 
@@ -283,9 +283,9 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness, "run.velocity_tolerance": tolerance}
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
-        asked = metrics(("converged", "convergence_time"))
+        asked = metrics_reducer(("converged", "convergence_time"))
         every, staying = (
-            HostSimulator(whole, (one,), tuple(values), lanes, 1) for one in (METRICS, asked._replace(done=None))
+            HostSimulator(whole, (one,), tuple(values), lanes, 1) for one in (ALL_METRICS, asked._replace(done=None))
         )
         assert staying.carried < every.carried
         expected, stayed = every(values, 3), staying(values, 3)
@@ -318,7 +318,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
 def test_all_lanes_may_leave(monkeypatch):
     monkeypatch.setattr(module, "_CALL", 1)
     whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
-    passage = HostSimulator(whole, (METRICS,), ("transmission.stiffness",), 5, 1)
+    passage = HostSimulator(whole, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
     found = passage({"transmission.stiffness": np.full(5, 1e8)}, 3)
     assert not found["finite"].any()
     assert not found["load.converged"].any()

@@ -11,7 +11,7 @@ from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.fused.shared_part import SharedPartLoop, SharedPartScan
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Run
-from jaxbl.sweeps.metrics import METRICS
+from jaxbl.sweeps.metrics import ALL_METRICS
 
 
 def experiment(excitation, dtype):
@@ -49,7 +49,7 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
 
     monkeypatch.setattr(module, "SharedPartLoop", Noted)
     with jax.enable_x64(precision == "float64"):
-        length = HostSimulator(experiment(excitation, precision), (METRICS,), (path,), 16, 1)._length
+        length = HostSimulator(experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._length
         ((looped, scanned, shared),) = made
         assert (looped._loop is not None) >= states
         # the plant's four states are not carried by each lane

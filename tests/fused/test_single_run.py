@@ -15,7 +15,7 @@ from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.single_run import record_run
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
-from jaxbl.sweeps.metrics import METRICS
+from jaxbl.sweeps.metrics import ALL_METRICS
 
 NAMES = ["motor.stribeck_friction", "load.gravity", "motor.cogging", "actuator.lag"]
 ODD = Reducer(
@@ -52,16 +52,16 @@ def row(state, signals):
 def scanned(excitation):
     """An experiment, and figures and record of it by the scan."""
     whole = experiment(excitation, 523, "float64")
-    return whole, *jax.jit(lambda seed: scan(whole, seed, (METRICS, ODD), row, 1))(jnp.asarray(3))
+    return whole, *jax.jit(lambda seed: scan(whole, seed, (ALL_METRICS, ODD), row, 1))(jnp.asarray(3))
 
 
 @pytest.mark.parametrize(
     ("excitation", "every", "reducers"),
     [
-        (Multisine(5.0, 0.8), 1, (METRICS,)),
-        (Prbs(5.0, 0.05), 7, (METRICS,)),  # blocks with a rest, none a multiple of what is kept
-        (Prbs(5.0, 0.05), 600, (METRICS,)),
-        (Multisine(5.0, 0.8), 3, (METRICS, ODD)),  # what no loop can do
+        (Multisine(5.0, 0.8), 1, (ALL_METRICS,)),
+        (Prbs(5.0, 0.05), 7, (ALL_METRICS,)),  # blocks with a rest, none a multiple of what is kept
+        (Prbs(5.0, 0.05), 600, (ALL_METRICS,)),
+        (Multisine(5.0, 0.8), 3, (ALL_METRICS, ODD)),  # what no loop can do
     ],
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
@@ -80,8 +80,8 @@ def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
 def test_a_run_in_single_precision():
     with jax.enable_x64(False):
         whole = experiment(Multisine(5.0, 0.8), 500, "float32")
-        found, kept = record_run(whole, 3, (METRICS,), row)
-        figures, record = jax.jit(lambda seed: scan(whole, seed, (METRICS,), row))(jnp.asarray(3, jnp.uint32))
+        found, kept = record_run(whole, 3, (ALL_METRICS,), row)
+        figures, record = jax.jit(lambda seed: scan(whole, seed, (ALL_METRICS,), row))(jnp.asarray(3, jnp.uint32))
     assert {column.dtype.name for column in kept.values()} == {"float32", "bool"}
     np.testing.assert_allclose(kept["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))
     np.testing.assert_allclose(found["motor.velocity_rmse"], figures["motor.velocity_rmse"], rtol=1e-3)

@@ -311,11 +311,11 @@ BAD = {
     "at rest": (
         one_side(effects=[], excitation={"kind": "sine", "amplitude": 0.0, "frequency": 1.0})
         | {"observer": {"motor": {"lambda": 1.0, "alpha": 1.0}}},
-        "motor: nothing acts on it that its observer does not know",
+        "motor: f⁺ = 0: ",
     ),
     "all known": (
         one_side({"drive.motor_viscous": 0.0}, effects=[]),
-        "motor: nothing acts on it that its observer does not know",
+        "motor: f⁺ = 0: ",
     ),
     "margin_alpha": (one_side(tune={"margin_alpha": 1.0}), "tune.margin_alpha: should be greater than 1, not 1.0"),
     "margin_exact": (one_side(tune={"margin_exact": 0.9}), "tune.margin_exact: should be greater than or equal to 1"),

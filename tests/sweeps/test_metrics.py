@@ -13,15 +13,15 @@ from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observe
 from jaxbl.simulate import scan
 from jaxbl.sweeps import metrics as under_test
 from jaxbl.sweeps.metrics import (
-    METRICS,
+    ALL_METRICS,
     SIDE_METRICS,
     ObserverGains,
+    add_gain_metrics,
+    find_metric,
     metric_columns,
-    metric_of,
-    needs_conditions,
+    needs_gain_metrics,
     observer_gains,
     window_start,
-    with_conditions,
 )
 
 H = 1e-3
@@ -29,7 +29,7 @@ H = 1e-3
 
 @eqx.filter_jit
 def run(experiment):
-    figures, kept = scan(experiment, jnp.asarray(2), (METRICS,), lambda state, signals: (signals, state.identifier))
+    figures, kept = scan(experiment, jnp.asarray(2), (ALL_METRICS,), lambda state, signals: (signals, state.identifier))
     return figures, kept
 
 
@@ -117,7 +117,7 @@ def test_columns_against_numpy_on_the_whole_trace(case):
     experiment = paper(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
     figures, (signals, identifier) = run(experiment)
     expected = by_numpy(experiment, signals, identifier)
-    figures = with_conditions(figures, observer_gains(experiment))
+    figures = add_gain_metrics(figures, observer_gains(experiment))
     assert set(figures) == set(expected) == set(metric_columns(experiment))
     for name, value in expected.items():
         np.testing.assert_allclose(figures[name], value, rtol=1e-7, atol=1e-12, err_msg=name)
@@ -155,8 +155,8 @@ def test_every_column_has_unit_and_meaning():
     columns = metric_columns(paper())
     assert len(columns) == 1 + 2 * len(SIDE_METRICS)
     for column in columns:
-        assert metric_of(column).doc
-    assert metric_of("load.torque_rmse").unit == "N m"
+        assert find_metric(column).doc
+    assert find_metric("load.torque_rmse").unit == "N m"
 
 
 def test_some_metrics_alone():
@@ -164,13 +164,13 @@ def test_some_metrics_alone():
     assert metric_columns(experiment, ["f_plus", "converged"]) == [
         "finite", "motor.converged", "motor.f_plus", "load.converged", "load.f_plus",
     ]  # fmt: skip
-    asked = under_test.metrics(("converged", "convergence_time"))
-    assert asked is under_test.metrics(("converged", "convergence_time"))
-    assert asked != under_test.metrics(("converged",))
+    asked = under_test.metrics_reducer(("converged", "convergence_time"))
+    assert asked is under_test.metrics_reducer(("converged", "convergence_time"))
+    assert asked != under_test.metrics_reducer(("converged",))
     # one state for both, besides those that show whether the lane stays finite
     assert {side: len(carry) for side, carry in asked.init(experiment).items()} == {"motor": 6, "load": 6}
-    assert [needs_conditions(names) for names in (None, ("converged",), ("margin_alpha",))] == [True, False, True]
-    given = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics(("margin_alpha",)),))[0])
+    assert [needs_gain_metrics(names) for names in (None, ("converged",), ("margin_alpha",))] == [True, False, True]
+    given = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics_reducer(("margin_alpha",)),))[0])
     assert set(given) == {"finite", "motor.f_plus", "load.f_plus"}
 
 
@@ -209,11 +209,11 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
         "motor": ObserverGains(np.array([4.0, 5.0, 6.0]), np.array([9.0, 9.0, 8.0]), np.array(0.0), np.array(0.5)),
         "load": ObserverGains(*map(np.array, (0.5, 0.4, 0.0, 0.1))),
     }
-    found = with_conditions(f_plus, gains)
+    found = add_gain_metrics(f_plus, gains)
     # both sides by the program of six lanes
     assert counts == [(5, {"largest": 6}), (2, {"largest": 6})]
     for seed, lane in np.ndindex(2, 3):
         alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
         of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}
-        for name, value in with_conditions(alone, of_lane).items():
+        for name, value in add_gain_metrics(alone, of_lane).items():
             np.testing.assert_array_equal(found[name][seed, lane], value, err_msg=name)
