@@ -97,7 +97,7 @@ class SideEnd(NamedTuple):
     """Time of the first sample of the last quarter, s."""
     count: int
     """Number of samples of the last quarter."""
-    identified_parameters: Mapping[str, Number]
+    identified: Mapping[str, Number]
     """Identified parameters of the transmission; none without an identifier."""
 
 
@@ -390,10 +390,9 @@ def _all_known(names: MetricNames, experiment: Experiment, carry: tuple) -> Arra
     states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     start = _window_start_time(experiment)
     metrics = _loop_metrics(experiment, names)
-    is_known = [metric.known(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
-    if not is_known or any(known is None for known in is_known):
-        return None
-    return functools.reduce(jnp.logical_and, is_known)
+    maybe_known = [metric.known(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    is_known = [known for known in maybe_known if known is not None]
+    return functools.reduce(jnp.logical_and, is_known) if is_known and len(is_known) == len(maybe_known) else None
 
 
 def identified_parameters(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
@@ -482,8 +481,12 @@ def metrics_reducer(names: MetricNames = None) -> Reducer:
 
     It is the same object for the same names, so that programs are compiled once.
     """
-    functions = _init_carries, _update_carries, _finish_metrics, _is_done
-    return Reducer(*(functools.partial(function, names) for function in functions))
+    return Reducer(
+        functools.partial(_init_carries, names),
+        functools.partial(_update_carries, names),
+        functools.partial(_finish_metrics, names),
+        functools.partial(_is_done, names),
+    )
 
 
 ALL_METRICS = metrics_reducer()

@@ -98,7 +98,10 @@ def test_figures_are_those_of_the_scan(names, law, options):
     whole = experiment(names, law, **options)
     effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
     values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
-    fused, expected = HostSimulator(whole, (ALL_METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, ALL_METRICS, 3)
+    fused, expected = (
+        HostSimulator(whole, (ALL_METRICS,), tuple(values), 150, 2)(values, 3),
+        scanned(whole, values, ALL_METRICS, 3),
+    )
     device = DeviceSimulator(whole, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
