@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test goldens lint docs versions clean
+.PHONY: demo test goldens lint docs size versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl demo
@@ -23,6 +23,10 @@ lint: .venv/installed-dev
 # the site, from the pages, docstrings, and the studies of the gallery
 docs: .venv/installed-dev
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html
+
+# lines, tokens and words by folder; tests/test_size.py holds ceilings
+size:
+	$(PYTHON) benchmarks/size.py
 
 versions: .venv/installed-dev
 	.ci/versions
