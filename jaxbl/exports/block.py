@@ -1,4 +1,4 @@
-"""What code is written for: a state, a step from sample to sample, and names for all that goes in and out."""
+"""A block to write code for: a state, a step from sample to sample, and names for all inputs and outputs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -8,7 +8,17 @@ import numpy as np
 
 from jaxbl.fused.jaxprs import ClosedJaxpr, trace
 
-from .lowering import Constant, Routine, Value, Variable, alike, lowered, read_by, with_x64, without_unread
+from .lowering import (
+    Constant,
+    Routine,
+    Value,
+    Variable,
+    are_same,
+    default_precision,
+    drop_unread,
+    find_read_variables,
+    lower_to_operations,
+)
 
 
 class Quantity(NamedTuple):
@@ -16,16 +26,16 @@ class Quantity(NamedTuple):
 
     name: str
     unit: str
-    about: str
+    description: str
     dtype: np.dtype
 
 
-class Known(NamedTuple):
+class StudyNumber(NamedTuple):
     """A number of the study: its value, unit and description."""
 
     value: float
     unit: str
-    about: str
+    description: str
 
 
 class Block(NamedTuple):
@@ -34,25 +44,25 @@ class Block(NamedTuple):
     Attributes:
         name: of the block, a C identifier.
         dtype: of its real numbers.
-        known: numbers of the study by config path; the first arguments of both functions, in this order.
-        first: what `start` is given besides.
-        state: what is carried from sample to sample.
+        study_numbers: numbers of the study by config path; the first arguments of both functions, in this order.
+        start_inputs: further arguments of `start`.
+        state: numbers that are carried from sample to sample.
         inputs, outputs: of each sample.
-        start: known numbers, first -> state; outputs before the first step, too, where it is asked for these.
-        step: known numbers, state, inputs -> state, outputs.
-        starts_with_outputs: whether it is.
+        start: study numbers, start inputs -> state, and the outputs before the first step if `start_gives_outputs`.
+        step: study numbers, state, inputs -> state, outputs.
+        start_gives_outputs: True if `start` gives outputs, too.
     """
 
     name: str
     dtype: np.dtype
-    known: Mapping[str, Known]
-    first: Sequence[Quantity]
+    study_numbers: Mapping[str, StudyNumber]
+    start_inputs: Sequence[Quantity]
     state: Sequence[Quantity]
     inputs: Sequence[Quantity]
     outputs: Sequence[Quantity]
     start: ClosedJaxpr
     step: ClosedJaxpr
-    starts_with_outputs: bool = False
+    start_gives_outputs: bool = False
 
 
 class Program(NamedTuple):
@@ -70,11 +80,11 @@ class Program(NamedTuple):
     """What `step` reads for each state."""
 
 
-def traced_block(
+def trace_block(
     name: str,
     dtype: np.dtype,
-    known: Mapping[str, Known],
-    first: Sequence[Quantity],
+    study_numbers: Mapping[str, StudyNumber],
+    start_inputs: Sequence[Quantity],
     inputs: Sequence[Quantity],
     start: Callable[[dict[str, Any], dict[str, Any]], Any],
     step: Callable[[dict[str, Any], Any, dict[str, Any]], tuple[Any, dict[str, tuple[Any, str, str]]]],
@@ -83,85 +93,110 @@ def traced_block(
     """Trace the functions of a block.
 
     Args:
-        name, dtype, known, first, inputs: as of :class:`Block`.
+        name, dtype, study_numbers, start_inputs, inputs: as of :class:`Block`.
         start: from the numbers of the study by config path, and what it is given by name, to a pytree of scalars.
         step: the same with the state, to the new state and the outputs: value, unit and description by name.
         outputs: values of the same outputs before the first step, where they are asked for: from what `start` is given, and
             the state that it gives.
     """
-    with with_x64(dtype):
-        numbers = {path: jax.ShapeDtypeStruct((), dtype) for path in known}
-        given = {one.name: jax.ShapeDtypeStruct((), one.dtype) for one in (*first, *inputs)}
-        begin = {one.name: given[one.name] for one in first}
-        sample = {one.name: given[one.name] for one in inputs}
-        state = jax.eval_shape(start, numbers, begin)
-        said: dict[str, tuple[str, str]] = {}
+    with default_precision(dtype):
+        numbers = {path: jax.ShapeDtypeStruct((), dtype) for path in study_numbers}
+        avals = {quantity.name: jax.ShapeDtypeStruct((), quantity.dtype) for quantity in (*start_inputs, *inputs)}
+        start_avals = {quantity.name: avals[quantity.name] for quantity in start_inputs}
+        sample_avals = {quantity.name: avals[quantity.name] for quantity in inputs}
+        state = jax.eval_shape(start, numbers, start_avals)
+        output_descriptions: dict[str, tuple[str, str]] = {}
 
         def flat_start(numbers: list[Any], begin: list[Any]) -> list[Any]:
-            own, given = dict(zip(known, numbers, strict=True)), _named(first, begin)
-            found = start(own, given)
-            return [*jax.tree.leaves(found), *(outputs(own, found, given).values() if outputs else ())]
+            study_values, start_values = dict(zip(study_numbers, numbers, strict=True)), _name_values(start_inputs, begin)
+            state = start(study_values, start_values)
+            return [*jax.tree.leaves(state), *(outputs(study_values, state, start_values).values() if outputs else ())]
 
         def flat_step(numbers: list[Any], leaves: list[Any], sample: list[Any]) -> list[Any]:
             tree = jax.tree.structure(state).unflatten(leaves)
-            new, out = step(dict(zip(known, numbers, strict=True)), tree, _named(inputs, sample))
-            said.update({name: (unit, about) for name, (_, unit, about) in out.items()})
+            new, out = step(dict(zip(study_numbers, numbers, strict=True)), tree, _name_values(inputs, sample))
+            output_descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
             return [*jax.tree.leaves(new), *(value for value, _, _ in out.values())]
 
         leaves = jax.tree.leaves(state)
-        started = trace(flat_start, list(numbers.values()), list(begin.values()))
-        stepped = trace(flat_step, list(numbers.values()), leaves, list(sample.values()))
-    dtypes = [np.dtype(aval.dtype) for aval in stepped.out_avals]
-    found = [Quantity(name, *said[name], dtype) for name, dtype in zip(said, dtypes[len(leaves) :], strict=True)]
-    names = [_identifier(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]
-    carried = [Quantity(one, "", "", dtype) for one, dtype in zip(names, dtypes[: len(leaves)], strict=True)]
-    return Block(name, dtype, known, first, carried, inputs, found, started, stepped, outputs is not None)
-
-
-def _named(quantities: Sequence[Quantity], values: Sequence[Any]) -> dict[str, Any]:
-    return {one.name: value for one, value in zip(quantities, values, strict=True)}
-
-
-def _identifier(path: Sequence[Any]) -> str:
-    """Of a leaf: `observer_motor_position`."""
-    parts = (getattr(one, "name", None) or getattr(one, "key", None) or getattr(one, "idx", None) for one in path)
-    return "_".join(str(0 if part is None else part) for part in parts)
-
-
-def program_of(block: Block) -> Program:
-    """The operations of a block. Raises `Unsupported` where one is unknown."""
-    known: list[Value] = [Constant(np.asarray(one.value, block.dtype), path, (path,)) for path, one in block.known.items()]
-    with with_x64(block.dtype):
-        start = lowered(block.start, [*known, *_variables(block.first)])
-        # a state that begins as a constant, and is that again after each step, is none, if all such are taken together
-        begin = start.results[: len(block.state)]
-        fixed = {i: one for i, one in enumerate(begin) if isinstance(one, Constant)}
-        while True:
-            state = _variables(block.state)
-            given = [fixed.get(i, variable) for i, variable in enumerate(state)]
-            step = lowered(block.step, [*known, *given, *_variables(block.inputs)])
-            still = {i: one for i, one in fixed.items() if alike(step.results[i], one)}
-            if len(still) == len(fixed):
-                break
-            fixed = still
-    count = len(state)
-    outputs, kept = step.results[count:], set[int]()
-    while True:
-        wanted = Routine(step.statements, (*(step.results[i] for i in sorted(kept)), *outputs))
-        read = read_by(wanted)
-        found = {i for i, variable in enumerate(state) if variable in read and i not in fixed}
-        if found == kept:
-            break
-        kept = found
-    places = sorted(kept)
-    return Program(
-        block,
-        tuple(block.state[i] for i in places),
-        without_unread(Routine(start.statements, (*(start.results[i] for i in places), *start.results[count:]))),
-        without_unread(wanted),
-        tuple(state[i] for i in places),
+        traced_start = trace(flat_start, list(numbers.values()), list(start_avals.values()))
+        traced_step = trace(flat_step, list(numbers.values()), leaves, list(sample_avals.values()))
+    dtypes = [np.dtype(aval.dtype) for aval in traced_step.out_avals]
+    output_quantities = [
+        Quantity(name, *output_descriptions[name], dtype)
+        for name, dtype in zip(output_descriptions, dtypes[len(leaves) :], strict=True)
+    ]
+    leaf_names = [_name_leaf(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]
+    state_quantities = [
+        Quantity(quantity, "", "", dtype) for quantity, dtype in zip(leaf_names, dtypes[: len(leaves)], strict=True)
+    ]
+    return Block(
+        name,
+        dtype,
+        study_numbers,
+        start_inputs,
+        state_quantities,
+        inputs,
+        output_quantities,
+        traced_start,
+        traced_step,
+        outputs is not None,
     )
 
 
-def _variables(quantities: Sequence[Quantity]) -> list[Variable]:
-    return [Variable(one.dtype, -1, one.name) for one in quantities]
+def _name_values(quantities: Sequence[Quantity], values: Sequence[Any]) -> dict[str, Any]:
+    return {quantity.name: value for quantity, value in zip(quantities, values, strict=True)}
+
+
+def _name_leaf(path: Sequence[Any]) -> str:
+    """Name a leaf of the state by its path: `observer_motor_position`."""
+    parts = (getattr(key, "name", None) or getattr(key, "key", None) or getattr(key, "idx", None) for key in path)
+    return "_".join(str(0 if part is None else part) for part in parts)
+
+
+def lower_block(block: Block) -> Program:
+    """Lower both functions of a block to operations. Raises `Unsupported` where an operation is unknown."""
+    study_constants: list[Value] = [
+        Constant(np.asarray(number.value, block.dtype), path, (path,)) for path, number in block.study_numbers.items()
+    ]
+    with default_precision(block.dtype):
+        start_routine = lower_to_operations(block.start, [*study_constants, *_make_variables(block.start_inputs)])
+        # A state that begins as a constant and keeps its value in each step is that constant. Whether it does may depend on
+        # other states of the kind: assume all of them, and drop those that change until none does.
+        start_values = start_routine.results[: len(block.state)]
+        constant_states = {i: start for i, start in enumerate(start_values) if isinstance(start, Constant)}
+        while True:
+            state = _make_variables(block.state)
+            state_values = [constant_states.get(i, variable) for i, variable in enumerate(state)]
+            step = lower_to_operations(block.step, [*study_constants, *state_values, *_make_variables(block.inputs)])
+            unchanged_states = {
+                i: constant for i, constant in constant_states.items() if are_same(step.results[i], constant)
+            }
+            if len(unchanged_states) == len(constant_states):
+                break
+            constant_states = unchanged_states
+    count = len(state)
+    outputs, read_states = step.results[count:], set[int]()
+    while True:
+        needed = Routine(step.statements, (*(step.results[i] for i in sorted(read_states)), *outputs))
+        read = find_read_variables(needed)
+        states_read_now = {i for i, variable in enumerate(state) if variable in read and i not in constant_states}
+        if states_read_now == read_states:
+            break
+        read_states = states_read_now
+    kept_indices = sorted(read_states)
+    return Program(
+        block,
+        tuple(block.state[i] for i in kept_indices),
+        drop_unread(
+            Routine(
+                start_routine.statements, (*(start_routine.results[i] for i in kept_indices), *start_routine.results[count:])
+            )
+        ),
+        drop_unread(needed),
+        tuple(state[i] for i in kept_indices),
+    )
+
+
+def _make_variables(quantities: Sequence[Quantity]) -> list[Variable]:
+    return [Variable(quantity.dtype, -1, quantity.name) for quantity in quantities]

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .block import Program, Quantity
-from .lowering import Constant, Operation, Routine, Value, Variable, constants_of
-from .writer import Writer, plain_text, shortest, unread
+from .lowering import Constant, Operation, Routine, Value, Variable, find_constants
+from .writer import Writer, find_unread_names, to_ascii, write_shortest
 
 _TYPES = {
     "float64": "double",
@@ -30,51 +30,51 @@ class Code(NamedTuple):
 
 
 def c_type(dtype: np.dtype) -> str:
-    """The type of C for numbers of a type."""
+    """Return the C type for numbers of a dtype."""
     return _TYPES[str(dtype)]
 
 
-def c_code(program: Program, about: Sequence[str]) -> Code:
-    """A program in C.
+def write_c_code(program: Program, head_lines: Sequence[str]) -> Code:
+    """Write a program in C.
 
     Args:
         program: of a block.
-        about: lines for the beginning of both files.
+        head_lines: lines for the beginning of both files.
     """
     name = program.block.name
     writer = _C(program)
-    writer.routines()
-    head = [*comment(about), ""]
-    constants = writer.definitions(set.intersection(*writer.read))
+    writer.write_routines()
+    head = [*write_comment(head_lines), ""]
+    constants = writer.define_constants(set.intersection(*writer.constants_read))
     includes = [f'#include "{name}.h"', "", *(["#include <math.h>", ""] if writer.needs_math else [])]
-    parts = [*head, *includes, *constants, "" if constants else None, *writer.helpers(), *writer.lines]
+    parts = [*head, *includes, *constants, "" if constants else None, *writer.write_helpers(), *writer.lines]
     source = "\n".join(part for part in parts if part is not None)
-    return Code(plain_text(f"{source.rstrip()}\n"), plain_text(_header(program, head)))
+    return Code(to_ascii(f"{source.rstrip()}\n"), to_ascii(_write_header(program, head)))
 
 
-def comment(lines: Sequence[str]) -> list[str]:
-    """A comment of several lines."""
+def write_comment(lines: Sequence[str]) -> list[str]:
+    """Write a comment of several lines."""
     return ["/*", *(f" * {line}".rstrip().replace("*/", "* /").replace("/*", "/ *") for line in lines), " */"]
 
 
-def said_of(program: Program, constant: Constant) -> str:
-    """What a constant is, for a comment."""
-    known = program.block.known.get(constant.formula)
-    if known is None:
+def describe_constant(program: Program, constant: Constant) -> str:
+    """Say for a comment which number of the study a constant is, or how it follows from them."""
+    study_number = program.block.study_numbers.get(constant.formula)
+    if study_number is None:
         return constant.formula.removeprefix("(").removesuffix(")") if constant.formula.startswith("(") else constant.formula
-    return f"{constant.formula}{f', {known.unit}' if known.unit else ''}: {known.about}"
+    return f"{constant.formula}{f', {study_number.unit}' if study_number.unit else ''}: {study_number.description}"
 
 
-def _header(program: Program, head: Sequence[str]) -> str:
+def _write_header(program: Program, head: Sequence[str]) -> str:
     block, name = program.block, program.block.name
     guard = f"{name.upper()}_H"
-    start, step = signatures(program)
+    start, step = write_signatures(program)
     lines = [*head, f"#ifndef {guard}", f"#define {guard}", "", "#include <stdbool.h>", "#include <stdint.h>", ""]
     lines += [
         "/* What is carried from sample to sample: for init and step alone. */",
-        *_struct(f"{name}_state", program.state or [Quantity("unused", "", "", np.dtype(np.int32))]),
+        *_write_struct(f"{name}_state", program.state or [Quantity("unused", "", "", np.dtype(np.int32))]),
         "/* What step finds. */",
-        *_struct(f"{name}_outputs", block.outputs),
+        *_write_struct(f"{name}_outputs", block.outputs),
         "/* Before the first sample. */",
         f"{start};",
         "",
@@ -86,22 +86,22 @@ def _header(program: Program, head: Sequence[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def signatures(program: Program) -> tuple[str, str]:
-    """Declarations of init and step."""
+def write_signatures(program: Program) -> tuple[str, str]:
+    """Write the declarations of init and step, without semicolons."""
     block, name = program.block, program.block.name
-    first = [f"{c_type(one.dtype)} {one.name}" for one in block.first]
-    inputs = [f"{c_type(one.dtype)} {one.name}" for one in block.inputs]
-    found = f"{name}_outputs *outputs"
-    start = ", ".join([f"{name}_state *state", *first, *([found] if block.starts_with_outputs else [])])
-    step = ", ".join([f"{name}_state *state", *inputs, found])
+    first = [f"{c_type(quantity.dtype)} {quantity.name}" for quantity in block.start_inputs]
+    inputs = [f"{c_type(quantity.dtype)} {quantity.name}" for quantity in block.inputs]
+    outputs = f"{name}_outputs *outputs"
+    start = ", ".join([f"{name}_state *state", *first, *([outputs] if block.start_gives_outputs else [])])
+    step = ", ".join([f"{name}_state *state", *inputs, outputs])
     return f"void {name}_init({start})", f"void {name}_step({step})"
 
 
-def _struct(name: str, members: Sequence[Quantity]) -> list[str]:
+def _write_struct(name: str, members: Sequence[Quantity]) -> list[str]:
     lines = ["typedef struct", "{"]
-    for one in members:
-        about = f"{one.about}{f', {one.unit}' if one.unit else ''}"
-        lines.append(f"    {c_type(one.dtype)} {one.name};{f' /* {about} */' if about else ''}")
+    for member in members:
+        remark = f"{member.description}{f', {member.unit}' if member.unit else ''}"
+        lines.append(f"    {c_type(member.dtype)} {member.name};{f' /* {remark} */' if remark else ''}")
     return [*lines, f"}} {name};", ""]
 
 
@@ -109,60 +109,70 @@ class _C(Writer):
     def __init__(self, program: Program):
         super().__init__(program)
         self.needs_math = False
-        self._needed: dict[str, tuple[np.dtype, ...]] = {}
-        """Helpers by name, with the types that they are about."""
-        self.read = [set(constants_of(routine)) & self.constants.keys() for routine in (program.start, program.step)]
+        self._helper_types: dict[str, tuple[np.dtype, ...]] = {}
+        """Argument and result type of each helper function that the code calls, by its name."""
+        self.constants_read = [
+            set(find_constants(routine)) & self.constants.keys() for routine in (program.start, program.step)
+        ]
         """Named constants of init and of step."""
 
-    def routines(self) -> None:
+    def write_routines(self) -> None:
         """Write init and step."""
         program, block = self.program, self.program.block
-        start, step = signatures(program)
-        self._function(start, 0, program.start, block.first, ())
-        self.line()
-        self._function(step, 1, program.step, block.inputs, program.state_variables)
+        start, step = write_signatures(program)
+        self._write_function(start, 0, program.start, block.start_inputs, ())
+        self.add_line()
+        self._write_function(step, 1, program.step, block.inputs, program.state_variables)
 
-    def _function(self, head: str, which: int, routine: Routine, given: Sequence[Quantity], old: Sequence[Variable]) -> None:
-        """One of the two; `old` are variables for the state that it finds."""
+    def _write_function(
+        self,
+        head: str,
+        routine_index: int,
+        routine: Routine,
+        arguments: Sequence[Quantity],
+        state_variables: Sequence[Variable],
+    ) -> None:
+        """One of the two; `state_variables` are variables for the state that it finds."""
         program, block = self.program, self.program.block
-        self.line(head)
-        self.line("{")
+        self.add_line(head)
+        self.add_line("{")
         self._depth += 1
-        self._own_constants(which)
+        self._write_constants_of_routine(routine_index)
         if not program.state:
-            self.line("(void)state;" if which else "state->unused = 0;")
-        for name in unread(routine, given):
-            self.line(f"(void){name};")
-        for one, variable in zip(program.state, old, strict=which == 1):
-            self.call(variable, f"old_{one.name}")
-            self.define(variable, f"state->{one.name}")
-        self.line()
+            self.add_line("(void)state;" if routine_index else "state->unused = 0;")
+        for name in find_unread_names(routine, arguments):
+            self.add_line(f"(void){name};")
+        for quantity, variable in zip(program.state, state_variables, strict=routine_index == 1):
+            self.give_name(variable, f"old_{quantity.name}")
+            self.define(variable, f"state->{quantity.name}")
+        self.add_line()
         self._source = ""
-        self.statements(routine.statements)
-        self.line()
-        states = [f"state->{one.name}" for one in program.state]
-        outputs = [f"outputs->{one.name}" for one in block.outputs]
-        found = len(routine.results) - len(states)
-        for place, value in zip((*states, *outputs[:found]), routine.results, strict=True):
-            self.line(f"{place} = {self.text(value)};")
+        self.write_statements(routine.statements)
+        self.add_line()
+        states = [f"state->{quantity.name}" for quantity in program.state]
+        outputs = [f"outputs->{quantity.name}" for quantity in block.outputs]
+        output_count = len(routine.results) - len(states)
+        for place, value in zip((*states, *outputs[:output_count]), routine.results, strict=True):
+            self.add_line(f"{place} = {self.text(value)};")
         self._depth -= 1
-        self.line("}")
+        self.add_line("}")
 
-    def definitions(self, which: Collection[Constant]) -> list[str]:
-        """Those of some constants, in the order of the code."""
-        return [
-            f"static const {c_type(one.dtype)} {name} = {self.literal(one)}; /* {said_of(self.program, one)} */"
-            for one, name in self.constants.items()
-            if one in which
-        ]
+    def define_constants(self, constants: Collection[Constant]) -> list[str]:
+        """Write definitions of constants, in the order of the code."""
+        lines = []
+        for constant, name in self.constants.items():
+            if constant in constants:
+                remark = describe_constant(self.program, constant)
+                lines.append(f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; /* {remark} */")
+        return lines
 
-    def _own_constants(self, routine: int) -> None:
-        """Those that one function alone reads stand in it."""
-        own = self.definitions(self.read[routine] - self.read[1 - routine])
-        for line in own:
-            self.line(line)
-        if own:
-            self.line()
+    def _write_constants_of_routine(self, routine_index: int) -> None:
+        """Define the constants that only this routine reads."""
+        definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
+        for line in definitions:
+            self.add_line(line)
+        if definitions:
+            self.add_line()
 
     def literal(self, constant):
         kind, value = str(constant.dtype), constant.value.item()
@@ -170,7 +180,7 @@ class _C(Writer):
             return "true" if value else "false"
         if constant.dtype.kind == "f":
             if np.isfinite(value):
-                text = shortest(constant.value) + ("f" if kind == "float32" else "")
+                text = write_shortest(constant.value) + ("f" if kind == "float32" else "")
             else:
                 self.needs_math = True
                 text = "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
@@ -185,39 +195,39 @@ class _C(Writer):
         return f"/* {text} */"
 
     def define(self, out, text):
-        self.line(f"const {c_type(out.dtype)} {self.name(out)} = {text};")
+        self.add_line(f"const {c_type(out.dtype)} {self.name(out)} = {text};")
 
     def declare(self, out, text):
         zero = self.literal(Constant(np.asarray(0, out.dtype)))
-        self.line(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
+        self.add_line(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
 
     def assign(self, name, text):
-        self.line(f"{name} = {text};")
+        self.add_line(f"{name} = {text};")
 
     def begin_repeat(self, times):
-        index = self.unique("i")
-        self.line(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)")
-        self.line("{")
+        index = self.make_unique("i")
+        self.add_line(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)")
+        self.add_line("{")
 
-    def begin_if(self, which):
-        self.line(f"if ({which})")
-        self.line("{")
+    def begin_if(self, condition):
+        self.add_line(f"if ({condition})")
+        self.add_line("{")
 
     def begin_else(self):
-        self.line("}")
-        self.line("else")
-        self.line("{")
+        self.add_line("}")
+        self.add_line("else")
+        self.add_line("{")
 
-    def end(self, what):
-        self.line("}")
+    def end(self, statement):
+        self.add_line("}")
 
-    def operation(self, one):
-        self.define(one.out, self._expression(one))
+    def write_operation(self, operation):
+        self.define(operation.out, self._write_expression(operation))
 
-    def _expression(self, one: Operation) -> str:
-        given, name, real = one.given, one.name, one.out.dtype.kind == "f"
-        texts = [self.text(value) for value in given]
-        logical = given[0].dtype == bool
+    def _write_expression(self, operation: Operation) -> str:
+        operands, name, real = operation.operands, operation.name, operation.out.dtype.kind == "f"
+        texts = [self.text(value) for value in operands]
+        logical = operands[0].dtype == bool
         if name in _INFIX and not (logical and name in ("and", "or", "xor")):
             return f"{texts[0]} {_INFIX[name]} {texts[1]}"
         if name in _LOGICAL and logical:
@@ -228,37 +238,37 @@ class _C(Writer):
             return f"-{texts[0]}"
         if name in ("abs", "sqrt") and real:
             self.needs_math = True
-            return f"{'fabs' if name == 'abs' else 'sqrt'}{'f' if one.out.dtype == np.float32 else ''}({texts[0]})"
+            return f"{'fabs' if name == 'abs' else 'sqrt'}{'f' if operation.out.dtype == np.float32 else ''}({texts[0]})"
         if name == "abs":
             return f"({texts[0]} < 0) ? -{texts[0]} : {texts[0]}"
         if name in ("max", "min"):
-            return _extreme(name, given, texts)
+            return _write_extreme(name, operands, texts)
         if name == "select":
             return f"{texts[0]} ? {texts[1]} : {texts[2]}"
         if name == "convert":
             if logical:
-                yes, no = (self.literal(Constant(np.asarray(value, one.out.dtype))) for value in (1, 0))
+                yes, no = (self.literal(Constant(np.asarray(value, operation.out.dtype))) for value in (1, 0))
                 return f"{texts[0]} ? {yes} : {no}"
-            if (given[0].dtype, one.out.dtype) == (self.program.block.dtype, np.int32):
-                return self._helped(one, texts)
-            return f"({c_type(one.out.dtype)}){texts[0]}"
+            if (operands[0].dtype, operation.out.dtype) == (self.program.block.dtype, np.int32):
+                return self._call_helper(operation, texts)
+            return f"({c_type(operation.out.dtype)}){texts[0]}"
         if name in ("shift_left", "shift_right_logical"):
-            wide = c_type(np.dtype(f"uint{8 * one.out.dtype.itemsize}"))
+            wide = c_type(np.dtype(f"uint{8 * operation.out.dtype.itemsize}"))
             sign = "<<" if name == "shift_left" else ">>"
-            return f"({c_type(one.out.dtype)})(({wide}){texts[0]} {sign} ({wide}){texts[1]})"
-        return self._helped(one, texts)
+            return f"({c_type(operation.out.dtype)})(({wide}){texts[0]} {sign} ({wide}){texts[1]})"
+        return self._call_helper(operation, texts)
 
-    def _helped(self, one: Operation, texts: Sequence[str]) -> str:
-        types = (one.given[0].dtype, one.out.dtype)
-        name = f"bits_of_{c_type(types[0])}" if one.name == "bitcast" else one.name
-        self._needed[name] = types
-        if one.name in ("ceil", "round_even", "round_away"):
-            self._needed["floor"] = types
-        self.needs_math = self.needs_math or not self._needed.keys().isdisjoint(("floor", "convert"))
-        return f"{_HELPER.get(one.name, name)}({texts[0]})"
+    def _call_helper(self, operation: Operation, texts: Sequence[str]) -> str:
+        types = (operation.operands[0].dtype, operation.out.dtype)
+        name = f"bits_of_{c_type(types[0])}" if operation.name == "bitcast" else operation.name
+        self._helper_types[name] = types
+        if operation.name in ("ceil", "round_even", "round_away"):
+            self._helper_types["floor"] = types
+        self.needs_math = self.needs_math or not self._helper_types.keys().isdisjoint(("floor", "convert"))
+        return f"{_HELPER.get(operation.name, name)}({texts[0]})"
 
-    def helpers(self) -> list[str]:
-        """Functions that the routines call."""
+    def write_helpers(self) -> list[str]:
+        """Write the helper functions that the routines call."""
         real = c_type(self.program.block.dtype)
         single = real == "float"
         words = {
@@ -272,17 +282,17 @@ class _C(Writer):
         }  # fmt: skip
         lines: list[str] = []
         order = ["floor", "ceil", "round_even", "round_away", "power_of_two"]
-        for name in sorted(self._needed, key=lambda name: order.index(name) if name in order else len(order)):
-            given, made = self._needed[name]
+        for name in sorted(self._helper_types, key=lambda name: order.index(name) if name in order else len(order)):
+            argument_type, result_type = self._helper_types[name]
             template = _HELPERS["bitcast" if name.startswith("bits_of_") else name]
-            text = template % (words | {"given": c_type(given), "made": c_type(made)})
+            text = template % (words | {"given": c_type(argument_type), "made": c_type(result_type)})
             lines += [*textwrap.dedent(text).strip("\n").split("\n"), ""]
         return lines
 
 
-def _extreme(name: str, given: Sequence[Value], texts: Sequence[str]) -> str:
-    """The larger or smaller of two numbers, NaN if either is."""
-    (a, b), (x, y) = given, texts
+def _write_extreme(name: str, operands: Sequence[Value], texts: Sequence[str]) -> str:
+    """Write the larger or smaller of two numbers, NaN if either is NaN."""
+    (a, b), (x, y) = operands, texts
     sign = "<=" if name == "max" else ">="
     if isinstance(b, Constant) or a.dtype.kind != "f":
         return f"({x} {sign} {y}) ? {y} : {x}"

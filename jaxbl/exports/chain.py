@@ -10,33 +10,38 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, initial_state, step
 
-from .block import Block, Known, Quantity, traced_block
-from .lowering import with_x64
+from .block import Block, Quantity, StudyNumber, trace_block
+from .lowering import default_precision
 
 PERIOD = "run.sample_period"
-LAST = np.iinfo(np.int32).max
+LAST_SAMPLE = np.iinfo(np.int32).max
 """Largest index of a sample."""
 
 
-class _Chain(NamedTuple):
-    """State of the chain (of :class:`jaxbl.simulate.State`); the sample's index, which stays at the largest number once it
-    has reached it, and how many samples the sums of the identifier have taken in since they were settled."""
+class _ChainState(NamedTuple):
+    """State of the chain.
+
+    Attributes:
+        observer, equivalent_control, identifier: as in :class:`jaxbl.simulate.State`.
+        samples: index of the sample; it stays at the largest integer once it has reached it.
+        samples_uncompensated: samples since the identifier's sums were compensated last.
+    """
 
     observer: Any
     equivalent_control: Any
     identifier: Any
     samples: Any
-    unsettled: Any
+    samples_uncompensated: Any
 
 
-def _chain(state: State, samples: Any, unsettled: Any) -> _Chain:
-    return _Chain(state.observer, state.equivalent_control, state.identifier, samples, unsettled)
+def _make_chain_state(state: State, samples: Any, samples_uncompensated: Any) -> _ChainState:
+    return _ChainState(state.observer, state.equivalent_control, state.identifier, samples, samples_uncompensated)
 
 
-def observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
-    """What `jaxbl.simulate.step` does with a recorded input and measured positions.
+def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
+    """Trace what `jaxbl.simulate.step` does with a recorded input and measured positions.
 
-    The identifier counts samples from `identifier.start` on; its sums are settled every `LONGEST_BLOCK` samples, as in
+    The identifier counts samples from `identifier.start` on; its sums are compensated every `LONGEST_BLOCK` samples, as in
     :func:`jaxbl.simulate.replay`.
 
     Args:
@@ -44,69 +49,78 @@ def observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         name: of the block, a C identifier.
         dtype: of its numbers.
     """
-    with with_x64(dtype):
+    with default_precision(dtype):
         experiment = as_arrays(config.build(), dtype)
-    known = known_numbers(experiment)
+    study_numbers = read_study_numbers(experiment)
     sides = experiment.sides
     positions = [Quantity(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
     torque = Quantity("input", "N m", "input torque, held from this sample to the next", dtype)
 
-    def start(numbers: dict[str, Any], given: dict[str, Any]) -> _Chain:
-        measured = {side: given[f"{side}_position"] for side in sides}
+    def start(numbers: dict[str, Any], inputs: dict[str, Any]) -> _ChainState:
+        measured = {side: inputs[f"{side}_position"] for side in sides}
         zero = jnp.zeros((), jnp.int32)
-        return _chain(initial_state(set_leaves(experiment, numbers), measured), zero, zero)
+        return _make_chain_state(initial_state(set_leaves(experiment, numbers), measured), zero, zero)
 
-    def sample(numbers: dict[str, Any], state: _Chain, given: dict[str, Any]) -> tuple[_Chain, dict[str, Any]]:
-        own = set_leaves(experiment, numbers)
-        measured = {side: given[f"{side}_position"] for side in sides}
-        time = state.samples.astype(dtype) * own.run.sample_period
+    def sample(numbers: dict[str, Any], state: _ChainState, inputs: dict[str, Any]) -> tuple[_ChainState, dict[str, Any]]:
+        lane = set_leaves(experiment, numbers)
+        measured = {side: inputs[f"{side}_position"] for side in sides}
+        time = state.samples.astype(dtype) * lane.run.sample_period
         before = State(None, state.observer, state.equivalent_control, state.identifier)
-        new, signals = step(own, before, Sample(time, input=given["input"], measured=measured))
+        new, signals = step(lane, before, Sample(time, input=inputs["input"], measured=measured))
         out: dict[str, Any] = {}
         for side in sides:
-            one = signals.side(side)
+            estimates = signals.side(side)
             out |= {
-                f"{side}_position_estimate": (one.position_estimate, "rad", f"position of the {side}"),
-                f"{side}_velocity_estimate": (one.velocity_estimate, "rad/s", f"velocity of the {side}"),
+                f"{side}_position_estimate": (estimates.position_estimate, "rad", f"position of the {side}"),
+                f"{side}_velocity_estimate": (estimates.velocity_estimate, "rad/s", f"velocity of the {side}"),
                 f"{side}_equivalent_control": (
-                    one.equivalent_control,
+                    estimates.equivalent_control,
                     "rad/s^2",
                     f"acceleration of the {side} beyond the nominal model, filtered",
                 ),
-                f"{side}_torque_estimate": (one.torque_estimate, "N m", f"transmitted torque by the {side}'s observer"),
+                f"{side}_torque_estimate": (
+                    estimates.torque_estimate,
+                    "N m",
+                    f"transmitted torque by the {side}'s observer",
+                ),
             }
-        out |= _identified(own, new)
+        out |= _identified_outputs(lane, new)
         # sums lose nothing over some hundred samples
-        full = state.unsettled >= LONGEST_BLOCK - 1
-        settled = jax.lax.cond(full, lambda state: end_block(own, (state, ()))[0], lambda state: state, new)
-        samples = jnp.minimum(state.samples, LAST - 1) + 1
-        return _chain(settled, samples, jnp.where(full, 0, state.unsettled + 1).astype(jnp.int32)), out
+        full = state.samples_uncompensated >= LONGEST_BLOCK - 1
+        compensated = jax.lax.cond(full, lambda state: end_block(lane, (state, ()))[0], lambda state: state, new)
+        samples = jnp.minimum(state.samples, LAST_SAMPLE - 1) + 1
+        return _make_chain_state(
+            compensated, samples, jnp.where(full, 0, state.samples_uncompensated + 1).astype(jnp.int32)
+        ), out
 
-    return traced_block(name, dtype, known, positions, [torque, *positions], start, sample)
-
-
-def known_numbers(experiment: Experiment) -> dict[str, Known]:
-    """Numbers of the study by config path; the sampling period is one, too."""
-    about = leaf_paths(experiment)
-    about[PERIOD] = next(one for field, one in parameters(Run) if field.name == "sample_period")
-    return {path: Known(float(get_leaf(experiment, path)), one.unit, one.doc) for path, one in about.items()}
+    return trace_block(name, dtype, study_numbers, positions, [torque, *positions], start, sample)
 
 
-def _identified(experiment: Experiment, state: State) -> dict[str, tuple[Any, str, str]]:
-    """Identified numbers of the transmission law by each side, 0 while nothing determines them, and whether it does."""
+def read_study_numbers(experiment: Experiment) -> dict[str, StudyNumber]:
+    """Read all numbers of the study by config path, the sampling period among them."""
+    leaves = leaf_paths(experiment)
+    leaves[PERIOD] = next(parameter for field, parameter in parameters(Run) if field.name == "sample_period")
+    return {
+        path: StudyNumber(float(get_leaf(experiment, path)), parameter.unit, parameter.doc)
+        for path, parameter in leaves.items()
+    }
+
+
+def _identified_outputs(experiment: Experiment, state: State) -> dict[str, tuple[Any, str, str]]:
+    """Return what each side identifies of the transmission law (0 while it is not determined), and whether it is determined."""
     identifier, law = experiment.identifier, experiment.transmission
     if identifier is None or law is None or state.identifier is None:
         return {}
-    units = {key.rpartition(".")[2]: one.unit for key, one in leaf_paths(law).items()} | {"half_gap": "rad"}
+    units = {key.rpartition(".")[2]: parameter.unit for key, parameter in leaf_paths(law).items()} | {"half_gap": "rad"}
     out: dict[str, tuple[Any, str, str]] = {}
-    solved = identifier.solution(state.identifier)
+    solutions = identifier.solution(state.identifier)
     for side in experiment.sides:
-        determined, theta = solved[side]
-        found = law.from_theta(tuple(jnp.where(determined, x, 1.0) for x in theta))
-        for value in found.values():
+        determined, theta = solutions[side]
+        law_numbers = law.from_theta(tuple(jnp.where(determined, x, 1.0) for x in theta))
+        for value in law_numbers.values():
             determined = determined & jnp.isfinite(value)
         out[f"{side}_identified"] = determined, "", f"whether the {side}'s side determines the numbers below"
-        for key, value in found.items():
+        for key, value in law_numbers.items():
             out[f"{side}_{key}"] = (
                 jnp.where(determined, value, 0.0),
                 units.get(key, ""),

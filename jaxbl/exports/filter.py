@@ -3,22 +3,23 @@
 from jaxbl.records import POSITION_CHANNELS
 
 from .block import Program
-from .c import c_type, comment, plain_text
+from .c import c_type, to_ascii, write_comment
 
 
-def columns(program: Program) -> list[str]:
-    """Columns that it reads."""
-    sides = [one.name.removesuffix("_position") for one in program.block.first]
+def input_columns(program: Program) -> list[str]:
+    """Return the columns that the program reads."""
+    sides = [quantity.name.removesuffix("_position") for quantity in program.block.start_inputs]
     return ["t", "u", *(POSITION_CHANNELS[side] for side in sides)]
 
 
-def filter_code(program: Program) -> str:
-    """The program, which reads columns `t,u,theta_e,theta_s` (`t,u,theta_e` of a rigid drive)."""
+def write_filter_code(program: Program) -> str:
+    """Write the program, which reads columns `t,u,theta_e,theta_s` (`t,u,theta_e` of a rigid drive)."""
     block, name = program.block, program.block.name
     real, single = c_type(block.dtype), c_type(block.dtype) == "float"
-    read = columns(program)
-    about = [
-        f"Reads samples as lines '{','.join(read)}' (s, N m, rad), and writes the outputs of {name} as CSV.",
+    csv_columns = input_columns(program)
+    column_list = ",".join(csv_columns)
+    remarks = [
+        f"Reads samples as lines '{column_list}' (s, N m, rad), and writes the outputs of {name} as CSV.",
         "",
         f"    cc -std=c99 -O2 {name}.c {name}_filter.c -lm -o {name}_filter",
         f"    ./{name}_filter < log.csv > found.csv",
@@ -26,15 +27,15 @@ def filter_code(program: Program) -> str:
         "",
         "Lines have to come at the sampling period; times are only copied. A first line without numbers is passed over.",
     ]
-    formats = ["%.9g" if single else "%.17g", *("%d" if one.dtype == bool else "%.9g" if single else "%.17g"
-               for one in block.outputs)]  # fmt: skip
-    names = ["t", *(one.name for one in block.outputs)]
+    formats = ["%.9g" if single else "%.17g", *("%d" if quantity.dtype == bool else "%.9g" if single else "%.17g"
+               for quantity in block.outputs)]  # fmt: skip
+    names = ["t", *(quantity.name for quantity in block.outputs)]
     cast = "(double)" if single else ""
-    printed = [f"{cast}row[0]", *(
-        f"outputs.{one.name} ? 1 : 0" if one.dtype == bool else f"{cast}outputs.{one.name}" for one in block.outputs
-    )]  # fmt: skip
-    places = {"input": "row[1]"} | {one.name: f"row[{2 + i}]" for i, one in enumerate(block.first)}
-    head = "\n".join(comment(about))
+    printed = [f"{cast}row[0]"]
+    for output in block.outputs:
+        printed.append(f"outputs.{output.name} ? 1 : 0" if output.dtype == bool else f"{cast}outputs.{output.name}")
+    places = {"input": "row[1]"} | {quantity.name: f"row[{2 + i}]" for i, quantity in enumerate(block.start_inputs)}
+    head = "\n".join(write_comment(remarks))
     text = f'''{head}
 
 #include <stdio.h>
@@ -43,10 +44,10 @@ def filter_code(program: Program) -> str:
 
 #include "{name}.h"
 
-#define COLUMNS {len(read)}
+#define COLUMNS {len(csv_columns)}
 #define LONGEST 1024
 
-/* The numbers of a line; 0 where there are not {len(read)}. */
+/* The numbers of a line; 0 where there are not {len(csv_columns)}. */
 static int numbers(const char *line, {real} row[COLUMNS])
 {{
     const char *at = line;
@@ -103,19 +104,19 @@ int main(int argc, char *argv[])
             {{
                 continue;
             }}
-            fprintf(stderr, "{name}_filter: line %lu should be {len(read)} numbers: {",".join(read)}\\n", count);
+            fprintf(stderr, "{name}_filter: line %lu should be {len(csv_columns)} numbers: {column_list}\\n", count);
             return 2;
         }}
         if (started == 0)
         {{
-            {name}_init({", ".join(["&state", *(places[one.name] for one in block.first)])});
+            {name}_init({", ".join(["&state", *(places[quantity.name] for quantity in block.start_inputs)])});
             started = 1;
         }}
-        {name}_step({", ".join(["&state", *(places[one.name] for one in block.inputs), "&outputs"])});
+        {name}_step({", ".join(["&state", *(places[quantity.name] for quantity in block.inputs), "&outputs"])});
         fprintf(out, "{",".join(formats)}\\n",
                 {f",{chr(10)}                ".join(printed)});
     }}
     return ((fclose(out) == 0) && (started == 1)) ? 0 : 1;
 }}
 '''
-    return plain_text(text)
+    return to_ascii(text)

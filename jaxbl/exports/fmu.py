@@ -21,9 +21,9 @@ from jaxbl.config import Config
 from jaxbl.sweeps.store import identity
 
 from .block import Quantity
-from .c import c_code, c_type
+from .c import c_type, write_c_code
 from .plant import PlantProgram
-from .writer import plain_text
+from .writer import to_ascii
 
 FMI = {2: "2.0", 3: "3.0"}
 """Versions by their numbers in options."""
@@ -41,9 +41,9 @@ class Platform(NamedTuple):
 
 
 # the same bytes for the same sources; nothing but Windows needed where it runs
-_OF_WINDOWS = "-s", "-static-libgcc", "-Wl,--no-insert-timestamp"
-_WINDOWS = Platform("win64", "x86_64-windows", "dll", "x86_64-w64-mingw32-gcc", _OF_WINDOWS)
-_HERE = {
+_WINDOWS_FLAGS = "-s", "-static-libgcc", "-Wl,--no-insert-timestamp"
+_WINDOWS = Platform("win64", "x86_64-windows", "dll", "x86_64-w64-mingw32-gcc", _WINDOWS_FLAGS)
+_HOST_PLATFORMS = {
     ("Linux", "x86_64"): Platform("linux64", "x86_64-linux", "so"),
     ("Linux", "aarch64"): Platform(None, "aarch64-linux", "so"),
     ("Darwin", "x86_64"): Platform("darwin64", "x86_64-darwin", "dylib"),
@@ -78,95 +78,98 @@ class Archive(NamedTuple):
         variables: in the order of their value references.
         token: instantiation token (FMI 2: guid).
         binaries: platforms of those in it.
-        why: there is none for this machine, or for Windows, in a line each.
+        missing: why there is no binary for this machine, or for Windows: a line each.
     """
 
     content: bytes
     variables: list[Scalar]
     token: str
     binaries: list[str]
-    why: list[str]
+    missing: list[str]
 
 
-def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> Archive:
-    """The archive of a drive.
+def build_fmu(config: Config, plant: PlantProgram, head_lines: Sequence[str], fmi: int) -> Archive:
+    """Build the archive of a drive.
 
     Args:
         config: the study.
         plant: its drive as a program.
-        about: lines for the beginning of the code.
+        head_lines: lines for the beginning of the code.
         fmi: 2 or 3.
     """
     block = plant.program.block
     name = block.name
-    variables = _variables(plant)
-    code, here = c_code(plant.program, about), Path(__file__).parent / "fmi"
+    variables = _list_variables(plant)
+    code, fmi_folder = write_c_code(plant.program, head_lines), Path(__file__).parent / "fmi"
     # a name has no hyphen: these files have their own
-    own = {file: (here / file).read_text(encoding="utf-8") for file in ("fmi-instance.h", f"fmi-{fmi}.c")}
-    sources = {f"{name}.c": code.source, f"{name}.h": code.header} | own
+    fmi_files = {file: (fmi_folder / file).read_text(encoding="utf-8") for file in ("fmi-instance.h", f"fmi-{fmi}.c")}
+    sources = {f"{name}.c": code.source, f"{name}.h": code.header} | fmi_files
     # the same study need not have the same code: that of another version, or with an effect that was changed
     content = hashlib.sha256(repr((sources, variables)).encode()).hexdigest()[:16]
     token = f"{identity(config, 'simulate')}-{content}"
-    sources["fmi-model.h"] = _model(plant, variables, token, config.run.sample_period)
-    compiled = [one for one in sources if one.endswith(".c")]
-    files: dict[str, str | bytes] = {"modelDescription.xml": _description(config, plant, variables, token, fmi, compiled)}
+    sources["fmi-model.h"] = _write_model_header(plant, variables, token, config.run.sample_period)
+    c_files = [file_name for file_name in sources if file_name.endswith(".c")]
+    files: dict[str, str | bytes] = {
+        "modelDescription.xml": _write_description(config, plant, variables, token, fmi, c_files)
+    }
     if fmi == 3:
-        files["sources/buildDescription.xml"] = _build_description(name, compiled)
+        files["sources/buildDescription.xml"] = _write_build_description(name, c_files)
     files |= {f"sources/{file}": text for file, text in sources.items()}
-    binaries, why = _binaries(name, fmi, sources)
+    binaries, missing_binaries = _compile_binaries(name, fmi, sources)
     files |= {f"binaries/{place}/{file}": content for place, (file, content) in binaries.items()}
-    return Archive(_archive(files), variables, token, [*binaries], why)
+    return Archive(_pack_archive(files), variables, token, [*binaries], missing_binaries)
 
 
-def _archive(files: Mapping[str, str | bytes]) -> bytes:
-    """A zip file, the same bytes for the same content."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+def _pack_archive(files: Mapping[str, str | bytes]) -> bytes:
+    """Pack files into a zip archive: the same bytes for the same content."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
-            about = zipfile.ZipInfo(name)
-            about.compress_type = zipfile.ZIP_DEFLATED
-            about.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
-            archive.writestr(about, content)
-    return made.getvalue()
+            entry = zipfile.ZipInfo(name)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(entry, content)
+    return stream.getvalue()
 
 
 # binaries
 
 
-def _binaries(name: str, fmi: int, sources: Mapping[str, str]) -> tuple[dict[str, tuple[str, bytes]], list[str]]:
-    """By platform, name and content of its binary; and why there are not more.
+def _compile_binaries(name: str, fmi: int, sources: Mapping[str, str]) -> tuple[dict[str, tuple[str, bytes]], list[str]]:
+    """Compile a binary for this machine, and one for Windows where a compiler for it is here.
 
-    One is for this machine, and one for Windows if a compiler for it is here.
+    Returns:
+        File name and content of each binary by its folder in the archive, and the reasons for binaries that are missing.
     """
     system = platform.system(), platform.machine()
-    found, why = {}, []
-    across = [_WINDOWS] if shutil.which(_WINDOWS.compiler) else []
-    for one in dict.fromkeys([_HERE.get(system), *across]):
-        place = one and (one.of_2 if fmi == 2 else one.of_3)
-        if one is None or place is None:
-            why.append(f"for {' on '.join(system)} none is compiled in FMI {FMI[fmi]}")
+    binaries, missing = {}, []
+    other_targets = [_WINDOWS] if shutil.which(_WINDOWS.compiler) else []
+    for target in dict.fromkeys([_HOST_PLATFORMS.get(system), *other_targets]):
+        folder = target and (target.of_2 if fmi == 2 else target.of_3)
+        if target is None or folder is None:
+            missing.append(f"for {' on '.join(system)} none is compiled in FMI {FMI[fmi]}")
             continue
-        content, fault = _binary(name, one, sources)
+        content, fault = _compile_binary(name, target, sources)
         if fault:
-            why.append(fault)
+            missing.append(fault)
         else:
-            found[place] = f"{name}.{one.ending}", content
-    return found, why
+            binaries[folder] = f"{name}.{target.ending}", content
+    return binaries, missing
 
 
-def _binary(name: str, of: Platform, sources: Mapping[str, str]) -> tuple[bytes, str]:
-    """The sources compiled for a platform, or why they are not."""
-    compiler = shutil.which(of.compiler)
+def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> tuple[bytes, str]:
+    """Compile the sources for a platform. Returns the binary, or b"" and the reason why there is none."""
+    compiler = shutil.which(target.compiler)
     if compiler is None:
-        return b"", f"no C compiler ({of.compiler}) was found"
+        return b"", f"no C compiler ({target.compiler}) was found"
     with TemporaryDirectory() as folder:
         for file, text in sources.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
         names = [file for file in sources if file.endswith(".c")]
-        made = f"{name}.{of.ending}"
+        library = f"{name}.{target.ending}"
         try:
-            done = subprocess.run(
-                [compiler, *_FLAGS, *of.flags, *names, "-o", made, "-lm"],
+            process = subprocess.run(
+                [compiler, *_FLAGS, *target.flags, *names, "-o", library, "-lm"],
                 cwd=folder,
                 capture_output=True,
                 text=True,
@@ -175,40 +178,53 @@ def _binary(name: str, of: Platform, sources: Mapping[str, str]) -> tuple[bytes,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             return b"", f"{compiler} did not run ({error})"
-        if done.returncode:
-            said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-            return b"", f"{compiler} failed: {said[0]}"
-        return (Path(folder) / made).read_bytes(), ""
+        if process.returncode:
+            errors = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
+            return b"", f"{compiler} failed: {errors[0]}"
+        return (Path(folder) / library).read_bytes(), ""
 
 
 # variables
 
 
-def _variables(plant: PlantProgram) -> list[Scalar]:
-    """All variables in the order of their value references: time, input, outputs, parameters."""
+def _list_variables(plant: PlantProgram) -> list[Scalar]:
+    """List all variables in the order of their value references: time, input, outputs, parameters."""
     block = plant.program.block
     torque = block.inputs[0]
-    found = [
+    variables = [
         Scalar("time", "independent", "continuous", "s", "time of the simulation"),
-        Scalar(torque.name, "input", "continuous", torque.unit, torque.about, 0.0),
+        Scalar(torque.name, "input", "continuous", torque.unit, torque.description, 0.0),
     ]
-    found += [Scalar(plant.outputs[one.name], "output", "continuous", one.unit, one.about) for one in block.outputs]
-    for path, (value, known) in plant.about.items():
+    variables += [
+        Scalar(plant.outputs[quantity.name], "output", "continuous", quantity.unit, quantity.description)
+        for quantity in block.outputs
+    ]
+    for path, (value, parameter) in plant.parameter_info.items():
         kind = "tunable" if path in plant.tunable else "fixed"
-        least = known.minimum if known.above is None else known.above
-        found.append(
-            Scalar(_structured(path), "parameter", kind, known.unit, known.doc, value, least, known.above, known.maximum)
+        minimum = parameter.minimum if parameter.above is None else parameter.above
+        variables.append(
+            Scalar(
+                _to_structured_name(path),
+                "parameter",
+                kind,
+                parameter.unit,
+                parameter.doc,
+                value,
+                minimum,
+                parameter.above,
+                parameter.maximum,
+            )
         )
-    return found
+    return variables
 
 
-def _structured(path: str) -> str:
-    """A config path by the naming convention "structured": of two effects of one kind, places in square brackets."""
+def _to_structured_name(path: str) -> str:
+    """Write a config path by FMI's "structured" naming convention: `effects.0.torque` becomes `effects[0].torque`."""
     return re.sub(r"\.(\d+)(?=\.)", r"[\1]", path)
 
 
 _BASES: dict[str, dict[str, int]] = {
-    **{one: {one: 1} for one in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
+    **{base: {base: 1} for base in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
     "N": {"kg": 1, "m": 1, "s": -2},
     "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
     "ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
@@ -218,18 +234,18 @@ _BASES: dict[str, dict[str, int]] = {
 _POWERS = {"²": "2", "³": "3", "^": "", " ": "."}
 
 
-def unit_name(unit: str) -> str:
-    """A unit as FMI's tools write it: `N.m.s2/rad2`."""
+def write_unit(unit: str) -> str:
+    """Write a unit as FMI tools do: `N.m.s2/rad2`."""
     for letter, other in _POWERS.items():
         unit = unit.replace(letter, other)
     return unit
 
 
-def base_unit(unit: str) -> dict[str, int] | None:
+def find_base_units(unit: str) -> dict[str, int] | None:
     """Exponents of base units of a unit of :func:`unit_name`; None where a symbol in it is unknown."""
-    found: dict[str, int] = {}
-    above, *below = unit.split("/")
-    for sign, part in ((1, above), *((-1, one) for one in below)):
+    exponents: dict[str, int] = {}
+    numerator, *divisors = unit.split("/")
+    for sign, part in ((1, numerator), *((-1, divisor) for divisor in divisors)):
         for factor in part.split("."):
             match = re.fullmatch(r"([A-Za-z]+)(\d*)", factor)
             if factor == "1":
@@ -237,20 +253,20 @@ def base_unit(unit: str) -> dict[str, int] | None:
             if match is None or match[1] not in _BASES:
                 return None
             for base, power in _BASES[match[1]].items():
-                found[base] = found.get(base, 0) + sign * power * int(match[2] or 1)
-    return {base: power for base, power in found.items() if power}
+                exponents[base] = exponents.get(base, 0) + sign * power * int(match[2] or 1)
+    return {base: power for base, power in exponents.items() if power}
 
 
 # texts
 
 
-def _description(
+def _write_description(
     config: Config, plant: PlantProgram, variables: Sequence[Scalar], token: str, fmi: int, sources: Sequence[str]
 ) -> str:
-    """modelDescription.xml."""
+    """Write modelDescription.xml."""
     name, run = plant.program.block.name, config.run
-    period = _n(run.sample_period)
-    about = {
+    period = _write_number(run.sample_period)
+    attributes = {
         "fmiVersion": FMI[fmi],
         "modelName": name,
         "guid" if fmi == 2 else "instantiationToken": token,
@@ -258,34 +274,34 @@ def _description(
         "generationTool": f"jaxbl {version('jaxbl')}",
         "variableNamingConvention": "structured",
     }
-    root = ET.Element("fmiModelDescription", about)
+    root = ET.Element("fmiModelDescription", attributes)
     # FMI cannot say that steps have to be multiples of a period: of what it can, that they are all alike is nearest
-    kind = {"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "false"}
+    capabilities = {"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "false"}
     if fmi == 3:
-        kind |= {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true", "fixedInternalStepSize": period}
+        capabilities |= {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true", "fixedInternalStepSize": period}
     else:
-        kind |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
-        kind |= {"canNotUseMemoryManagementFunctions": "true"}
-    simulation = ET.SubElement(root, "CoSimulation", kind)
+        capabilities |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
+        capabilities |= {"canNotUseMemoryManagementFunctions": "true"}
+    simulation = ET.SubElement(root, "CoSimulation", capabilities)
     if fmi == 2:
         files = ET.SubElement(simulation, "SourceFiles")
-        for one in sources:
-            ET.SubElement(files, "File", name=one)
+        for variable in sources:
+            ET.SubElement(files, "File", name=variable)
     units = ET.SubElement(root, "UnitDefinitions")
-    for unit in dict.fromkeys(unit_name(one.unit) for one in variables if one.unit):
+    for unit in dict.fromkeys(write_unit(variable.unit) for variable in variables if variable.unit):
         element = ET.SubElement(units, "Unit", name=unit)
-        if (base := base_unit(unit)) is not None:
+        if (base := find_base_units(unit)) is not None:
             ET.SubElement(element, "BaseUnit", {key: str(power) for key, power in base.items()})
     categories = ET.SubElement(root, "LogCategories")
     ET.SubElement(categories, "Category", name="logStatusError", description="what was refused, and why")
-    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=_n(run.duration), stepSize=period)
-    places = ET.SubElement(root, "ModelVariables")
+    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=_write_number(run.duration), stepSize=period)
+    model_variables = ET.SubElement(root, "ModelVariables")
     structure = ET.SubElement(root, "ModelStructure")
     # FMI 2 does not need the time, and the FMI Library misses a start value of it
-    declared = [(i, one) for i, one in enumerate(variables) if fmi == 3 or one.causality != "independent"]
-    for i, one in declared:
-        _variable(places, i, one, fmi)
-    outputs = [i for i, one in enumerate(variables) if one.causality == "output"]
+    declared = [(i, variable) for i, variable in enumerate(variables) if fmi == 3 or variable.causality != "independent"]
+    for i, variable in declared:
+        _write_variable(model_variables, i, variable, fmi)
+    outputs = [i for i, variable in enumerate(variables) if variable.causality == "output"]
     if fmi == 3:
         for i in outputs:
             ET.SubElement(structure, "Output", valueReference=str(i), dependencies="")
@@ -297,64 +313,81 @@ def _description(
             for place, (i, _) in enumerate(declared, 1):
                 if i in outputs:
                     ET.SubElement(parent, "Unknown", {"index": str(place)} | more)
-    return _xml(root)
+    return _write_xml(root)
 
 
-def _variable(parent: ET.Element, reference: int, one: Scalar, fmi: int) -> None:
-    about = {"name": one.name, "valueReference": str(reference), "causality": one.causality, "variability": one.variability}
-    if one.causality != "independent":
-        about |= (
-            {"initial": "calculated"} if one.start is None else {"initial": "exact"} if one.causality == "parameter" else {}
-        )
-    number = {"unit": unit_name(one.unit)} if one.unit else {}
-    number |= {
-        key: _n(value) for key, value in (("min", one.least), ("max", one.most), ("start", one.start)) if value is not None
+def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: int) -> None:
+    attributes = {
+        "name": variable.name,
+        "valueReference": str(reference),
+        "causality": variable.causality,
+        "variability": variable.variability,
     }
-    text = {"description": one.about} if one.about else {}
+    if variable.causality != "independent":
+        attributes |= (
+            {"initial": "calculated"}
+            if variable.start is None
+            else {"initial": "exact"}
+            if variable.causality == "parameter"
+            else {}
+        )
+    number = {"unit": write_unit(variable.unit)} if variable.unit else {}
+    number |= {
+        key: _write_number(value)
+        for key, value in (("min", variable.least), ("max", variable.most), ("start", variable.start))
+        if value is not None
+    }
+    text = {"description": variable.about} if variable.about else {}
     if fmi == 3:
-        ET.SubElement(parent, "Float64", about | text | number)
+        ET.SubElement(parent, "Float64", attributes | text | number)
     else:
-        ET.SubElement(ET.SubElement(parent, "ScalarVariable", about | text), "Real", number)
+        ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes | text), "Real", number)
 
 
-def _build_description(name: str, sources: Sequence[str]) -> str:
+def _write_build_description(name: str, sources: Sequence[str]) -> str:
     root = ET.Element("fmiBuildDescription", fmiVersion=FMI[3])
     build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
     files = ET.SubElement(build, "SourceFileSet", language="C99")
-    for one in sources:
-        ET.SubElement(files, "SourceFile", name=one)
-    return _xml(root)
+    for source in sources:
+        ET.SubElement(files, "SourceFile", name=source)
+    return _write_xml(root)
 
 
-def _xml(root: ET.Element) -> str:
+def _write_xml(root: ET.Element) -> str:
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
-def _n(value: float) -> str:
-    """A number with all its digits."""
+def _write_number(value: float) -> str:
+    """Write a number with all its digits."""
     return repr(float(value) + 0.0)
 
 
-def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period: float) -> str:
-    """`fmi-model.h`: variables by value reference, and calls of the code with them."""
+def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token: str, period: float) -> str:
+    """Write `fmi-model.h`: variables by value reference, and calls of the code with them."""
     block = plant.program.block
     name, real = block.name, c_type(block.dtype)
     double = "" if real == "double" else "(double)"
     single = "" if real == "double" else "(float)"
-    place = {one.name: i for i, one in enumerate(variables)}
-    change = {"input": "ALWAYS", "fixed": "FIXED", "tunable": "ALWAYS"}
+    reference = {variable.name: i for i, variable in enumerate(variables)}
+    change_rules = {"input": "ALWAYS", "fixed": "FIXED", "tunable": "ALWAYS"}
     rows = []
-    for one in variables:
-        when = change.get(one.causality, change.get(one.variability, "NEVER"))
-        low, high = (_limit(value, sign) for value, sign in ((one.least, "-"), (one.most, "")))
-        rows.append(f'    {{"{one.name}", {when}, {_n(one.start or 0.0)}, {low}, {high}, {int(one.above is not None)}}},')
+    for variable in variables:
+        change_rule = change_rules.get(variable.causality, change_rules.get(variable.variability, "NEVER"))
+        low, high = (_write_limit(value, sign) for value, sign in ((variable.least, "-"), (variable.most, "")))
+        start, is_open = _write_number(variable.start or 0.0), int(variable.above is not None)
+        rows.append(f'    {{"{variable.name}", {change_rule}, {start}, {low}, {high}, {is_open}}},')
 
-    def given(quantities: Sequence[Quantity]) -> list[str]:
-        places = (place[_structured(plant.parameters.get(one.name, one.name))] for one in quantities)
+    def read_values(quantities: Sequence[Quantity]) -> list[str]:
+        places = (
+            reference[_to_structured_name(plant.parameters.get(quantity.name, quantity.name))] for quantity in quantities
+        )
         return [f"{single}model->values[{i}]" for i in places]
 
-    outputs = [f"    model->values[{place[plant.outputs[one.name]]}] = {double}outputs.{one.name};" for one in block.outputs]
+    outputs = [
+        f"    model->values[{reference[plant.outputs[variable.name]]}] = {double}outputs.{variable.name};"
+        for variable in block.outputs
+    ]
     lines = [
         "/*",
         f" * Variables of {name} by value reference, and the calls of its code with them.",
@@ -368,7 +401,7 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         f'#include "{name}.h"',
         "",
         f'#define MODEL_TOKEN "{token}"',
-        f"#define MODEL_PERIOD {_n(period)}",
+        f"#define MODEL_PERIOD {_write_number(period)}",
         "#define MODEL_TIME 0u",
         f"#define MODEL_VARIABLES {len(variables)}u",
         "",
@@ -385,7 +418,7 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "",
         "typedef struct",
         "{",
-        f"    char name[{max(len(one.name) for one in variables) + 1}];",
+        f"    char name[{max(len(variable.name) for variable in variables) + 1}];",
         "    int change;",
         "    double start;",
         "    double least;",
@@ -411,28 +444,28 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "static void model_begin(Model *model)",
         "{",
         f"    {name}_outputs outputs;",
-        f"    {name}_init({_wrapped(['&model->state', *given(block.first), '&outputs'])});",
+        f"    {name}_init({_wrap_arguments(['&model->state', *read_values(block.start_inputs), '&outputs'])});",
         "    model_found(model, outputs);",
         "}",
         "",
         "static void model_sample(Model *model)",
         "{",
         f"    {name}_outputs outputs;",
-        f"    {name}_step({_wrapped(['&model->state', *given(block.inputs), '&outputs'])});",
+        f"    {name}_step({_wrap_arguments(['&model->state', *read_values(block.inputs), '&outputs'])});",
         "    model_found(model, outputs);",
         "}",
         "",
         "#endif /* FMI_MODEL_HEADER */",
     ]
-    return plain_text("\n".join(lines) + "\n")
+    return to_ascii("\n".join(lines) + "\n")
 
 
-def _wrapped(arguments: Sequence[str]) -> str:
-    """Arguments of a call, four a line."""
+def _wrap_arguments(arguments: Sequence[str]) -> str:
+    """Write arguments of a call, four a line."""
     rows = (", ".join(arguments[i : i + 4]) for i in range(0, len(arguments), 4))
     return ",\n        ".join(rows)
 
 
-def _limit(value: float | None, sign: str) -> str:
-    """An end of a range."""
-    return f"{sign}ANY" if value is None else _n(value)
+def _write_limit(value: float | None, sign: str) -> str:
+    """Write an end of a range; `ANY` where the range has none."""
+    return f"{sign}ANY" if value is None else _write_number(value)

@@ -32,13 +32,13 @@ from jaxbl.fused.jaxprs import (
 )
 
 TYPES = ("float32", "float64", "int32", "uint32", "int64", "uint64", "bool")
-"""Of numbers, in the code that is written."""
-_LONGEST = 90
+"""Types of numbers that the code may have."""
+_LONGEST_FORMULA = 90
 """Letters of a formula in a comment."""
 
 
 class Variable:
-    """A number that the code computes or is given; `name` where it has one of its own."""
+    """A number that the code computes or takes as an argument; `name` is "" for a numbered one."""
 
     def __init__(self, dtype: np.dtype, number: int, name: str = ""):
         self.dtype, self.number, self.name = dtype, number, name
@@ -49,8 +49,13 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Constant:
-    """A number that is known, and how it follows from numbers of the study: a formula, or "" for one that is in the code
-    itself."""
+    """A number that is known when the code is written.
+
+    Attributes:
+        value: scalar array.
+        formula: how it follows from numbers of the study; "" for a number of the code itself.
+        paths: config paths of those numbers.
+    """
 
     value: Any
     formula: str = ""
@@ -58,12 +63,12 @@ class Constant:
 
     @property
     def dtype(self) -> np.dtype:
-        """Its type."""
+        """Type of the number."""
         return self.value.dtype
 
     @property
     def key(self) -> tuple[str, bytes, str]:
-        """What makes it the same as another one."""
+        """Two constants are the same if this is equal."""
         return str(self.value.dtype), self.value.tobytes(), self.formula
 
     def __eq__(self, other: object) -> bool:
@@ -81,12 +86,12 @@ class Operation(NamedTuple):
 
     out: Variable
     name: str
-    given: tuple[Value, ...]
+    operands: tuple[Value, ...]
     source: str
 
 
 class Repeat(NamedTuple):
-    """`carried` begin as `start`; so many times the body is run, and they become `results`, all at once."""
+    """A loop: `carried` begin as `start`; the body runs `times` times, and each time they become `results`, all at once."""
 
     times: int
     carried: tuple[Variable, ...]
@@ -97,9 +102,9 @@ class Repeat(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """`outs` become the results of one of two bodies."""
+    """A choice: `outs` become the results of the first body if the condition is true, else of the second."""
 
-    which: Value
+    condition: Value
     outs: tuple[Variable, ...]
     bodies: "tuple[tuple[Statement, ...], tuple[Statement, ...]]"
     results: tuple[tuple[Value, ...], tuple[Value, ...]]
@@ -110,126 +115,133 @@ Statement = Operation | Repeat | Choice
 
 
 class Routine(NamedTuple):
-    """Statements in their order, and the values that they make."""
+    """Statements in their order, and the values that they compute."""
 
     statements: tuple[Statement, ...]
     results: tuple[Value, ...]
 
 
-def lowered(closed: ClosedJaxpr, given: Sequence[Any]) -> Routine:
-    """The operations of a traced function of scalars.
+def lower_to_operations(closed: ClosedJaxpr, arguments: Sequence[Any]) -> Routine:
+    """Lower a traced function of scalars to operations.
 
     Args:
         closed: the function.
-        given: its arguments: variables, or constants.
+        arguments: its arguments: variables, or constants.
 
     Raises:
         Unsupported: an operation of it is unknown here.
     """
-    writer = _Lowering()
-    results = writer.run(closed, given)
-    return Routine(tuple(writer.statements), tuple(results))
+    lowering = _Lowering()
+    results = lowering.lower_jaxpr(closed, arguments)
+    return Routine(tuple(lowering.statements), tuple(results))
 
 
-def without_unread(routine: Routine) -> Routine:
-    """The same without what no result reads."""
-    statements, _ = _read(routine.statements, routine.results)
+def drop_unread(routine: Routine) -> Routine:
+    """Drop the statements that no result reads."""
+    statements, _ = _find_needed(routine.statements, routine.results)
     return Routine(statements, routine.results)
 
 
-def variables_in(values: Iterable[Value]) -> set[Variable]:
-    """Those of some values that are no constants."""
+def select_variables(values: Iterable[Value]) -> set[Variable]:
+    """Return the variables among some values."""
     return {value for value in values if isinstance(value, Variable)}
 
 
-def read_by(routine: Routine) -> set[Variable]:
-    """Variables that a routine reads and does not make."""
-    return _read(routine.statements, routine.results)[1]
+def find_read_variables(routine: Routine) -> set[Variable]:
+    """Find the variables that a routine reads and does not compute."""
+    return _find_needed(routine.statements, routine.results)[1]
 
 
-def constants_of(routine: Routine) -> list[Constant]:
-    """Constants in the order in which they are first read."""
-    every = chain(_values(routine.statements), routine.results)
-    return list(dict.fromkeys(value for value in every if isinstance(value, Constant)))
+def find_constants(routine: Routine) -> list[Constant]:
+    """Find the constants of a routine, in the order in which they are first read."""
+    values = chain(_read_values(routine.statements), routine.results)
+    return list(dict.fromkeys(value for value in values if isinstance(value, Constant)))
 
 
-def operations_of(routine: Routine) -> Counter[str]:
-    """How often each operation is done, by name; of a choice, by the longer way."""
-    return _counted(routine.statements)
+def count_operations(routine: Routine) -> Counter[str]:
+    """Count how often each operation is done, by name; of a choice the longer body counts."""
+    return _count_in(routine.statements)
 
 
-def _counted(statements: Iterable[Statement]) -> Counter[str]:
-    found: Counter[str] = Counter()
-    for one in statements:
-        if isinstance(one, Operation):
-            found[one.name] += 1
-        elif isinstance(one, Repeat):
-            found.update({name: number * one.times for name, number in _counted(one.body).items()})
+def _count_in(statements: Iterable[Statement]) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for statement in statements:
+        if isinstance(statement, Operation):
+            counts[statement.name] += 1
+        elif isinstance(statement, Repeat):
+            counts.update({name: number * statement.times for name, number in _count_in(statement.body).items()})
         else:
-            found.update(max(map(_counted, one.bodies), key=Counter.total))
-    return found
+            counts.update(max(map(_count_in, statement.bodies), key=Counter.total))
+    return counts
 
 
-def _values(statements: Iterable[Statement]) -> Iterable[Value]:
-    for one in statements:
-        if isinstance(one, Operation):
-            yield from one.given
-        elif isinstance(one, Repeat):
-            yield from chain(one.start, _values(one.body), one.results)
+def _read_values(statements: Iterable[Statement]) -> Iterable[Value]:
+    for statement in statements:
+        if isinstance(statement, Operation):
+            yield from statement.operands
+        elif isinstance(statement, Repeat):
+            yield from chain(statement.start, _read_values(statement.body), statement.results)
         else:
-            yield one.which
-            for body, results in zip(one.bodies, one.results, strict=True):
-                yield from chain(_values(body), results)
+            yield statement.condition
+            for body, results in zip(statement.bodies, statement.results, strict=True):
+                yield from chain(_read_values(body), results)
 
 
-def _read(statements: Sequence[Statement], results: Iterable[Value]) -> tuple[tuple[Statement, ...], set[Variable]]:
-    """Statements that make what results read, and the variables that these read and do not make."""
-    needed, kept = variables_in(results), []
-    for one in reversed(statements):
-        if isinstance(one, Operation):
-            if one.out not in needed:
+def _find_needed(statements: Sequence[Statement], results: Iterable[Value]) -> tuple[tuple[Statement, ...], set[Variable]]:
+    """Find the statements that the results need, and the variables that these read and do not compute."""
+    needed, needed_statements = select_variables(results), []
+    for statement in reversed(statements):
+        if isinstance(statement, Operation):
+            if statement.out not in needed:
                 continue
-            needed = needed - {one.out} | variables_in(one.given)
-            kept.append(one)
-        elif isinstance(one, Repeat):
-            alive = [variable in needed for variable in one.carried]
+            needed = needed - {statement.out} | select_variables(statement.operands)
+            needed_statements.append(statement)
+        elif isinstance(statement, Repeat):
+            alive = [variable in needed for variable in statement.carried]
             while True:
-                body, inside = _read(one.body, _chosen(one.results, alive))
-                before, alive = alive, [is_ or one_ in inside for is_, one_ in zip(alive, one.carried, strict=True)]
+                body, inside = _find_needed(statement.body, _select_marked(statement.results, alive))
+                before, alive = (
+                    alive,
+                    [is_alive or variable in inside for is_alive, variable in zip(alive, statement.carried, strict=True)],
+                )
                 if before == alive:
                     break
             if any(alive):
-                carried, start = _chosen(one.carried, alive), _chosen(one.start, alive)
-                needed = (needed | inside) - set(carried) | variables_in(start)
-                kept.append(one._replace(carried=carried, start=start, body=body, results=_chosen(one.results, alive)))
+                carried, start = _select_marked(statement.carried, alive), _select_marked(statement.start, alive)
+                needed = (needed | inside) - set(carried) | select_variables(start)
+                needed_statements.append(
+                    statement._replace(
+                        carried=carried, start=start, body=body, results=_select_marked(statement.results, alive)
+                    )
+                )
         else:
-            alive = [variable in needed for variable in one.outs]
+            alive = [variable in needed for variable in statement.outs]
             if any(alive):
-                outs = _chosen(one.outs, alive)
-                results_ = tuple(_chosen(some, alive) for some in one.results)
-                bodies, inside = zip(*map(_read, one.bodies, results_), strict=True)
-                needed = needed.difference(outs).union(*inside, variables_in([one.which]))
-                kept.append(one._replace(outs=outs, bodies=bodies, results=results_))
-    return tuple(reversed(kept)), needed
+                outs = _select_marked(statement.outs, alive)
+                branch_results_alive = tuple(_select_marked(branch_results, alive) for branch_results in statement.results)
+                bodies, inside = zip(*map(_find_needed, statement.bodies, branch_results_alive), strict=True)
+                needed = needed.difference(outs).union(*inside, select_variables([statement.condition]))
+                needed_statements.append(statement._replace(outs=outs, bodies=bodies, results=branch_results_alive))
+    return tuple(reversed(needed_statements)), needed
 
 
-def alike(one: Value, other: Value) -> bool:
-    """Whether two values are the same variable, or the same number."""
-    if isinstance(one, Constant) and isinstance(other, Constant):
-        return one.key[:2] == other.key[:2]
-    return one is other
+def are_same(first: Value, second: Value) -> bool:
+    """Return True if two values are the same variable or the same number."""
+    if isinstance(first, Constant) and isinstance(second, Constant):
+        return first.key[:2] == second.key[:2]
+    return first is second
 
 
-def _chosen(some: Sequence[Any], which: Sequence[bool]) -> tuple[Any, ...]:
-    return tuple(one for one, taken in zip(some, which, strict=True) if taken)
+def _select_marked(candidates: Sequence[Any], marks: Sequence[bool]) -> tuple[Any, ...]:
+    return tuple(candidate for candidate, marked in zip(candidates, marks, strict=True) if marked)
 
 
-def _type(v: Any) -> np.dtype:
-    """Of a variable or literal of a jaxpr."""
+def _dtype_of(v: Any) -> np.dtype:
+    """Return the dtype of a variable or literal of a jaxpr."""
     return np.dtype(v.aval.dtype)
 
 
-def _shape(v: Any) -> tuple[int, ...]:
+def _shape_of(v: Any) -> tuple[int, ...]:
     return v.aval.shape
 
 
@@ -238,9 +250,9 @@ class _Lowering:
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
-        self._known: dict[Any, Variable] = {}
-        """Variables by the operation that makes them."""
-        self.made: dict[Variable, Operation] = {}
+        self._variable_by_operation: dict[Any, Variable] = {}
+        """The variable that holds the result of an operation, by the operation's name, type and operands."""
+        self.operation_by_variable: dict[Variable, Operation] = {}
         self._numbers = count()
         self._source = ""
 
@@ -249,117 +261,117 @@ class _Lowering:
 
     # jaxprs
 
-    def run(self, closed: ClosedJaxpr, given: Sequence[Value], outside: bool = True) -> list[Value]:
-        """The results of a jaxpr; inside of a call, what asked for that counts as source."""
+    def lower_jaxpr(self, closed: ClosedJaxpr, arguments: Sequence[Value], outside: bool = True) -> list[Value]:
+        """Lower a jaxpr and return its results. Within a call (`outside` is False) the source stays that of the call."""
         jaxpr = closed.jaxpr
-        env: dict[Var, Value] = dict(zip(jaxpr.invars, given, strict=True))
+        env: dict[Var, Value] = dict(zip(jaxpr.invars, arguments, strict=True))
         env |= {v: Constant(np.asarray(value)) for v, value in zip(jaxpr.constvars, closed.consts, strict=True)}
 
         def read(v: Var | Literal) -> Value:
-            return Constant(np.asarray(v.val, _type(v))) if isinstance(v, Literal) else env[v]
+            return Constant(np.asarray(v.val, _dtype_of(v))) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
             if outside:
                 self._source = equation_source(eqn)
             values = [read(v) for v in eqn.invars]
-            results = self.equation(eqn, values, outside)
+            results = self.lower_equation(eqn, values, outside)
             if all(isinstance(value, Constant) for value in values):
-                results = [_explained(one, eqn.primitive.name, values) for one in results]  # type: ignore[arg-type]
+                results = [_add_formula(result, eqn.primitive.name, values) for result in results]  # type: ignore[arg-type]
             env |= dict(zip(eqn.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, eqn: JaxprEqn, given: list[Value], outside: bool = True) -> list[Value]:
-        name, known = eqn.primitive.name, all(isinstance(value, Constant) for value in given)
-        if any(_shape(v) for v in (*eqn.invars, *eqn.outvars)):
-            if known:
-                return self._bound(eqn, given)
+    def lower_equation(self, eqn: JaxprEqn, operands: list[Value], outside: bool = True) -> list[Value]:
+        name, all_constant = eqn.primitive.name, all(isinstance(value, Constant) for value in operands)
+        if any(_shape_of(v) for v in (*eqn.invars, *eqn.outvars)):
+            if all_constant:
+                return self._evaluate(eqn, operands)
             raise Unsupported(f"{name} of arrays: what runs in real time should be made of scalars")
         if name == "scan":
-            return self._repeated(*scan_parameters(eqn), given, outside)
+            return self._lower_scan(*scan_parameters(eqn), operands, outside)
         if name == "cond":
-            return self._chosen(cond_branches(eqn), given, outside)
+            return self._lower_cond(cond_branches(eqn), operands, outside)
         if (called := callee(eqn)) is not None:
-            return self.run(called, given, False)
-        dtype = _type(eqn.invars[0]) if given else np.dtype(bool)
+            return self.lower_jaxpr(called, operands, False)
+        dtype = _dtype_of(eqn.invars[0]) if operands else np.dtype(bool)
         if str(dtype) not in TYPES:
             raise Unsupported(f"numbers of type {dtype}")
         real = jnp.issubdtype(dtype, jnp.floating)
         if name in FUNCTIONS and real:
-            return self.run(trace_scalar_function(FUNCTIONS[name], dtype), given, False)
+            return self.lower_jaxpr(trace_scalar_function(FUNCTIONS[name], dtype), operands, False)
         rule = (_OF_FLOATS if real else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
-            if known:
-                return self._bound(eqn, given)
+            if all_constant:
+                return self._evaluate(eqn, operands)
             raise Unsupported(f"{name} of {dtype}")
-        return [rule(self, eqn, *given)]
+        return [rule(self, eqn, *operands)]
 
-    def _bound(self, eqn: JaxprEqn, given: Sequence[Value]) -> list[Value]:
-        """What is known, as JAX computes it."""
-        made = eqn.primitive.bind(*(jnp.asarray(one.value) for one in given), **eqn.params)  # type: ignore[union-attr]
-        return [Constant(np.asarray(one)) for one in (made if eqn.primitive.multiple_results else [made])]
+    def _evaluate(self, eqn: JaxprEqn, constants: Sequence[Value]) -> list[Value]:
+        """Compute an equation of constants by JAX."""
+        results = eqn.primitive.bind(*(jnp.asarray(constant.value) for constant in constants), **eqn.params)  # type: ignore[union-attr]
+        return [Constant(np.asarray(constant)) for constant in (results if eqn.primitive.multiple_results else [results])]
 
-    def _repeated(self, times: int, body: ClosedJaxpr, fixed: int, given: list[Value], outside: bool) -> list[Value]:
-        still, state = given[:fixed], given[fixed:]
-        if times == 1 or all(isinstance(value, Constant) for value in given):
+    def _lower_scan(self, times: int, body: ClosedJaxpr, fixed: int, operands: list[Value], outside: bool) -> list[Value]:
+        fixed_values, state = operands[:fixed], operands[fixed:]
+        if times == 1 or all(isinstance(value, Constant) for value in operands):
             for _ in range(times):
-                state = self.run(body, [*still, *state], outside)
+                state = self.lower_jaxpr(body, [*fixed_values, *state], outside)
             return state
         source = self._source
         carried = tuple(self.variable(value.dtype) for value in state)
-        statements, results = self._inside(lambda: self.run(body, [*still, *carried], outside))
+        statements, results = self._lower_body(lambda: self.lower_jaxpr(body, [*fixed_values, *carried], outside))
         self.statements.append(Repeat(times, carried, tuple(state), statements, results, source))
         return list(carried)
 
-    def _chosen(self, branches: Sequence[ClosedJaxpr], given: list[Value], outside: bool) -> list[Value]:
-        which, *rest = given
-        if isinstance(which, Constant):
-            return self.run(branches[int(np.clip(which.value, 0, len(branches) - 1))], rest, outside)
+    def _lower_cond(self, branches: Sequence[ClosedJaxpr], operands: list[Value], outside: bool) -> list[Value]:
+        condition, *branch_operands = operands
+        if isinstance(condition, Constant):
+            return self.lower_jaxpr(branches[int(np.clip(condition.value, 0, len(branches) - 1))], branch_operands, outside)
         if len(branches) != 2:
             raise Unsupported("cond among more than two")
-        which, source = self.emit("ne", bool, which, Constant(np.asarray(0, which.dtype))), self._source
-        no, yes = (self._inside(lambda body=body: self.run(body, rest, outside)) for body in branches)
+        condition, source = self.emit("ne", bool, condition, Constant(np.asarray(0, condition.dtype))), self._source
+        no, yes = (self._lower_body(lambda body=body: self.lower_jaxpr(body, branch_operands, outside)) for body in branches)
         # what is the same on both ways is no choice
-        open_ = [not alike(a, b) for a, b in zip(yes[1], no[1], strict=True)]
-        merged = [self.variable(a.dtype) if own else a for a, own in zip(yes[1], open_, strict=True)]
-        outs = tuple(one for one, own in zip(merged, open_, strict=True) if own and isinstance(one, Variable))
-        results = _chosen(yes[1], open_), _chosen(no[1], open_)
-        self.statements.append(Choice(which, outs, (yes[0], no[0]), results, source))
+        differ = [not are_same(a, b) for a, b in zip(yes[1], no[1], strict=True)]
+        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes[1], differ, strict=True)]
+        outs = tuple(out for out, differs in zip(merged, differ, strict=True) if differs and isinstance(out, Variable))
+        results = _select_marked(yes[1], differ), _select_marked(no[1], differ)
+        self.statements.append(Choice(condition, outs, (yes[0], no[0]), results, source))
         return merged
 
-    def _inside(self, make: Callable[[], list[Value]]) -> tuple[tuple[Statement, ...], tuple[Value, ...]]:
-        """Statements of a body of their own: what they make is not known behind it."""
-        outer, known = self.statements, self._known
-        self.statements, self._known = [], dict(known)
-        results = make()
-        found, self.statements, self._known = self.statements, outer, known
-        return tuple(found), tuple(results)
+    def _lower_body(self, lower_body: Callable[[], list[Value]]) -> tuple[tuple[Statement, ...], tuple[Value, ...]]:
+        """Lower a body apart: variables that it defines cannot be used after it."""
+        outer_statements, outer_variables = self.statements, self._variable_by_operation
+        self.statements, self._variable_by_operation = [], dict(outer_variables)
+        results = lower_body()
+        statements, self.statements, self._variable_by_operation = self.statements, outer_statements, outer_variables
+        return tuple(statements), tuple(results)
 
     # operations
 
-    def emit(self, name: str, dtype: Any, *given: Value) -> Value:
-        """An operation, or what is known to be its result."""
+    def emit(self, name: str, dtype: Any, *operands: Value) -> Value:
+        """Write an operation and return its result: a new variable, or a value that is known to be the same."""
         dtype = np.dtype(dtype)
-        if all(isinstance(value, Constant) for value in given):
+        if all(isinstance(value, Constant) for value in operands):
             with np.errstate(all="ignore"):
-                value = np.asarray(_FOLDED[name](dtype, *(one.value[()] for one in given)), dtype)  # type: ignore[union-attr]
-            return Constant(value, paths=_paths(given))
-        if (same := self._simpler(name, dtype, given)) is not None:
-            return same
-        key = (name, dtype, *given)
-        if key not in self._known:
-            out = self._known[key] = self.variable(dtype)
-            self.made[out] = Operation(out, name, given, self._source)
-            self.statements.append(self.made[out])
-        return self._known[key]
+                value = np.asarray(_EVALUATIONS[name](dtype, *(constant.value[()] for constant in operands)), dtype)  # type: ignore[union-attr]
+            return Constant(value, paths=_find_paths(operands))
+        if (simpler := self._simplify(name, dtype, operands)) is not None:
+            return simpler
+        key = (name, dtype, *operands)
+        if key not in self._variable_by_operation:
+            out = self._variable_by_operation[key] = self.variable(dtype)
+            self.operation_by_variable[out] = Operation(out, name, operands, self._source)
+            self.statements.append(self.operation_by_variable[out])
+        return self._variable_by_operation[key]
 
-    def _simpler(self, name: str, dtype: np.dtype, given: Sequence[Value]) -> Value | None:
-        """The result of an operation in a simpler way, the same to the last bit."""
-        a, b = given[0], given[-1]
+    def _simplify(self, name: str, dtype: np.dtype, operands: Sequence[Value]) -> Value | None:
+        """Return the result of an operation by a simpler one if there is one with the same bits, else None."""
+        a, b = operands[0], operands[-1]
         if name == "mul":
-            for one, other in ((a, b), (b, a)):
-                if isinstance(one, Constant) and one.value == 1:
+            for factor, other in ((a, b), (b, a)):
+                if isinstance(factor, Constant) and factor.value == 1:
                     return other
-                if isinstance(one, Constant) and one.value == -1 and dtype.kind == "f":
+                if isinstance(factor, Constant) and factor.value == -1 and dtype.kind == "f":
                     return self.emit("neg", dtype, other)
         if name == "div" and dtype.kind == "f" and isinstance(b, Constant):
             mantissa, exponent = np.frexp(b.value)
@@ -367,62 +379,68 @@ class _Lowering:
                 # the reciprocal is exact
                 inverse = self.emit("div", dtype, Constant(np.asarray(1, dtype)), b)
                 assert isinstance(inverse, Constant)
-                return self.emit("mul", dtype, a, _explained(inverse, "div", [Constant(np.asarray(1, dtype)), b]))
+                return self.emit("mul", dtype, a, _add_formula(inverse, "div", [Constant(np.asarray(1, dtype)), b]))
         if name == "sub" and isinstance(b, Constant) and b.value == 0 and not np.signbit(b.value):
             return a
         if name == "select":
-            which, yes, no = given
-            if isinstance(which, Constant):
-                return yes if which.value else no
+            condition, yes, no = operands
+            if isinstance(condition, Constant):
+                return yes if condition.value else no
             if yes == no:
                 return yes
         if name == "convert" and a.dtype == dtype:
             return a
-        if name == "ne" and isinstance(b, Constant) and b.value == 0 and isinstance(a, Variable) and a in self.made:
+        if (
+            name == "ne"
+            and isinstance(b, Constant)
+            and b.value == 0
+            and isinstance(a, Variable)
+            and a in self.operation_by_variable
+        ):
             # a truth value that became a number
-            inner = self.made[a]
-            if inner.name == "convert" and inner.given[0].dtype == bool:
-                return inner.given[0]
+            inner = self.operation_by_variable[a]
+            if inner.name == "convert" and inner.operands[0].dtype == bool:
+                return inner.operands[0]
         return None
 
 
 # constants
 
 
-def _paths(given: Iterable[Value]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(path for one in given if isinstance(one, Constant) for path in one.paths))
+def _find_paths(values: Iterable[Value]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(path for constant in values if isinstance(constant, Constant) for path in constant.paths))
 
 
 _INFIX = {"add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/"}
 
 
-def _explained(result: Value, name: str, given: Sequence[Constant]) -> Value:
-    """A constant with the formula of the equation that made it."""
-    if not isinstance(result, Constant) or result.formula or not (paths := _paths(given)) or result.value.ndim:
+def _add_formula(result: Value, name: str, operands: Sequence[Constant]) -> Value:
+    """Give a constant the formula of the equation that it is the result of."""
+    if not isinstance(result, Constant) or result.formula or not (paths := _find_paths(operands)) or result.value.ndim:
         return result
-    texts = [one.formula or f"{one.value.item():.6g}" for one in given]
+    texts = [operand.formula or f"{operand.value.item():.6g}" for operand in operands]
     if name in _INFIX:
         formula = f"({f' {_INFIX[name]} '.join(texts)})"
     else:
         formula = f"-{texts[0]}" if name == "neg" else f"{name}({', '.join(texts)})"
-    if len(formula) > _LONGEST or name not in _SAID:
+    if len(formula) > _LONGEST_FORMULA or name not in _READABLE_EQUATIONS:
         formula = f"from {', '.join(paths)}"
     return replace(result, formula=formula, paths=paths)
 
 
-_SAID = {*_INFIX, "neg", "abs", "sqrt", "square", "integer_pow", "min", "max", *FUNCTIONS}
-"""Equations whose formula says something."""
+_READABLE_EQUATIONS = {*_INFIX, "neg", "abs", "sqrt", "square", "integer_pow", "min", "max", *FUNCTIONS}
+"""Equations with a formula that a reader understands."""
 
 
-def _folded_power(dtype: np.dtype, n: Any) -> Any:
+def _evaluate_power_of_two(dtype: np.dtype, n: Any) -> Any:
     return np.ldexp(dtype.type(1), int(n))
 
 
-def _to_integer(dtype: np.dtype, a: Any) -> Any:
+def _evaluate_conversion(dtype: np.dtype, a: Any) -> Any:
     return np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a
 
 
-_FOLDED: dict[str, Callable[..., Any]] = {
+_EVALUATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda _, a, b: a + b,
     "sub": lambda _, a, b: a - b,
     "mul": lambda _, a, b: a * b,
@@ -449,12 +467,12 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "not": lambda _, a: ~a,
     "shift_left": lambda _, a, b: a << b,
     "shift_right_logical": lambda dtype, a, b: a.view(f"u{dtype.itemsize}") >> b.view(f"u{dtype.itemsize}"),
-    "select": lambda _, which, yes, no: yes if which else no,
-    "convert": _to_integer,
+    "select": lambda _, condition, yes, no: yes if condition else no,
+    "convert": _evaluate_conversion,
     "bitcast": lambda dtype, a: np.asarray(a).view(dtype),
-    "power_of_two": _folded_power,
+    "power_of_two": _evaluate_power_of_two,
 }
-"""Operations of known numbers, by name: those of a :class:`Operation` are the same."""
+"""How an operation is computed for constants, by the name of the :class:`Operation`."""
 
 
 # rules: what a primitive becomes
@@ -462,22 +480,22 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 Rule = Callable[..., Value]
 
 
-def _plain(name: str) -> Rule:
-    return lambda w, eqn, *given: w.emit(name, given[0].dtype, *given)
+def _make_operation_rule(name: str) -> Rule:
+    return lambda w, eqn, *operands: w.emit(name, operands[0].dtype, *operands)
 
 
-def _number(like: Value, value: float) -> Constant:
+def _make_constant_like(like: Value, value: float) -> Constant:
     return Constant(np.asarray(value, like.dtype))
 
 
-def _compared(name: str) -> Rule:
+def _make_comparison_rule(name: str) -> Rule:
     return lambda w, eqn, a, b: w.emit(name, bool, a, b)
 
 
 def _sign(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    zero = _number(a, 0)
-    below = w.emit("select", a.dtype, w.emit("lt", bool, a, zero), _number(a, -1), a)
-    return w.emit("select", a.dtype, w.emit("gt", bool, a, zero), _number(a, 1), below)
+    zero = _make_constant_like(a, 0)
+    below = w.emit("select", a.dtype, w.emit("lt", bool, a, zero), _make_constant_like(a, -1), a)
+    return w.emit("select", a.dtype, w.emit("gt", bool, a, zero), _make_constant_like(a, 1), below)
 
 
 def _clamp(w: _Lowering, eqn: JaxprEqn, low: Value, a: Value, high: Value) -> Value:
@@ -489,54 +507,54 @@ def _power(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = reduce(lambda x, y: w.emit("mul", a.dtype, x, y), [a] * abs(power))
-    return result if power > 0 else w.emit("div", a.dtype, _number(a, 1), result)
+    return result if power > 0 else w.emit("div", a.dtype, _make_constant_like(a, 1), result)
 
 
-def _select(w: _Lowering, eqn: JaxprEqn, which: Value, *cases: Value) -> Value:
-    if len(cases) != 2 or which.dtype != bool:
+def _select(w: _Lowering, eqn: JaxprEqn, condition: Value, *cases: Value) -> Value:
+    if len(cases) != 2 or condition.dtype != bool:
         raise Unsupported("select_n among more than two")
-    return w.emit("select", cases[0].dtype, which, cases[1], cases[0])
+    return w.emit("select", cases[0].dtype, condition, cases[1], cases[0])
 
 
 def _convert(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    new = _type(eqn.outvars[0])
+    new = _dtype_of(eqn.outvars[0])
     if new.kind == "b" and a.dtype.kind != "b":
-        return w.emit("ne", bool, a, _number(a, 0))
+        return w.emit("ne", bool, a, _make_constant_like(a, 0))
     return w.emit("convert", new, a)
 
 
 def _bitcast(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
     """The bits of a number as another one; of an exponent that is put together from an integer, a power of two."""
-    new = _type(eqn.outvars[0])
+    new = _dtype_of(eqn.outvars[0])
     bias, bits = (1023, 52) if new == np.float64 else (127, 23)
-    shift = w.made.get(a) if isinstance(a, Variable) and new.kind == "f" else None
-    if shift is not None and shift.name == "shift_left" and _is(shift.given[1], bits):
-        sum_ = w.made.get(shift.given[0])  # type: ignore[call-overload]
-        if sum_ is not None and sum_.name == "add" and _is(sum_.given[1], bias):
-            exponent = sum_.given[0]
-            before = w.made.get(exponent) if isinstance(exponent, Variable) else None
+    shift = w.operation_by_variable.get(a) if isinstance(a, Variable) and new.kind == "f" else None
+    if shift is not None and shift.name == "shift_left" and _is_number(shift.operands[1], bits):
+        sum_ = w.operation_by_variable.get(shift.operands[0])  # type: ignore[call-overload]
+        if sum_ is not None and sum_.name == "add" and _is_number(sum_.operands[1], bias):
+            exponent = sum_.operands[0]
+            before = w.operation_by_variable.get(exponent) if isinstance(exponent, Variable) else None
             if before is not None and before.name == "convert":
-                exponent = before.given[0]
+                exponent = before.operands[0]
             return w.emit("power_of_two", new, w.emit("convert", np.int32, exponent))
     return w.emit("bitcast", new, a)
 
 
-def _is(value: Value, number: int) -> bool:
+def _is_number(value: Value, number: int) -> bool:
     return isinstance(value, Constant) and value.value == number
 
 
 def _finite(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    return w.emit("le", bool, w.emit("abs", a.dtype, a), _number(a, float(jnp.finfo(a.dtype).max)))
+    return w.emit("le", bool, w.emit("abs", a.dtype, a), _make_constant_like(a, float(jnp.finfo(a.dtype).max)))
 
 
 def _one_minus_square(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    one = _number(a, 1)
-    return w.emit("mul", a.dtype, w.emit("add", a.dtype, one, a), w.emit("sub", a.dtype, one, a))
+    unit = _make_constant_like(a, 1)
+    return w.emit("mul", a.dtype, w.emit("add", a.dtype, unit, a), w.emit("sub", a.dtype, unit, a))
 
 
 _OF_FLOATS: dict[str, Rule] = {
-    **{name: _plain(name) for name in ("add", "sub", "mul", "div", "neg", "abs", "sqrt", "floor", "ceil")},
-    "add_any": _plain("add"),
+    **{name: _make_operation_rule(name) for name in ("add", "sub", "mul", "div", "neg", "abs", "sqrt", "floor", "ceil")},
+    "add_any": _make_operation_rule("add"),
     "square": lambda w, eqn, a: w.emit("mul", a.dtype, a, a),
     "one_minus_square": _one_minus_square,
     "integer_pow": _power,
@@ -547,14 +565,14 @@ _OF_FLOATS: dict[str, Rule] = {
     "is_finite": _finite,
 }
 _OF_INTEGERS: dict[str, Rule] = {
-    name: _plain(name)
+    name: _make_operation_rule(name)
     for name in ("add", "sub", "mul", "div", "rem", "neg", "and", "or", "xor", "not", "shift_left", "shift_right_logical")
 }
 _OF_ALL: dict[str, Rule] = {
-    **{name: _compared(name) for name in ("gt", "lt", "ge", "le", "eq", "ne")},
+    **{name: _make_comparison_rule(name) for name in ("gt", "lt", "ge", "le", "eq", "ne")},
     "sign": _sign,
-    "max": _plain("max"),
-    "min": _plain("min"),
+    "max": _make_operation_rule("max"),
+    "min": _make_operation_rule("min"),
     "clamp": _clamp,
     "select_n": _select,
     "convert_element_type": _convert,
@@ -563,18 +581,18 @@ _OF_ALL: dict[str, Rule] = {
 }
 
 
-def named_constants(constants: Iterable[Constant], known: Mapping[str, Any]) -> dict[Constant, str]:
-    """Names of those constants that come from numbers of a study: that of its config path for such a
-    number itself, `DERIVED_1` and so on for what follows from them."""
+def name_constants(constants: Iterable[Constant], study_numbers: Mapping[str, Any]) -> dict[Constant, str]:
+    """Name the constants that come from numbers of the study: a number by its config path, what follows from several
+    numbers `DERIVED_1` and so on."""
     names: dict[Constant, str] = {}
-    for one in constants:
-        if one.formula in known:
-            names[one] = one.formula.replace(".", "_").upper()
-        elif one.formula:
-            names[one] = f"DERIVED_{1 + sum(name.startswith('DERIVED_') for name in names.values())}"
+    for constant in constants:
+        if constant.formula in study_numbers:
+            names[constant] = constant.formula.replace(".", "_").upper()
+        elif constant.formula:
+            names[constant] = f"DERIVED_{1 + sum(name.startswith('DERIVED_') for name in names.values())}"
     return names
 
 
-def with_x64(dtype: np.dtype) -> Any:
-    """Context in which a type is JAX's default."""
+def default_precision(dtype: np.dtype) -> Any:
+    """Return a context in which a floating-point type is JAX's default."""
     return jax.enable_x64(dtype == np.float64)

@@ -13,16 +13,16 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
 from jaxbl.simulate import Experiment, move_plant
 
-from .block import Program, Quantity, program_of, traced_block
-from .chain import LAST, PERIOD, known_numbers
-from .lowering import read_by, with_x64
+from .block import Program, Quantity, lower_block, trace_block
+from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
+from .lowering import default_precision, find_read_variables
 
 _INPUT = "u"
 _PARTS = "drive.", "transmission.", "effects.", "initial."
 
 
-class Moving(NamedTuple):
-    """State of the drive, and the sample's index, which stays at the largest number once it has reached it."""
+class MovingDrive(NamedTuple):
+    """State of the drive, and the index of the sample; it stays at the largest integer once it has reached it."""
 
     plant: PlantState
     samples: Any
@@ -34,20 +34,20 @@ class PlantProgram(NamedTuple):
     Attributes:
         program: `start` and `step` are given those parameters that they read, `step` the input torque before them.
         parameters: numbers of the study that the program reads, by the name that they have in it: their config paths.
-        about: the same by config path: value, unit, range, description.
-        tunable: config paths of those that `step` reads.
+        parameter_info: the same by config path: value, unit, range, description.
+        tunable: config paths of the numbers that `step` reads.
         outputs: names of the columns of `trace.parquet`, by the names of the outputs.
     """
 
     program: Program
     parameters: Mapping[str, str]
-    about: Mapping[str, tuple[float, Parameter]]
+    parameter_info: Mapping[str, tuple[float, Parameter]]
     tunable: frozenset[str]
     outputs: Mapping[str, str]
 
 
-def plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProgram:
-    """The drive of a study.
+def build_plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProgram:
+    """Build the program of a study's drive.
 
     Outputs are true quantities at the sample that a step leads to, or at t = 0: nothing of them is measured.
 
@@ -57,70 +57,90 @@ def plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProgram:
         dtype: of its numbers.
 
     Raises:
-        Unsupported: some law or effect has an operation that code cannot say.
+        Unsupported: a law or effect has an operation that cannot be written as code.
     """
-    with with_x64(dtype):
+    with default_precision(dtype):
         experiment = as_arrays(config.build(), dtype)
-    about = {path: one for path, one in leaf_paths(experiment).items() if path.startswith(_PARTS)}
+    candidates = {path: parameter for path, parameter in leaf_paths(experiment).items() if path.startswith(_PARTS)}
     # a number that the motion does not read is no parameter: those of encoders
-    every = _traced(experiment, name, dtype, about, about)
-    first, later = (
-        {path: one for path, one in about.items() if _identifier(path) in {variable.name for variable in read_by(routine)}}
-        for routine in (every.start, every.step)
+    full_program = _lower_plant(experiment, name, dtype, candidates, candidates)
+    start_parameters, step_parameters = (
+        {
+            path: parameter
+            for path, parameter in candidates.items()
+            if _make_identifier(path) in {variable.name for variable in find_read_variables(routine)}
+        }
+        for routine in (full_program.start, full_program.step)
     )
-    program = _traced(experiment, name, dtype, first, later)
+    program = _lower_plant(experiment, name, dtype, start_parameters, step_parameters)
     source = config.build()
-    read = {path: one for path, one in about.items() if path in first or path in later}
+    parameters_read = {
+        path: parameter for path, parameter in candidates.items() if path in start_parameters or path in step_parameters
+    }
     return PlantProgram(
         program,
-        {_identifier(path): path for path in read},
-        {path: (float(get_leaf(source, path)), one) for path, one in read.items()},
-        frozenset(later),
-        {one.name: one.name.replace("motor_", "motor.").replace("load_", "load.") for one in program.block.outputs},
+        {_make_identifier(path): path for path in parameters_read},
+        {path: (float(get_leaf(source, path)), parameter) for path, parameter in parameters_read.items()},
+        frozenset(step_parameters),
+        {
+            parameter.name: parameter.name.replace("motor_", "motor.").replace("load_", "load.")
+            for parameter in program.block.outputs
+        },
     )
 
 
-def _identifier(path: str) -> str:
-    """A name in code for a config path."""
+def _make_identifier(path: str) -> str:
+    """Make a name in code of a config path."""
     return re.sub(r"\W", "_", path, flags=re.ASCII)
 
 
-def _traced(
-    experiment: Experiment, name: str, dtype: np.dtype, first: dict[str, Parameter], later: dict[str, Parameter]
+def _lower_plant(
+    experiment: Experiment,
+    name: str,
+    dtype: np.dtype,
+    start_parameters: dict[str, Parameter],
+    step_parameters: dict[str, Parameter],
 ) -> Program:
-    """The program whose start is given some numbers by config path, and whose step others."""
-    numbers = {path: _identifier(path) for path in (first | later)}
+    """Lower the drive to a program whose `start` and `step` take the numbers at these config paths as arguments."""
+    numbers = {path: _make_identifier(path) for path in (start_parameters | step_parameters)}
     if len(set(numbers.values())) < len(numbers):
         raise Unsupported("two numbers that have one name in code")
-    begins, steps = (
-        [Quantity(numbers[path], one.unit, one.doc, dtype) for path, one in some.items()] for some in (first, later)
+    start_inputs, step_inputs = (
+        [Quantity(numbers[path], parameter.unit, parameter.doc, dtype) for path, parameter in group.items()]
+        for group in (start_parameters, step_parameters)
     )
     unit = experiment.plant.input_unit
     torque = Quantity(_INPUT, unit, f"input{' torque' * (unit == 'N m')}, held from this sample to the next", dtype)
 
-    def own(known: dict[str, Any], given: dict[str, Any]) -> Experiment:
-        return set_leaves(experiment, known | {path: given[one] for path, one in numbers.items() if one in given})
+    def place_numbers(study_values: dict[str, Any], arguments: dict[str, Any]) -> Experiment:
+        return set_leaves(
+            experiment, study_values | {path: arguments[name] for path, name in numbers.items() if name in arguments}
+        )
 
-    def start(known: dict[str, Any], given: dict[str, Any]) -> Moving:
-        mine = own(known, given)
-        return Moving(mine.plant.init(mine.initial), jnp.zeros((), jnp.int32))
+    def start(study_values: dict[str, Any], arguments: dict[str, Any]) -> MovingDrive:
+        experiment = place_numbers(study_values, arguments)
+        return MovingDrive(experiment.plant.init(experiment.initial), jnp.zeros((), jnp.int32))
 
-    def begin(known: dict[str, Any], state: Moving, given: dict[str, Any]) -> dict[str, Any]:
-        found = _outputs(own(known, given), None, state.plant, jnp.zeros((), dtype))
-        return {key: value for key, (value, _, _) in found.items()}
+    def first_outputs(study_values: dict[str, Any], state: MovingDrive, arguments: dict[str, Any]) -> dict[str, Any]:
+        outputs = _read_outputs(place_numbers(study_values, arguments), None, state.plant, jnp.zeros((), dtype))
+        return {key: value for key, (value, _, _) in outputs.items()}
 
-    def step(known: dict[str, Any], state: Moving, given: dict[str, Any]) -> tuple[Moving, dict[str, Any]]:
-        mine = own(known, given)
-        time = state.samples.astype(dtype) * mine.run.sample_period
-        moved = move_plant(mine.plant, mine.run, state.plant, given[_INPUT], time)
-        samples = jnp.minimum(state.samples, LAST - 1) + 1
-        return Moving(moved, samples), _outputs(mine, state.plant, moved, given[_INPUT])
+    def step(
+        study_values: dict[str, Any], state: MovingDrive, arguments: dict[str, Any]
+    ) -> tuple[MovingDrive, dict[str, Any]]:
+        placed = place_numbers(study_values, arguments)
+        time = state.samples.astype(dtype) * placed.run.sample_period
+        moved = move_plant(placed.plant, placed.run, state.plant, arguments[_INPUT], time)
+        samples = jnp.minimum(state.samples, LAST_SAMPLE - 1) + 1
+        return MovingDrive(moved, samples), _read_outputs(placed, state.plant, moved, arguments[_INPUT])
 
-    known = {PERIOD: known_numbers(experiment)[PERIOD]}
-    return program_of(traced_block(name, dtype, known, begins, [torque, *steps], start, step, begin))
+    study_numbers = {PERIOD: read_study_numbers(experiment)[PERIOD]}
+    return lower_block(
+        trace_block(name, dtype, study_numbers, start_inputs, [torque, *step_inputs], start, step, first_outputs)
+    )
 
 
-def _outputs(
+def _read_outputs(
     experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any
 ) -> dict[str, tuple[Any, str, str]]:
     """Value, unit and description: those of :func:`jaxbl.simulate.step`, but for means over a sample, which are over the one
@@ -145,10 +165,10 @@ def _outputs(
             "transmitted torque",
         )
         return out
-    about = "what resists beyond the nominal model: mean over the sample that ends here; 0 at the start"
+    torque_description = "what resists beyond the nominal model: mean over the sample that ends here; 0 at the start"
     resisting = jnp.zeros_like(period)
     if before is not None:
         expected = drive.acceleration("motor", before.velocity["motor"], torque)
         resisting = drive.inertia("motor") * (expected - acceleration["motor"])
-    out["torque"] = resisting, "N m", about
+    out["torque"] = resisting, "N m", torque_description
     return out

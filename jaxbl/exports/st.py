@@ -8,29 +8,29 @@ import numpy as np
 from jaxbl.fused import Unsupported
 
 from .block import Program
-from .c import said_of
+from .c import describe_constant
 from .lowering import Constant, Operation, Value, Variable
-from .writer import Writer, plain_text, shortest
+from .writer import Writer, to_ascii, write_shortest
 
 _TYPES = {"float64": "LREAL", "float32": "REAL", "int32": "DINT", "uint32": "UDINT", "int64": "LINT", "uint64": "ULINT",
           "bool": "BOOL"}  # fmt: skip
 
 
-def st_code(program: Program, about: Sequence[str]) -> str:
-    """A program as a function block.
+def write_st_code(program: Program, head_lines: Sequence[str]) -> str:
+    """Write a program as a function block.
 
     Args:
         program: of a block.
-        about: lines for the beginning of the file.
+        head_lines: lines for the beginning of the file.
 
     Raises:
-        Unsupported: it does something that structured text has no exact words for.
+        Unsupported: the program has an operation that structured text cannot express exactly.
     """
-    return plain_text(_St(program).block(about))
+    return to_ascii(_St(program).write_block(head_lines))
 
 
 def st_type(dtype: np.dtype) -> str:
-    """The type of structured text for numbers of a type."""
+    """Return the type in structured text for numbers of a dtype."""
     return _TYPES[str(dtype)]
 
 
@@ -38,63 +38,69 @@ class _St(Writer):
     def __init__(self, program: Program):
         super().__init__(program)
         self._temporary: list[tuple[str, np.dtype]] = []
-        self._made: dict[Variable, Operation] = {}
-        """Operations by what they make."""
+        self._operation_by_variable: dict[Variable, Operation] = {}
+        """Operations by the variable that holds their result."""
         for name in ("restart", "started"):
-            self.unique(name)
+            self.make_unique(name)
 
-    def block(self, about: Sequence[str]) -> str:
-        """The whole file."""
+    def write_block(self, head_lines: Sequence[str]) -> str:
+        """Write the file."""
         program, block = self.program, self.program.block
-        for one, variable in zip(program.state, program.state_variables, strict=True):
-            self.call(variable, f"{one.name}")
+        for quantity, variable in zip(program.state, program.state_variables, strict=True):
+            self.give_name(variable, f"{quantity.name}")
         self._depth = 1
-        self.line("IF restart OR NOT started THEN")
+        self.add_line("IF restart OR NOT started THEN")
         self._depth += 1
-        self.statements(program.start.statements)
+        self.write_statements(program.start.statements)
         for variable, value in zip(program.state_variables, program.start.results, strict=True):
             self.assign(self.name(variable), self.text(value))
         self.assign("started", "TRUE")
         self._depth -= 1
-        self.line("END_IF;")
-        self.line()
+        self.add_line("END_IF;")
+        self.add_line()
         self._source = ""
-        self.statements(program.step.statements)
-        self.line()
+        self.write_statements(program.step.statements)
+        self.add_line()
         count = len(program.state)
         # outputs first: some are states as they were
-        for one, value in zip(block.outputs, program.step.results[count:], strict=True):
-            self.assign(one.name, self.text(value))
-        self.line()
-        self._assigned(program.state_variables, program.step.results[:count])
+        for quantity, value in zip(block.outputs, program.step.results[count:], strict=True):
+            self.assign(quantity.name, self.text(value))
+        self.add_line()
+        self._assign_together(program.state_variables, program.step.results[:count])
         body = self.lines
-        inputs = {one.name: one for one in (*block.first, *block.inputs)}.values()
-        self.lines, self._depth = [f"(* {about[0]}", *(f"   {line}".rstrip() for line in about[1:]), "*)"], 0
-        self.line(f"FUNCTION_BLOCK {block.name}")
-        self._variables(
-            "VAR_INPUT", [(one.name, one.dtype, "", one) for one in inputs], "restart: BOOL := FALSE; (* begin anew *)"
+        inputs = {quantity.name: quantity for quantity in (*block.start_inputs, *block.inputs)}.values()
+        self.lines, self._depth = [f"(* {head_lines[0]}", *(f"   {line}".rstrip() for line in head_lines[1:]), "*)"], 0
+        self.add_line(f"FUNCTION_BLOCK {block.name}")
+        self._declare_variables(
+            "VAR_INPUT",
+            [(quantity.name, quantity.dtype, "", quantity) for quantity in inputs],
+            "restart: BOOL := FALSE; (* begin anew *)",
         )
-        self._variables("VAR_OUTPUT", [(one.name, one.dtype, "", one) for one in block.outputs])
+        self._declare_variables("VAR_OUTPUT", [(quantity.name, quantity.dtype, "", quantity) for quantity in block.outputs])
         constants = [
-            f"{name}: {st_type(one.dtype)} := {self.literal(one)}; (* {said_of(program, one)} *)"
-            for one, name in self.constants.items()
+            f"{name}: {st_type(quantity.dtype)} := {self.literal(quantity)}; (* {describe_constant(program, quantity)} *)"
+            for quantity, name in self.constants.items()
         ]
-        self._variables("VAR CONSTANT", [], *constants)
+        self._declare_variables("VAR CONSTANT", [], *constants)
         states = [(self.name(variable), variable.dtype, "", None) for variable in program.state_variables]
-        self._variables("VAR", states, "started: BOOL := FALSE;")
-        self._variables("VAR_TEMP", [(name, dtype, "", None) for name, dtype in self._temporary])
+        self._declare_variables("VAR", states, "started: BOOL := FALSE;")
+        self._declare_variables("VAR_TEMP", [(name, dtype, "", None) for name, dtype in self._temporary])
         return "\n".join([*self.lines, *body, "END_FUNCTION_BLOCK", ""])
 
-    def _variables(self, kind: str, every: Sequence[tuple], *more: str) -> None:
-        if not every and not more:
+    def _declare_variables(self, kind: str, variables: Sequence[tuple], *more_lines: str) -> None:
+        if not variables and not more_lines:
             return
-        self.line(kind)
-        for name, dtype, start, about in every:
-            said = f" (* {about.about}{f', {about.unit}' if about.unit else ''} *)" if about is not None else ""
-            self.line(f"    {name}: {st_type(dtype)}{start};{said}")
-        for line in more:
-            self.line(f"    {line}")
-        self.line("END_VAR")
+        self.add_line(kind)
+        for name, dtype, start, quantity in variables:
+            remark = (
+                f" (* {quantity.description}{f', {quantity.unit}' if quantity.unit else ''} *)"
+                if quantity is not None
+                else ""
+            )
+            self.add_line(f"    {name}: {st_type(dtype)}{start};{remark}")
+        for line in more_lines:
+            self.add_line(f"    {line}")
+        self.add_line("END_VAR")
 
     def literal(self, constant):
         kind, value = st_type(constant.dtype), constant.value.item()
@@ -104,7 +110,7 @@ class _St(Writer):
             return f"{kind}#{value}"
         if not np.isfinite(value):
             raise Unsupported("numbers that are not finite")
-        text = shortest(constant.value).upper()
+        text = write_shortest(constant.value).upper()
         mantissa, mark, exponent = text.partition("E")
         # the standard wants a point in each real number
         return f"{kind}#{mantissa if '.' in mantissa else f'{mantissa}.0'}{mark}{exponent}"
@@ -122,36 +128,36 @@ class _St(Writer):
             self.assign(self.name(out), text)
 
     def assign(self, name, text):
-        self.line(f"{name} := {text};")
+        self.add_line(f"{name} := {text};")
 
     def begin_repeat(self, times):
-        index = self._more(np.dtype(np.int32), "turn")
-        self.line(f"FOR {index} := 1 TO {times} DO")
+        index = self._add_temporary(np.dtype(np.int32), "turn")
+        self.add_line(f"FOR {index} := 1 TO {times} DO")
 
-    def begin_if(self, which):
-        self.line(f"IF {which} THEN")
+    def begin_if(self, condition):
+        self.add_line(f"IF {condition} THEN")
 
     def begin_else(self):
-        self.line("ELSE")
+        self.add_line("ELSE")
 
-    def end(self, what):
-        self.line("END_FOR;" if what == "repeat" else "END_IF;")
+    def end(self, statement):
+        self.add_line("END_FOR;" if statement == "repeat" else "END_IF;")
 
-    def _more(self, dtype: np.dtype, name: str) -> str:
+    def _add_temporary(self, dtype: np.dtype, name: str) -> str:
         """A variable more."""
-        found = self.unique(name)
-        self._temporary.append((found, dtype))
-        return found
+        unused = self.make_unique(name)
+        self._temporary.append((unused, dtype))
+        return unused
 
-    def operation(self, one: Operation):
-        given, name, out = one.given, one.name, one.out
-        texts = [self.text(value) for value in given]
-        kind, logical = st_type(out.dtype), given[0].dtype == bool
-        if name == "div" and out.dtype.kind == "f" and not isinstance(given[1], Constant):
+    def write_operation(self, operation: Operation):
+        operands, name, out = operation.operands, operation.name, operation.out
+        texts = [self.text(value) for value in operands]
+        kind, logical = st_type(out.dtype), operands[0].dtype == bool
+        if name == "div" and out.dtype.kind == "f" and not isinstance(operands[1], Constant):
             # controllers stop at a division by zero
             self._temporary.append((self.name(out), out.dtype))
             zero = f"{kind}#0.0"
-            self._lines(
+            self._add_lines(
                 f"IF {texts[1]} <> {zero} THEN",
                 f"    {self.name(out)} := {texts[0]} / {texts[1]};",
                 "ELSE",
@@ -163,7 +169,7 @@ class _St(Writer):
         elif name == "not" and logical:
             self.define(out, f"NOT {texts[0]}")
         elif name == "neg":
-            self.define(out, f"-{texts[0]}" if not isinstance(given[0], Constant) else f"-({texts[0]})")
+            self.define(out, f"-{texts[0]}" if not isinstance(operands[0], Constant) else f"-({texts[0]})")
         elif name in ("abs", "sqrt", "min", "max"):
             self.define(out, f"{name.upper()}({', '.join(texts)})")
         elif name == "select":
@@ -171,54 +177,59 @@ class _St(Writer):
         elif name == "convert" and logical:
             no, yes = (self.literal(Constant(np.asarray(value, out.dtype))) for value in (0, 1))
             self.define(out, f"SEL({texts[0]}, {no}, {yes})")
-        elif name == "convert" and (given[0].dtype.kind != "f" or out.dtype.kind == "f" or _is_whole(self._made, given[0])):
-            self.define(out, f"{st_type(given[0].dtype)}_TO_{kind}({texts[0]})")
+        elif name == "convert" and (
+            operands[0].dtype.kind != "f" or out.dtype.kind == "f" or _is_integer(self._operation_by_variable, operands[0])
+        ):
+            self.define(out, f"{st_type(operands[0].dtype)}_TO_{kind}({texts[0]})")
         elif name in ("floor", "ceil", "round_even"):
-            self._rounded(one, texts[0])
+            self._write_rounding(operation, texts[0])
         elif name == "power_of_two":
-            self._power_of_two(one, texts[0])
+            self._write_power_of_two(operation, texts[0])
         else:
-            raise Unsupported(f"{name} of {given[0].dtype} in structured text")
-        self._made[out] = one
+            raise Unsupported(f"{name} of {operands[0].dtype} in structured text")
+        self._operation_by_variable[out] = operation
 
-    def _lines(self, *lines: str) -> None:
+    def _add_lines(self, *lines: str) -> None:
         for line in lines:
-            self.line(line)
+            self.add_line(line)
 
-    def _rounded(self, one: Operation, x: str) -> None:
-        """By a conversion, whichever neighbour it takes; numbers beyond 2^30 are left as they are."""
-        kind, out = st_type(one.out.dtype), self.name(one.out)
-        self._temporary.append((out, one.out.dtype))
-        n, rest = self._more(np.dtype(np.int32), "near"), self._more(one.out.dtype, "rest")
+    def _write_rounding(self, operation: Operation, x: str) -> None:
+        """Write a rounding by a conversion, whichever neighbour it takes. Numbers beyond 2^30 stay as they are."""
+        kind, out = st_type(operation.out.dtype), self.name(operation.out)
+        self._temporary.append((out, operation.out.dtype))
+        n, remainder = self._add_temporary(np.dtype(np.int32), "near"), self._add_temporary(operation.out.dtype, "rest")
         up, down = f"{out} := {out} + {kind}#1.0;", f"{out} := {out} - {kind}#1.0;"
         odd = f"{n} MOD DINT#2 <> DINT#0"
         fits = {
-            "floor": [f"IF {rest} < {kind}#0.0 THEN", f"    {down}", "END_IF;"],
-            "ceil": [f"IF {rest} > {kind}#0.0 THEN", f"    {up}", "END_IF;"],
+            "floor": [f"IF {remainder} < {kind}#0.0 THEN", f"    {down}", "END_IF;"],
+            "ceil": [f"IF {remainder} > {kind}#0.0 THEN", f"    {up}", "END_IF;"],
             "round_even": [
-                f"IF ({rest} > {kind}#0.5) OR (({rest} = {kind}#0.5) AND ({odd})) THEN",
+                f"IF ({remainder} > {kind}#0.5) OR (({remainder} = {kind}#0.5) AND ({odd})) THEN",
                 f"    {up}",
-                f"ELSIF ({rest} < {kind}#-0.5) OR (({rest} = {kind}#-0.5) AND ({odd})) THEN",
+                f"ELSIF ({remainder} < {kind}#-0.5) OR (({remainder} = {kind}#-0.5) AND ({odd})) THEN",
                 f"    {down}",
                 "END_IF;",
             ],
-        }[one.name]
-        self._lines(
+        }[operation.name]
+        self._add_lines(
             f"{out} := {x};",
             f"IF ABS({x}) < {kind}#1073741824.0 THEN",
             f"    {n} := {kind}_TO_DINT({x});",
             f"    {out} := DINT_TO_{kind}({n});",
-            f"    {rest} := {x} - {out};",
+            f"    {remainder} := {x} - {out};",
             *(f"    {line}" for line in fits),
             "END_IF;",
         )
 
-    def _power_of_two(self, one: Operation, n: str) -> None:
-        """By squares of 2 or 1 / 2, which are exact."""
-        kind, out = st_type(one.out.dtype), self.name(one.out)
-        self._temporary.append((out, one.out.dtype))
-        left, factor = self._more(np.dtype(np.int32), "remaining"), self._more(one.out.dtype, "factor")
-        self._lines(
+    def _write_power_of_two(self, operation: Operation, n: str) -> None:
+        """Write a power of two by squares of 2 or 1 / 2, which are exact."""
+        kind, out = st_type(operation.out.dtype), self.name(operation.out)
+        self._temporary.append((out, operation.out.dtype))
+        left, factor = (
+            self._add_temporary(np.dtype(np.int32), "remaining"),
+            self._add_temporary(operation.out.dtype, "factor"),
+        )
+        self._add_lines(
             f"{out} := {kind}#1.0;",
             f"{factor} := SEL({n} < DINT#0, {kind}#2.0, {kind}#0.5);",
             f"{left} := ABS({n});",
@@ -234,9 +245,13 @@ class _St(Writer):
         )
 
 
-def _is_whole(made: dict[Variable, Operation], value: Value) -> bool:
-    """Whether a number is known to be an integer, which every conversion keeps."""
-    return isinstance(value, Variable) and value in made and made[value].name in ("floor", "ceil", "round_even")
+def _is_integer(operation_by_variable: dict[Variable, Operation], value: Value) -> bool:
+    """Return True if a value is known to be an integer, which every conversion keeps."""
+    return (
+        isinstance(value, Variable)
+        and value in operation_by_variable
+        and operation_by_variable[value].name in ("floor", "ceil", "round_even")
+    )
 
 
 _INFIX = {

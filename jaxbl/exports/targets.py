@@ -14,15 +14,15 @@ from jaxbl.files import is_empty, json_with_checksum, make_folder, read_json, re
 from jaxbl.fused import Unsupported
 from jaxbl.sweeps.store import identity
 
-from .block import Program, Quantity, program_of
-from .c import c_code
-from .chain import observer_chain
-from .filter import columns, filter_code
-from .fmu import FMI, fmu
-from .lowering import operations_of
+from .block import Program, Quantity, lower_block
+from .c import write_c_code
+from .chain import build_observer_chain
+from .filter import input_columns, write_filter_code
+from .fmu import FMI, build_fmu
+from .lowering import count_operations
 from .mjcf import MUJOCO, by_answer, mjcf
-from .plant import plant_program
-from .st import st_code
+from .plant import build_plant_program
+from .st import write_st_code
 
 SUMMARY = "export.json"
 PRECISIONS = {"double": "float64", "float": "float32"}
@@ -32,8 +32,16 @@ _LONGEST_NAME = 23
 
 
 class Request(NamedTuple):
-    """What is asked for: a study, its name in the code, the type of its numbers, the sides that move along a line, the
-    version of FMI, and the file that the study came from ("" for none)."""
+    """A study to export and the options.
+
+    Attributes:
+        config: the study.
+        name: of functions and files in the code.
+        precision: of its numbers, a key of `PRECISIONS`.
+        linear: sides that move along a line.
+        fmi: version of FMI.
+        file: name of the file that the study came from, "" for none.
+    """
 
     config: Config
     name: str
@@ -44,7 +52,7 @@ class Request(NamedTuple):
 
 
 class Files(NamedTuple):
-    """What a target makes: contents by file name, what it says of itself in `export.json`, and lines for the terminal."""
+    """Contents by file name, entries for `export.json`, and lines for the terminal."""
 
     contents: Mapping[str, str | bytes]
     summary: Mapping[str, Any]
@@ -52,23 +60,29 @@ class Files(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A target: what it is, what makes its files, which options it has, and the name of what comes from no file. `make`
-    raises `Unsupported` where a study has what the target cannot say."""
+    """A target of `jaxbl export`.
 
-    about: str
+    Attributes:
+        description: for the help.
+        make: writes the files; raises `Unsupported` where the target cannot express something in the study.
+        options: options of the command that the target has.
+        unnamed: name in the code for a study that comes from no file.
+    """
+
+    description: str
     make: Callable[[Request], Files]
     options: tuple[str, ...]
     unnamed: str = "observer"
 
 
 class Export(NamedTuple):
-    """What was written.
+    """The files that an export wrote.
 
     Attributes:
         folder: where it is.
         files: names of the files in it.
         summary: what `export.json` says.
-        lines: the same in a few words.
+        lines: the summary for the terminal.
     """
 
     folder: Path
@@ -77,69 +91,78 @@ class Export(NamedTuple):
     lines: list[str]
 
 
-def _c(request: Request) -> Files:
-    program, name = _program(request), request.name
-    code = c_code(program, _about(request, program, _c_call(program)))
-    texts = {f"{name}.c": code.source, f"{name}.h": code.header, f"{name}_filter.c": filter_code(program)}
-    summary = _summary(program) | {"state_bytes": state_bytes(program)}
+def _export_c(request: Request) -> Files:
+    program, name = _lower_observers(request), request.name
+    code = write_c_code(program, _write_head_of_code(request, program, _write_c_call(program)))
+    texts = {f"{name}.c": code.source, f"{name}.h": code.header, f"{name}_filter.c": write_filter_code(program)}
+    summary = _summarise(program) | {"state_bytes": count_state_bytes(program)}
     lines = [
-        f"{name}.c, {name}.h: {_cost(program)}, and a state of {summary['state_bytes']} bytes.",
-        f"{name}_filter.c: an example that reads {','.join(columns(program))} as CSV:",
+        f"{name}.c, {name}.h: {_describe_cost(program)}, and a state of {summary['state_bytes']} bytes.",
+        f"{name}_filter.c: an example that reads {','.join(input_columns(program))} as CSV:",
         f"  cc -std=c99 -O2 {name}.c {name}_filter.c -lm -o {name}_filter",
     ]
     return Files(texts, summary, lines)
 
 
-def _st(request: Request) -> Files:
-    program, name = _program(request), request.name
-    about = [
+def _export_st(request: Request) -> Files:
+    program, name = _lower_observers(request), request.name
+    call_lines = [
         "How to call: an instance of the function block once a sample, the first one included. restart begins anew.",
         "Divisions by zero give zero. Where a controller computes as IEEE 754 asks, the numbers are those of --target c.",
     ]
-    lines = [f"{name}.st: function block {name}, {_cost(program)}."]
-    return Files({f"{name}.st": st_code(program, _about(request, program, about))}, _summary(program), lines)
+    lines = [f"{name}.st: function block {name}, {_describe_cost(program)}."]
+    return Files(
+        {f"{name}.st": write_st_code(program, _write_head_of_code(request, program, call_lines))}, _summarise(program), lines
+    )
 
 
-def _mjcf(request: Request) -> Files:
-    text, step, said = mjcf(request.config, linear=request.linear)
-    lists = by_answer(said)
+def _export_mjcf(request: Request) -> Files:
+    text, step, notes = mjcf(request.config, linear=request.linear)
+    lists = by_answer(notes)
     lines = [f"model.xml: MuJoCo {MUJOCO} or later, steps of {step:.3g} s."]
-    lines += [f"{how}: {path}: {why}" for how in ("approximated", "not said") for path, why in lists[how].items()]
+    lines += [
+        f"{answer}: {path}: {reason}" for answer in ("approximated", "not said") for path, reason in lists[answer].items()
+    ]
     return Files({"model.xml": text}, {"mujoco": MUJOCO, "time_step": step} | lists, lines)
 
 
-def _fmu(request: Request) -> Files:
+def _export_fmu(request: Request) -> Files:
     name, fmi = request.name, FMI[request.fmi]
-    plant = plant_program(request.config, name, np.dtype(PRECISIONS[request.precision]))
+    plant = build_plant_program(request.config, name, np.dtype(PRECISIONS[request.precision]))
     call = ["Called by the functions of FMI. Functions touch nothing but their arguments."]
-    made = fmu(request.config, plant, _head(request, f"{name}: the drive, from sample to sample.", call), request.fmi)
-    period, count = request.config.run.sample_period, sum(one.causality == "parameter" for one in made.variables)
-    what = f"{name}.fmu: FMI {fmi}, co-simulation, steps of {period:g} s, {count} parameters"
-    places, why = " and ".join(made.binaries), "; ".join(made.why)
-    if made.binaries:
-        lines = [f"{what}; {'binaries' if made.binaries[1:] else 'a binary'} for {places}, and the sources."]
-        lines += [f"One more binary is missing: {why}."] if why else []
+    archive = build_fmu(
+        request.config, plant, _write_head(request, f"{name}: the drive, from sample to sample.", call), request.fmi
+    )
+    period, count = (
+        request.config.run.sample_period,
+        sum(variable.causality == "parameter" for variable in archive.variables),
+    )
+    headline = f"{name}.fmu: FMI {fmi}, co-simulation, steps of {period:g} s, {count} parameters"
+    platforms, reasons = " and ".join(archive.binaries), "; ".join(archive.missing)
+    if archive.binaries:
+        lines = [f"{headline}; {'binaries' if archive.binaries[1:] else 'a binary'} for {platforms}, and the sources."]
+        lines += [f"One more binary is missing: {reasons}."] if reasons else []
     else:
-        lines = [f"{what}; the sources alone: {why}."]
+        lines = [f"{headline}; the sources alone: {reasons}."]
     summary = {
         "precision": request.precision,
         "sample_period": period,
         "fmi": fmi,
-        "token": made.token,
-        "binaries": made.binaries,
-        "variables": [dict(one._asdict()) for one in made.variables],
+        "token": archive.token,
+        "binaries": archive.binaries,
+        "variables": [dict(variable._asdict()) for variable in archive.variables],
     }
-    return Files({f"{name}.fmu": made.content}, summary, lines)
+    return Files({f"{name}.fmu": archive.content}, summary, lines)
 
 
 _OF_CODE = "precision", "name"
 TARGETS: dict[str, Target] = {
-    "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _c, _OF_CODE),
-    "st": Target("structured text (IEC 61131-3): the same as a function block", _st, _OF_CODE),
-    "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _mjcf, ("linear",)),
-    "fmu": Target("the drive as a Functional Mock-up Unit for co-simulation", _fmu, (*_OF_CODE, "fmi"), "drive"),
+    "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _export_c, _OF_CODE),
+    "st": Target("structured text (IEC 61131-3): the same as a function block", _export_st, _OF_CODE),
+    "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _export_mjcf, ("linear",)),
+    "fmu": Target("the drive as a Functional Mock-up Unit for co-simulation", _export_fmu, (*_OF_CODE, "fmi"), "drive"),
 }
-"""By the names of --target."""
+"""Targets by the values of --target."""
 
 
 def export(
@@ -172,21 +195,23 @@ def export(
     study = read_config(config)
     if target not in TARGETS:
         raise InputError(f"--target {target}: should be one of {', '.join(TARGETS)}")
-    given = {"precision": precision, "name": name, "linear": linear, "fmi": fmi}
-    for option, value in given.items():
+    options = {"precision": precision, "name": name, "linear": linear, "fmi": fmi}
+    for option, value in options.items():
         if value not in (None, (), []) and option not in TARGETS[target].options:
             raise InputError(f"--{option}: --target {target} has no such option; leave it out")
-    chosen = {long: short for short, long in PRECISIONS.items()}[study.run.precision] if precision is None else precision
-    if chosen not in PRECISIONS:
-        raise InputError(f"--precision {chosen}: should be one of {', '.join(PRECISIONS)}")
+    precision_name = (
+        {long: short for short, long in PRECISIONS.items()}[study.run.precision] if precision is None else precision
+    )
+    if precision_name not in PRECISIONS:
+        raise InputError(f"--precision {precision_name}: should be one of {', '.join(PRECISIONS)}")
     if fmi is not None and fmi not in FMI:
         raise InputError(f"--fmi {fmi}: should be one of {', '.join(map(str, FMI))}")
-    known = _name(file, TARGETS[target].unnamed) if name is None else checked_name(name)
-    request = Request(study, known, chosen, tuple(linear), fmi or max(FMI), file)
+    code_name = _make_code_name(file, TARGETS[target].unnamed) if name is None else check_name(name)
+    request = Request(study, code_name, precision_name, tuple(linear), fmi or max(FMI), file)
     try:
-        made = TARGETS[target].make(request)
-    except Unsupported as why:
-        raise InputError(f"--target {target}: {file or 'the study'} has what it cannot say: {why}") from None
+        files = TARGETS[target].make(request)
+    except Unsupported as error:
+        raise InputError(f"--target {target}: {file or 'the study'} has what it cannot say: {error}") from None
     head = {
         "target": target,
         "name": request.name,
@@ -194,28 +219,28 @@ def export(
         "study": file,
         "identity": identity(study, "simulate"),
         "jaxbl": version("jaxbl"),
-        "files": list(made.contents),
+        "files": list(files.contents),
     }
-    summary = head | dict(made.summary)
-    where = Path(folder)
-    with remove_if_empty_on_error(where):
-        _claim(where, request.name, target)
-        for file_name, content in made.contents.items():
-            write_atomic(where / file_name, content)
-        write_atomic(where / SUMMARY, json_with_checksum(summary))
-    return Export(where, (*made.contents, SUMMARY), summary, made.lines)
+    summary = head | dict(files.summary)
+    out = Path(folder)
+    with remove_if_empty_on_error(out):
+        _claim(out, request.name, target)
+        for file_name, content in files.contents.items():
+            write_atomic(out / file_name, content)
+        write_atomic(out / SUMMARY, json_with_checksum(summary))
+    return Export(out, (*files.contents, SUMMARY), summary, files.lines)
 
 
 def _claim(folder: Path, name: str, target: str) -> None:
-    """Make the folder, or see that it holds the same export."""
+    """Make the folder, or check that it holds the same export. Raises `InputError`."""
     make_folder(folder)
     if is_empty(folder):
         return
     if not (folder / SUMMARY).exists():
         raise InputError(f"{folder}: is not empty and holds no export; choose another folder with --out")
-    found = read_json(folder / SUMMARY)
-    if (found.get("name"), found.get("target")) != (name, target):
-        other = f"{found.get('name')} for --target {found.get('target')}"
+    summary = read_json(folder / SUMMARY)
+    if (summary.get("name"), summary.get("target")) != (name, target):
+        other = f"{summary.get('name')} for --target {summary.get('target')}"
         raise InputError(f"{folder}: holds another export ({other}); choose another folder with --out")
 
 
@@ -230,8 +255,8 @@ _RESERVED = (
 """Keywords of the languages, and headers of C: a build may look for those where the code's own header is."""
 
 
-def checked_name(name: str) -> str:
-    """A name that every target can use. Raises `InputError`."""
+def check_name(name: str) -> str:
+    """Return the name if every target can use it. Raises `InputError` otherwise."""
     if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name) or len(name) > _LONGEST_NAME or name in _RESERVED.split():
         raise InputError(
             f"--name {name}: should be small letters, digits and single underscores, begin with a letter, have at most "
@@ -240,41 +265,41 @@ def checked_name(name: str) -> str:
     return name
 
 
-def _name(file: str, unnamed: str) -> str:
-    """A name from that of a file; the other one where there is none."""
+def _make_code_name(file: str, unnamed: str) -> str:
+    """Make a name in code from that of a file; `unnamed` where there is no file."""
     plain = re.sub(r"[^a-z0-9]+", "_", Path(file).stem.lower()).strip("_")
     plain = plain if plain[:1].isalpha() else f"study_{plain}"
     plain = plain[:_LONGEST_NAME].strip("_") if file else unnamed
     return f"{plain}_code" if plain in _RESERVED.split() else plain
 
 
-def _program(request: Request) -> Program:
-    return program_of(observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision])))
+def _lower_observers(request: Request) -> Program:
+    return lower_block(build_observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision])))
 
 
-def _cost(program: Program) -> str:
-    return f"{operations_of(program.step).total()} operations a step in {_precision(program)}"
+def _describe_cost(program: Program) -> str:
+    return f"{count_operations(program.step).total()} operations a step in {_name_precision(program)}"
 
 
-def _precision(program: Program) -> str:
+def _name_precision(program: Program) -> str:
     return next(short for short, long in PRECISIONS.items() if program.block.dtype == long)
 
 
-def _about(request: Request, program: Program, call: list[str]) -> list[str]:
-    """Lines for the beginning of a file."""
-    sides = [one.name.removesuffix("_position") for one in program.block.first]
+def _write_head_of_code(request: Request, program: Program, call: list[str]) -> list[str]:
+    """Write the lines at the beginning of a file of observers."""
+    sides = [quantity.name.removesuffix("_position") for quantity in program.block.start_inputs]
     parts = f"{'observers' if len(sides) > 1 else 'observer'} of {' and '.join(sides)}, equivalent control"
-    identifier = ", identifier" if any(one.name.endswith("_identified") for one in program.block.outputs) else ""
-    return _head(request, f"{request.name}: {parts}{identifier}, from sample to sample.", call)
+    identifier = ", identifier" if any(quantity.name.endswith("_identified") for quantity in program.block.outputs) else ""
+    return _write_head(request, f"{request.name}: {parts}{identifier}, from sample to sample.", call)
 
 
-def _head(request: Request, what: str, call: list[str]) -> list[str]:
+def _write_head(request: Request, first_line: str, call: list[str]) -> list[str]:
     config = request.config
-    said = f" ({config.title})" if config.title else ""
+    title = f" ({config.title})" if config.title else ""
     return [
-        what,
+        first_line,
         "",
-        f"Made by jaxbl {version('jaxbl')} from {request.file or 'a study'}{said},",
+        f"Made by jaxbl {version('jaxbl')} from {request.file or 'a study'}{title},",
         f"whose numbers have the hash {identity(config, 'simulate')}. To change one, change the study and export it again.",
         f"Numbers: {request.precision}. Sampling period: {config.run.sample_period:g} s. SI units: s, rad, N m.",
         "",
@@ -282,10 +307,12 @@ def _head(request: Request, what: str, call: list[str]) -> list[str]:
     ]
 
 
-def _c_call(program: Program) -> list[str]:
+def _write_c_call(program: Program) -> list[str]:
     block, name = program.block, program.block.name
-    first, inputs = (", ".join(one.name for one in some) for some in (block.first, block.inputs))
-    period = program.block.known["run.sample_period"].value
+    first, inputs = (
+        ", ".join(quantity.name for quantity in quantities) for quantities in (block.start_inputs, block.inputs)
+    )
+    period = program.block.study_numbers["run.sample_period"].value
     return [
         "How to call:",
         f"    static {name}_state state;",
@@ -299,28 +326,28 @@ def _c_call(program: Program) -> list[str]:
     ]
 
 
-def _summary(program: Program) -> dict[str, Any]:
+def _summarise(program: Program) -> dict[str, Any]:
     block = program.block
-    counts = operations_of(program.step)
+    counts = count_operations(program.step)
     return {
-        "precision": _precision(program),
-        "sample_period": block.known["run.sample_period"].value,
-        "first": [_said(one) for one in block.first],
-        "inputs": [_said(one) for one in block.inputs],
-        "outputs": [_said(one) for one in block.outputs],
-        "state": [{"name": one.name, "type": str(one.dtype)} for one in program.state],
+        "precision": _name_precision(program),
+        "sample_period": block.study_numbers["run.sample_period"].value,
+        "first": [_describe_quantity(quantity) for quantity in block.start_inputs],
+        "inputs": [_describe_quantity(quantity) for quantity in block.inputs],
+        "outputs": [_describe_quantity(quantity) for quantity in block.outputs],
+        "state": [{"name": quantity.name, "type": str(quantity.dtype)} for quantity in program.state],
         "operations_per_step": dict(sorted(counts.items())),
         "operations": counts.total(),
     }
 
 
-def _said(one: Quantity) -> dict[str, str]:
-    return {"name": one.name, "unit": one.unit, "about": one.about, "type": str(one.dtype)}
+def _describe_quantity(quantity: Quantity) -> dict[str, str]:
+    return {"name": quantity.name, "unit": quantity.unit, "about": quantity.description, "type": str(quantity.dtype)}
 
 
-def state_bytes(program: Program) -> int:
-    """Size of the state's struct where numbers are aligned to their own size."""
-    sizes = [one.dtype.itemsize for one in program.state] or [4]
+def count_state_bytes(program: Program) -> int:
+    """Return the size of the state's struct in bytes where numbers are aligned to their own size."""
+    sizes = [quantity.dtype.itemsize for quantity in program.state] or [4]
     end = 0
     for size in sizes:
         end = -(-end // size) * size + size

@@ -17,9 +17,9 @@ from .lowering import (
     Statement,
     Value,
     Variable,
-    constants_of,
-    named_constants,
-    read_by,
+    find_constants,
+    find_read_variables,
+    name_constants,
 )
 
 
@@ -36,35 +36,35 @@ class Writer(abc.ABC):
         self._source = ""
         self._names: dict[Variable, str] = {}
         block = program.block
-        self._used = {one.name.lower() for one in (*block.first, *block.inputs, *block.outputs)}
+        self._used = {quantity.name.lower() for quantity in (*block.start_inputs, *block.inputs, *block.outputs)}
         self._numbers = count(1)
-        every = [one for routine in (program.start, program.step) for one in constants_of(routine)]
-        self.constants = named_constants(dict.fromkeys(every), program.block.known)
+        constants = [quantity for routine in (program.start, program.step) for quantity in find_constants(routine)]
+        self.constants = name_constants(dict.fromkeys(constants), program.block.study_numbers)
 
     # what a language says
 
     @abc.abstractmethod
     def literal(self, constant: Constant) -> str:
-        """A number of the code itself."""
+        """Write a number."""
 
     @abc.abstractmethod
     def remark(self, text: str) -> str:
-        """A comment."""
+        """Write a comment."""
 
     @abc.abstractmethod
     def define(self, out: Variable, text: str) -> None:
-        """A variable that stays what it is."""
+        """Define a variable that does not change."""
 
     @abc.abstractmethod
     def declare(self, out: Variable, text: str | None) -> None:
-        """A variable that is changed later; it begins as something, if that is said."""
+        """Declare a variable that changes later, with its first value if there is one."""
 
     @abc.abstractmethod
     def assign(self, name: str, text: str) -> None:
         """Change a variable."""
 
     @abc.abstractmethod
-    def operation(self, one: Operation) -> None:
+    def write_operation(self, operation: Operation) -> None:
         """Write one operation."""
 
     @abc.abstractmethod
@@ -72,94 +72,95 @@ class Writer(abc.ABC):
         """Begin a loop."""
 
     @abc.abstractmethod
-    def begin_if(self, which: str) -> None:
+    def begin_if(self, condition: str) -> None:
         """Begin a choice."""
 
     @abc.abstractmethod
     def begin_else(self) -> None:
-        """Begin its other way."""
+        """Begin the other branch of a choice."""
 
     @abc.abstractmethod
-    def end(self, what: str) -> None:
+    def end(self, statement: str) -> None:
         """End a "repeat" or an "if"."""
 
     # what they have in common
 
-    def line(self, text: str = "") -> None:
-        """A line at the present depth."""
+    def add_line(self, text: str = "") -> None:
+        """Add a line at the present depth."""
         self.lines.append(f"{self.indent * self._depth}{text}" if text else "")
 
     def text(self, value: Value) -> str:
-        """A value in an expression."""
+        """Write a value in an expression."""
         if isinstance(value, Constant):
             return self.constants.get(value) or self.literal(value)
         return self.name(value)
 
     def name(self, variable: Variable) -> str:
-        """A variable's name in the code."""
+        """Return the name of a variable in the code."""
         if variable not in self._names:
-            self._names[variable] = variable.name or self.unique(f"v{next(self._numbers)}")
+            self._names[variable] = variable.name or self.make_unique(f"v{next(self._numbers)}")
         return self._names[variable]
 
-    def call(self, variable: Variable, name: str) -> None:
+    def give_name(self, variable: Variable, name: str) -> None:
         """Give a variable a name."""
-        self._names[variable] = self.unique(name)
+        self._names[variable] = self.make_unique(name)
 
-    def unique(self, name: str) -> str:
-        """A name that nothing else has; no language may tell large letters from small ones."""
-        taken = self._used | {one.lower() for one in self.constants.values()}
-        found = next(one for one in chain([name], (f"{name}_{i}" for i in count(2))) if one.lower() not in taken)
-        self._used.add(found.lower())
-        return found
+    def make_unique(self, name: str) -> str:
+        """Make a name that is not used yet, also if large and small letters count as the same."""
+        taken = self._used | {constant_name.lower() for constant_name in self.constants.values()}
+        numbered_names = (f"{name}_{i}" for i in count(2))
+        unused_name = next(candidate for candidate in chain([name], numbered_names) if candidate.lower() not in taken)
+        self._used.add(unused_name.lower())
+        return unused_name
 
-    def statements(self, statements: Sequence[Statement]) -> None:
+    def write_statements(self, statements: Sequence[Statement]) -> None:
         """Write statements, with a comment where they come from another file."""
-        for one in statements:
-            file = one.source.partition(":")[0]
+        for statement in statements:
+            file = statement.source.partition(":")[0]
             if file and file != self._source:
                 self._source = file
-                self.line(self.remark(_place(one.source)))
-            if isinstance(one, Operation):
-                self.operation(one)
-            elif isinstance(one, Repeat):
-                self._repeat(one)
+                self.add_line(self.remark(_shorten_source(statement.source)))
+            if isinstance(statement, Operation):
+                self.write_operation(statement)
+            elif isinstance(statement, Repeat):
+                self._write_repeat(statement)
             else:
-                self._choice(one)
+                self._write_choice(statement)
 
-    def _repeat(self, one: Repeat) -> None:
-        for variable, start in zip(one.carried, one.start, strict=True):
+    def _write_repeat(self, loop: Repeat) -> None:
+        for variable, start in zip(loop.carried, loop.start, strict=True):
             self.declare(variable, self.text(start))
-        self.begin_repeat(one.times)
+        self.begin_repeat(loop.times)
         self._depth += 1
-        self.statements(one.body)
-        self._assigned(one.carried, one.results)
+        self.write_statements(loop.body)
+        self._assign_together(loop.carried, loop.results)
         self._depth -= 1
         self.end("repeat")
 
-    def _assigned(self, to: Sequence[Variable], results: Sequence[Value]) -> None:
-        """All at once: one that is read after it has changed is kept first."""
-        texts, seen = [], set()
-        for variable, value in zip(to, results, strict=True):
-            if value in seen and isinstance(value, Variable):
-                kept = Variable(value.dtype, -1)
-                self.define(kept, self.text(value))
-                value = kept
+    def _assign_together(self, variables: Sequence[Variable], results: Sequence[Value]) -> None:
+        """Assign results to variables, all at once: a variable that is read after its assignment is copied first."""
+        texts, assigned = [], set()
+        for variable, value in zip(variables, results, strict=True):
+            if value in assigned and isinstance(value, Variable):
+                old_value = Variable(value.dtype, -1)
+                self.define(old_value, self.text(value))
+                value = old_value
             texts.append(self.text(value))
-            seen.add(variable)
-        for variable, text, value in zip(to, texts, results, strict=True):
+            assigned.add(variable)
+        for variable, text, value in zip(variables, texts, results, strict=True):
             if value is not variable:
                 self.assign(self.name(variable), text)
 
-    def _choice(self, one: Choice) -> None:
-        yes, no = one.bodies
+    def _write_choice(self, choice: Choice) -> None:
+        yes, no = choice.bodies
         short = not no
-        for variable, value in zip(one.outs, one.results[1], strict=True):
+        for variable, value in zip(choice.outs, choice.results[1], strict=True):
             self.declare(variable, self.text(value) if short else None)
-        self.begin_if(self.text(one.which))
-        for body, results in zip((yes, no), one.results, strict=True):
+        self.begin_if(self.text(choice.condition))
+        for body, results in zip((yes, no), choice.results, strict=True):
             self._depth += 1
-            self.statements(body)
-            for variable, value in zip(one.outs, results, strict=True):
+            self.write_statements(body)
+            for variable, value in zip(choice.outs, results, strict=True):
                 self.assign(self.name(variable), self.text(value))
             self._depth -= 1
             if short:
@@ -169,19 +170,19 @@ class Writer(abc.ABC):
         self.end("if")
 
 
-def _place(source: str) -> str:
-    """A source without what Python adds."""
+def _shorten_source(source: str) -> str:
+    """Shorten the name of a source function by what Python adds to it."""
     return source.replace("<locals>.", "").replace(".<dictcomp>", "").replace(".<genexpr>", "").replace(".<lambda>", "")
 
 
-def unread(routine: Routine, quantities: Sequence[Quantity]) -> list[str]:
-    """Names of those of some quantities that a routine does not read."""
-    read = {variable.name for variable in read_by(routine)}
-    return [one.name for one in quantities if one.name not in read]
+def find_unread_names(routine: Routine, quantities: Sequence[Quantity]) -> list[str]:
+    """Find the names of quantities that a routine does not read."""
+    read = {variable.name for variable in find_read_variables(routine)}
+    return [quantity.name for quantity in quantities if quantity.name not in read]
 
 
-def shortest(value: Any) -> str:
-    """The shortest decimal number that is read as this one again, in its own precision."""
+def write_shortest(value: Any) -> str:
+    """Write the shortest decimal number that is read as this number again, in its own precision."""
     text = repr(float(value)) if np.asarray(value).dtype == np.float64 else str(np.float32(value))
     return text if any(mark in text for mark in ".en") else f"{text}.0"
 
@@ -189,8 +190,8 @@ def shortest(value: Any) -> str:
 _LETTERS = {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho"}
 
 
-def plain_text(text: str) -> str:
-    """The text in letters that every compiler reads."""
+def to_ascii(text: str) -> str:
+    """Replace the letters that not every compiler reads."""
     for letter, other in _LETTERS.items():
         text = text.replace(letter, other)
     return text.encode("ascii", "replace").decode()

@@ -34,7 +34,7 @@ class Strict:
 
     def __init__(self, block):
         self.single = block.dtype == np.float32
-        numbers = [self.real(one.value) for one in block.known.values()]
+        numbers = [self.real(one.value) for one in block.study_numbers.values()]
         count, known = len(block.state), len(numbers)
         self._start = self._made(block.start, known, [])(*numbers)
         self._step = self._made(block.step, known, [])(*numbers)

@@ -14,7 +14,7 @@ import jaxbl
 from jaxbl.config import read_config
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.errors import InputError
-from jaxbl.exports.chain import observer_chain
+from jaxbl.exports.chain import build_observer_chain
 from jaxbl.exports.targets import TARGETS
 from jaxbl.observer import OBSERVERS
 from jaxbl.simulate import replay
@@ -65,7 +65,7 @@ def test_all_compilers_and_levels_give_the_same_bits(code, compiler, level, prec
 
 def strictly(data, precision, inputs):
     dtype = np.dtype(np.float32 if precision == "float" else np.float64)
-    block = Strict(observer_chain(read_config(data), "drive", dtype))
+    block = Strict(build_observer_chain(read_config(data), "drive", dtype))
     state, rows = block.start(inputs[0, 1:].astype(dtype)), []
     for row in inputs.astype(dtype):
         state, out = block.step(state, list(row) if precision == "float" else row.tolist())

@@ -19,8 +19,8 @@ from jaxbl.config import read_config
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.transmission import LinearShaft
 from jaxbl.errors import InputError
-from jaxbl.exports.fmu import _WINDOWS, base_unit, unit_name
-from jaxbl.exports.plant import plant_program
+from jaxbl.exports.fmu import _WINDOWS, find_base_units, write_unit
+from jaxbl.exports.plant import build_plant_program
 
 fmpy = pytest.importorskip("fmpy", reason="runs FMUs by FMPy (pip install 'jaxbl[fmu]')")
 from fmpy.fmi1 import FMICallException  # noqa: E402
@@ -192,8 +192,8 @@ def test_every_effect_of_the_package_can_be_said():
     own = {name for name, cls in EFFECTS.items() if cls.__module__.startswith("jaxbl.")}
     assert own == NUMBERS.keys()
     for one in EFFECT:
-        program = plant_program(read_config(small(effects=[one])), "drive", np.dtype(np.float64))
-        numbers = {path for path in program.about if path.startswith("effects.")}
+        program = build_plant_program(read_config(small(effects=[one])), "drive", np.dtype(np.float64))
+        numbers = {path for path in program.parameter_info if path.startswith("effects.")}
         expected = {
             f"effects.{one['kind']}.{key}"
             for key, value in one.items()
@@ -214,10 +214,10 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
     path, _ = written(data, tmp_path, precision=precision)
     dtype = np.dtype(np.float32 if precision == "float" else np.float64)
     torques = (5.0 * np.sin(8.0 * np.arange(3000) * 1e-3)).astype(dtype)
-    plant = plant_program(read_config(data), "drive", dtype)
+    plant = build_plant_program(read_config(data), "drive", dtype)
     block = Strict(plant.program.block)
-    given = {one: block.real(plant.about[path][0]) for one, path in plant.parameters.items()}
-    first, later = plant.program.block.first, plant.program.block.inputs[1:]
+    given = {one: block.real(plant.parameter_info[path][0]) for one, path in plant.parameters.items()}
+    first, later = plant.program.block.start_inputs, plant.program.block.inputs[1:]
     found = block.start([given[one.name] for one in first])
     state, rows = found[: len(plant.program.block.state)], []
     for torque in torques:
@@ -693,8 +693,8 @@ def test_any_name_that_is_allowed_compiles(tmp_path, name):
     ],
 )
 def test_units_have_exponents_of_base_units(unit, name, base):
-    assert unit_name(unit) == name
-    assert base_unit(name) == base
+    assert write_unit(unit) == name
+    assert find_base_units(name) == base
 
 
 @pytest.mark.parametrize(
