@@ -107,7 +107,7 @@ def read_study_numbers(experiment: Experiment) -> dict[str, StudyNumber]:
 
 
 def _identified_outputs(experiment: Experiment, state: State) -> dict[str, tuple[Any, str, str]]:
-    """Return what each side identifies of the transmission law (0 while it is not determined), and whether it is determined."""
+    """Return what each side identifies of the law (0 while it is not determined), and whether it is determined."""
     identifier, law = experiment.identifier, experiment.transmission
     if identifier is None or law is None or state.identifier is None:
         return {}
