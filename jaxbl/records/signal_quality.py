@@ -36,11 +36,11 @@ class ChannelStatistics:
     unit: str
     least: float
     largest: float
-    find_resolution: float
+    resolution: float
     noise: float
-    find_bandwidth: float
+    bandwidth: float
     saturated: float
-    count_jumps: int
+    jumps: int
     skew: float | None = None
     skew_error: float | None = None
 
