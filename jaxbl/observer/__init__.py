@@ -1,6 +1,6 @@
-"""What runs in real time: observers, equivalent control, recursive least squares; and gain conditions.
+"""Observers, equivalent control and recursive least squares, which run in real time; and gain conditions.
 
-Observers are in the order in which lists name them.
+Observers stand in the order in which lists name them.
 """
 
 # ruff: noqa: I001

@@ -1,13 +1,13 @@
-"""What all observers of one side have in common, and where they are registered.
+"""Base class of the observers of one side, and their registry.
 
-An observer takes the measured position and the nominal acceleration, and knows nothing of where the measurement comes from.
-It estimates position and velocity, and what acceleration is missing in the nominal model (the equivalent control z_2 of
-(15)): the transmitted torque follows from that. Further packages add observers through the entry-point group
-`jaxbl.observers`; the entry's name is the observer's.
+An observer takes the measured position and the nominal acceleration. It estimates position, velocity, and the acceleration
+that the nominal model lacks: the equivalent control z_2 of (15), from which the transmitted torque follows. Installed
+packages add observers by the entry-point group `jaxbl.observers`; the entry point's name is the observer's.
 """
 
 import abc
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -17,11 +17,16 @@ from jaxbl.drive.parameters import Scalar, config_key, parameter, parameters
 from jaxbl.registry import Registry, check_module
 
 Acceleration = Callable[[Scalar], Scalar]
-"""Nominal acceleration (rad/s^2) as a function of velocity (rad/s), the input held at its present value."""
+"""Nominal acceleration f(x_2, u) in rad/s^2 as a function of velocity (rad/s), at the present input."""
 
 
 class ObserverState(NamedTuple):
-    """Position (rad) and velocity (rad/s) predicted for the coming sample, and what else an observer carries."""
+    """State of an observer between samples.
+
+    Attributes:
+        position, velocity: prediction for the next sample, rad and rad/s.
+        extra_states: further numbers that the observer carries.
+    """
 
     position: Scalar
     velocity: Scalar
@@ -29,7 +34,7 @@ class ObserverState(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Position (rad), velocity (rad/s) and equivalent control z_2 (rad/s^2, unfiltered) at the sample."""
+    """Estimates at a sample: position (rad), velocity (rad/s), and unfiltered equivalent control z_2 (rad/s^2)."""
 
     position: Scalar
     velocity: Scalar
@@ -37,8 +42,13 @@ class Estimate(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """What gains are chosen for: the bound f_plus (rad/s^2) of the acceleration missing in the nominal model, the sampling
-    period (s), and the rms error of the encoder (rad), with that of its resolution."""
+    """Conditions for which gains are chosen.
+
+    Attributes:
+        f_plus: bound of the acceleration that the nominal model lacks, rad/s^2.
+        period: sampling period, s.
+        noise: rms error of the encoder's readings, quantisation included, rad.
+    """
 
     f_plus: float
     period: float
@@ -46,78 +56,97 @@ class OperatingConditions(NamedTuple):
 
 
 class AbstractObserver(eqx.Module):
-    """An observer of one side; `position_error` and `velocity_error` are x - x_hat at t = 0."""
+    """An observer of one side.
+
+    Attributes:
+        name: key `kind` of the config.
+        position_error, velocity_error: x - x_hat at t = 0, rad and rad/s.
+    """
 
     name: ClassVar[str]
-    """Key `kind` of the config."""
     position_error: Scalar = parameter("rad", "position error x - x_hat at t = 0", default=0.0, kw_only=True)
     velocity_error: Scalar = parameter("rad/s", "velocity error x - x_hat at t = 0", default=0.0, kw_only=True)
 
     @classmethod
     def select_discretisation(cls, discretisation: str) -> type[Self]:
-        """The class for a key `discretisation` of the config: one class for all, unless the observer has several."""
+        """Return the class for the key `discretisation` of the config: this class, unless the observer has several."""
         return cls
 
     @classmethod
     @abc.abstractmethod
     def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        """Least and largest value of each gain that a search for gains should try, positive, by its config key; the same
-        twice for one that it takes for given."""
+        """Return the range of each gain, by config key, in which a search for gains should try.
+
+        Args:
+            conditions: for which gains are chosen.
+
+        Returns:
+            The least and the largest value of each gain, both positive; they are equal for a gain that stays fixed.
+        """
 
     def gains(self) -> dict[str, float]:
-        """Gains of this observer by config key."""
+        """Gains of this observer, by config key."""
         names = [field.name for field, _ in parameters(self) if not field.kw_only]
         return {config_key(name): float(getattr(self, name)) for name in names}
 
     @abc.abstractmethod
     def start(self, position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar) -> ObserverState:
-        """State before the first sample that predicts a position (rad) and a velocity (rad/s).
+        """Return the state before the first sample.
 
         Args:
-            position, velocity: predicted for the first sample.
+            position, velocity: prediction for the first sample, rad and rad/s.
             acceleration: nominal acceleration without input.
-            period: sampling period in s.
+            period: sampling period, s.
         """
 
     @abc.abstractmethod
     def step(
         self, state: ObserverState, measured: Float[Array, ""], acceleration: Acceleration, period: Scalar
     ) -> tuple[ObserverState, Estimate]:
-        """Take in one sample and predict the next.
+        """Estimate the motion at a sample, and predict the next one.
 
         Args:
             state: prediction for this sample.
-            measured: position in rad.
+            measured: position, rad.
             acceleration: nominal acceleration.
-            period: sampling period in s.
+            period: sampling period, s.
+
+        Returns:
+            The prediction for the next sample, and the estimates at this one.
         """
 
 
 def predict_next(
-    position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar, held: Any = 0.0, missing: Any = 0.0
+    position: Scalar,
+    velocity: Scalar,
+    acceleration: Acceleration,
+    period: Scalar,
+    disturbance: Any = 0.0,
+    missing_acceleration: Any = 0.0,
 ) -> tuple[Scalar, Scalar]:
-    """Position and velocity one sampling period later.
+    """Predict position and velocity one sampling period later.
 
-    Friction is that of the mean velocity over the period: that of its beginning would be half a period late, which the
-    observer would take for a disturbance.
+    Friction is evaluated at the mean velocity over the period. At the velocity of its beginning it would be half a period
+    late, and the observer would take the difference for a disturbance.
 
     Args:
-        position, velocity: now.
-        acceleration: nominal.
-        period: in s.
-        held: acceleration (rad/s^2) beside it over the period.
-        missing: acceleration that the next correction will make up for; the velocity lags by half a period of it.
+        position, velocity: at this sample, rad and rad/s.
+        acceleration: nominal acceleration.
+        period: sampling period, s.
+        disturbance: acceleration beside the nominal one over the period, rad/s^2.
+        missing_acceleration: acceleration that the next correction makes up for, rad/s^2; the velocity lags by half a
+            period of it.
+
+    Returns:
+        Position and velocity at the next sample.
     """
-    total = held + acceleration(velocity + period * (missing + 0.5 * (held + acceleration(velocity))))
+    mean_velocity = velocity + period * (missing_acceleration + 0.5 * (disturbance + acceleration(velocity)))
+    total = disturbance + acceleration(mean_velocity)
     return position + period * (velocity + 0.5 * period * total), velocity + period * total
 
 
-def _check(name: str, found: Any) -> None:
-    check_module(name, found, AbstractObserver)
-
-
-OBSERVERS = Registry("jaxbl.observers", _check)
-"""Observers by the key `kind` of the config."""
+OBSERVERS = Registry("jaxbl.observers", partial(check_module, base=AbstractObserver))
+"""Observers by the key `kind` of the config, those of installed packages included."""
 
 
 class Observers(eqx.Module):

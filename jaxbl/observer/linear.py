@@ -1,7 +1,7 @@
-"""Linear observers of one side: Luenberger, steady-state Kalman, extended state, and the filtered difference of most drives.
+"""Linear observers of one side: Luenberger, steady-state Kalman, extended state, and filtered differences.
 
-Those with a model correct the predicted position, velocity and disturbance (an acceleration, held between samples) by fixed
-shares of the innovation: x_hat = x_predicted + L (y - x_predicted). Their shares follow from gains before the first sample.
+Observers with a model correct the predicted position, velocity and disturbance (an acceleration, held between samples) by
+fixed shares L of the innovation: x_hat = x_predicted + L (y - x_predicted). The shares are computed once, from the gains.
 """
 
 import abc
@@ -16,12 +16,11 @@ from jaxbl.drive.parameters import Scalar, parameter
 from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predict_next
 
 _SLOWEST, _FASTEST = 1e-3, 3.0
-"""Bandwidths worth a search, rad/s times the sampling period: poles at 0.999 and 0.05."""
+"""Range of bandwidths for a search of gains, rad/s times the sampling period: poles at 0.999 and 0.05."""
 
 
 class Correction(NamedTuple):
-    """What a unit of innovation (rad) adds: to the position in rad, to the velocity in rad/s, to the disturbance in
-    rad/s^2."""
+    """Shares of the innovation (rad) that are added to position (1), velocity (1/s) and disturbance (1/s^2)."""
 
     position: Scalar
     velocity: Scalar
@@ -29,11 +28,17 @@ class Correction(NamedTuple):
 
 
 class AbstractLinearObserver(AbstractObserver):
-    """An observer whose correction is linear in the innovation and the same at all samples."""
+    """An observer whose correction is linear in the innovation, with the same shares at all samples.
+
+    Attributes:
+        has_disturbance: True if the disturbance is a state; otherwise it is what corrects the velocity.
+    """
+
+    has_disturbance: ClassVar[bool] = True
 
     @abc.abstractmethod
     def correction(self, acceleration: Acceleration, period: Scalar) -> Correction:
-        """Shares of the innovation."""
+        """Shares of the innovation, for the nominal acceleration and the sampling period (s)."""
 
     def start(self, position, velocity, acceleration, period):
         shares = self.correction(acceleration, period)
@@ -48,22 +53,20 @@ class AbstractLinearObserver(AbstractObserver):
         disturbance = disturbance + share.disturbance * innovation
         if self.has_disturbance:
             control = disturbance
-            new = predict_next(position, velocity, acceleration, period, held=disturbance)
+            new = predict_next(position, velocity, acceleration, period, disturbance=disturbance)
         else:
             control = share.velocity * innovation / period
-            new = predict_next(position, velocity, acceleration, period, missing=control)
+            new = predict_next(position, velocity, acceleration, period, missing_acceleration=control)
         return ObserverState(*new, (disturbance, *share)), Estimate(position, velocity, control)
-
-    has_disturbance: ClassVar[bool] = True
-    """Whether the observer has the disturbance as a state of its own."""
 
 
 @OBSERVERS.add
 class Luenberger(AbstractLinearObserver):
     """Observer of position and velocity with two poles; the missing acceleration is what corrects its velocity.
 
-    Reference: D. G. Luenberger, IEEE Trans. Mil. Electron. 8 (1964); the shares place the poles of z^2 + p_1 z + p_2 of the
-    double integrator: 1 - p_2 and (1 + p_1 + p_2) / h.
+    The shares 1 - p_2 and (1 + p_1 + p_2) / h of the innovation give a double integrator the characteristic polynomial
+    z^2 + p_1 z + p_2, whose roots are exp(s h) with s^2 + 2 damping bandwidth s + bandwidth^2 = 0.
+    Reference: D. G. Luenberger, IEEE Trans. Mil. Electron. 8 (1964).
     """
 
     name: ClassVar[str] = "luenberger"
@@ -76,24 +79,25 @@ class Luenberger(AbstractLinearObserver):
         return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period), "damping": (0.003, 10.0)}
 
     def correction(self, acceleration, period):
-        reach = self.bandwidth * period
-        decay = jnp.exp(-self.damping * reach)
-        beside = 1.0 - self.damping * self.damping
-        turn = reach * jnp.sqrt(jnp.abs(beside))
-        # two real poles where the damping is above one: exp(-d + t) and exp(-d - t), neither of which overflows
-        real = jnp.exp(turn - self.damping * reach) + jnp.exp(-turn - self.damping * reach)
-        poles = jnp.where(beside > 0.0, 2.0 * decay * jnp.cos(turn), real)
+        angle = self.bandwidth * period
+        decay = jnp.exp(-self.damping * angle)
+        discriminant = 1.0 - self.damping * self.damping
+        turn = angle * jnp.sqrt(jnp.abs(discriminant))
+        # a damping above 1 makes two real poles, exp(-d + t) and exp(-d - t), of which neither overflows
+        sum_of_real = jnp.exp(turn - self.damping * angle) + jnp.exp(-turn - self.damping * angle)
+        sum_of_poles = jnp.where(discriminant > 0.0, 2.0 * decay * jnp.cos(turn), sum_of_real)
         product = decay * decay
-        return Correction(1.0 - product, (1.0 - poles + product) / period, jnp.zeros_like(product))
+        return Correction(1.0 - product, (1.0 - sum_of_poles + product) / period, jnp.zeros_like(product))
 
 
 @OBSERVERS.add
 class ExtendedState(AbstractLinearObserver):
-    """Linear extended-state observer: the disturbance is a third state, all three poles are at one place.
+    """Linear extended-state observer: the disturbance is a third state, and the three poles are equal.
 
-    Reference: Z. Gao, Proc. American Control Conf. (2003); R. Miklosovic, A. Radke, Z. Gao, Proc. American Control Conf.
-    (2006) for the discrete form whose estimate includes the measurement: with beta = exp(-bandwidth h) the shares are
-    1 - beta^3, 3/2 (1 - beta)^2 (1 + beta) / h and (1 - beta)^3 / h^2.
+    With beta = exp(-bandwidth h) the shares of the innovation are 1 - beta^3, 3/2 (1 - beta)^2 (1 + beta) / h and
+    (1 - beta)^3 / h^2; the estimate includes the measurement.
+    References: Z. Gao, Proc. American Control Conf. (2003); for the discrete form, R. Miklosovic, A. Radke, Z. Gao, Proc.
+    American Control Conf. (2006).
     """
 
     name: ClassVar[str] = "extended_state"
@@ -104,18 +108,18 @@ class ExtendedState(AbstractLinearObserver):
         return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period)}
 
     def correction(self, acceleration, period):
-        left = -jnp.expm1(-self.bandwidth * period)
-        beta = 1.0 - left
-        rate = left / period
-        return Correction(left * (1.0 + beta + beta * beta), 1.5 * rate * left * (1.0 + beta), left * rate * rate)
+        share = -jnp.expm1(-self.bandwidth * period)  # 1 - beta
+        beta = 1.0 - share
+        rate = share / period
+        return Correction(share * (1.0 + beta + beta * beta), 1.5 * rate * share * (1.0 + beta), share * rate * rate)
 
 
 @OBSERVERS.add
 class Kalman(AbstractLinearObserver):
     """Steady-state Kalman filter of position, velocity and a disturbance that is a random walk.
 
-    Its shares are those of the Riccati equation of the nominal model with friction, solved by doubling: E. K.-W. Chu et al.,
-    Int. J. Control 77 (2004). Only the ratios of the three noises matter.
+    The shares of the innovation follow from the Riccati equation of the nominal model with friction; only the ratios of the
+    three noises matter. It is solved by doubling: E. K.-W. Chu et al., Int. J. Control 77 (2004).
     """
 
     name: ClassVar[str] = "kalman"
@@ -129,8 +133,8 @@ class Kalman(AbstractLinearObserver):
 
     @classmethod
     def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        # only ratios matter: an ideal encoder may have any noise. Without the other noise, a bandwidth w needs a density of
-        # position_noise sqrt(h) w^3, or w^2
+        # since only ratios matter, the noise of an ideal encoder is arbitrary. A bandwidth w needs a disturbance noise of
+        # position_noise sqrt(h) w^3, or an acceleration noise of position_noise sqrt(h) w^2
         noise = max(conditions.noise, 1e-9)
         size, slow, fast = noise * conditions.period**0.5, _SLOWEST / conditions.period, _FASTEST / conditions.period
         return {
@@ -143,53 +147,60 @@ class Kalman(AbstractLinearObserver):
         zero = jnp.zeros_like(jnp.asarray(period + self.position_noise))
         still = predict_next(zero, zero, acceleration, period)
 
-        def column(velocity: Any, control: Any) -> list[Any]:
-            # states are position, velocity times h, disturbance times h^2, over the position's noise: numbers near one
-            moved = predict_next(zero, velocity / period, acceleration, period, held=control / (period * period))
-            return [moved[0] - still[0], (moved[1] - still[1]) * period, control]
+        def transition_column(velocity: Any, disturbance: Any) -> list[Any]:
+            # states are position, velocity times h, disturbance times h^2, over the position's noise: numbers near 1
+            acting = disturbance / (period * period)
+            new_position, new_velocity = predict_next(zero, velocity / period, acceleration, period, disturbance=acting)
+            return [new_position - still[0], (new_velocity - still[1]) * period, disturbance]
 
-        one = zero + 1.0
-        turned = [[one, zero, zero], column(one, zero), column(zero, one)]
+        unit = zero + 1.0
+        transposed = [[unit, zero, zero], transition_column(unit, zero), transition_column(zero, unit)]
         noise = self.position_noise
         slow = (self.disturbance_noise / noise) ** 2 * period**5
         fast = (self.acceleration_noise / noise) ** 2 * period**3
-        # white noise integrated over a period, once and twice more
+        # covariance of white noise that is integrated over a period, once, twice and three times
         q = [
             [slow / 20.0 + fast / 3.0, slow / 8.0 + fast / 2.0, slow / 6.0],
             [slow / 8.0 + fast / 2.0, slow / 3.0 + fast, slow / 2.0],
             [slow / 6.0, slow / 2.0, slow],
         ]
-        covariance = _solve_riccati(turned, q)
-        total = covariance[0][0] + 1.0
-        return Correction(
-            covariance[0][0] / total, covariance[1][0] / (total * period), covariance[2][0] / (total * period * period)
-        )
+        p = _solve_riccati(transposed, q)
+        total = p[0][0] + 1.0
+        return Correction(p[0][0] / total, p[1][0] / (total * period), p[2][0] / (total * period * period))
 
 
 Matrix = list[list[Any]]
-"""Three rows of three numbers: loops compiled for lanes know no arrays."""
+"""Three rows of three numbers, since compiled loops over lanes have no arrays."""
 
 _DOUBLINGS = 32
-"""2^32 samples: any filter that is of use is stationary by then."""
+"""Doublings, for 2^32 samples: every useful filter is stationary by then."""
 
 
-def _solve_riccati(turned: Matrix, q: Matrix) -> Matrix:
-    """Covariance p of the predicted state, of x' = a x + w with covariance q of w, whose first number is measured with unit
-    noise: the solution of p = a p (1 + g p)^-1 a' + q, by doubling. `turned` is a'."""
+def _solve_riccati(transposed: Matrix, q: Matrix) -> Matrix:
+    """Solve the Riccati equation p = a p (1 + g p)^-1 a' + q by doubling, with g = diag(1, 0, 0).
+
+    p is the covariance of the predicted state of x' = a x + w, where w has the covariance q, and the first component of x is
+    measured with unit noise.
+
+    Args:
+        transposed: the transpose a' of the transition matrix.
+        q: covariance of the process noise over a period.
+    """
     zero = 0.0 * q[0][0]
     g = [[zero + 1.0, zero, zero], [zero, zero, zero], [zero, zero, zero]]
 
-    def doubled(_: Any, carry: tuple[Matrix, Matrix, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+    def double(_: Any, carry: tuple[Matrix, Matrix, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+        # b is the transposed transition over 2^k samples
         b, g, p = carry
-        shrunk = _invert(_add(_identity(zero), _multiply(g, p)))
-        back, forward = _transpose(b), _multiply(b, shrunk)
+        inverse = _invert(_add(_identity(zero), _multiply(g, p)))
+        b_transposed, b_inverse = _transpose(b), _multiply(b, inverse)
         return (
-            _multiply(forward, b),
-            _symmetrise(_add(g, _multiply(_multiply(forward, g), back))),
-            _symmetrise(_add(p, _multiply(_multiply(_multiply(back, p), shrunk), b))),
+            _multiply(b_inverse, b),
+            _symmetrise(_add(g, _multiply(_multiply(b_inverse, g), b_transposed))),
+            _symmetrise(_add(p, _multiply(_multiply(_multiply(b_transposed, p), inverse), b))),
         )
 
-    return jax.lax.fori_loop(0, _DOUBLINGS, doubled, (turned, g, q))[2]
+    return jax.lax.fori_loop(0, _DOUBLINGS, double, (transposed, g, q))[2]
 
 
 def _identity(zero: Any) -> Matrix:
@@ -209,12 +220,12 @@ def _transpose(a: Matrix) -> Matrix:
 
 
 def _symmetrise(a: Matrix) -> Matrix:
-    """Rounding would make it lopsided, more with each doubling."""
+    """Make a matrix symmetric again; rounding would distort it more with each doubling."""
     return [[0.5 * (a[i][j] + a[j][i]) for j in range(3)] for i in range(3)]
 
 
 def _invert(a: Matrix) -> Matrix:
-    """By cofactors."""
+    """Invert a matrix by its cofactors."""
 
     def cofactor(i: int, j: int) -> Any:
         rows, columns = ([(k + 1) % 3, (k + 2) % 3] for k in (i, j))
@@ -229,8 +240,9 @@ def _invert(a: Matrix) -> Matrix:
 class DirtyDerivative(AbstractObserver):
     """Filtered difference, as in most drives: velocity s / (T s + 1) of the measured position, without a model.
 
-    The missing acceleration is the filtered difference of that velocity, less the nominal acceleration behind the same
-    filters (a disturbance observer: K. Ohnishi et al., IEEE/ASME Trans. Mechatronics 1 (1996)). Backward Euler.
+    The missing acceleration is the filtered difference of this velocity, less the nominal acceleration behind the same
+    filters: a disturbance observer, K. Ohnishi et al., IEEE/ASME Trans. Mechatronics 1 (1996). The filters are discretised
+    by backward Euler.
     """
 
     name: ClassVar[str] = "dirty_derivative"
@@ -242,18 +254,19 @@ class DirtyDerivative(AbstractObserver):
 
     def start(self, position, velocity, acceleration, period):
         zero = jnp.zeros_like(jnp.asarray(position + velocity))
-        # as if it had moved so before
+        # as if the side had moved with this velocity before
         return ObserverState(position, velocity, (position - period * velocity, velocity + zero, zero, zero, zero, zero))
 
     def step(self, state, measured, acceleration, period):
-        before, velocity_before, earlier, last, given, disturbance = state.extra_states
+        old_position, old_velocity, older_input, old_input, filtered_input, disturbance = state.extra_states
         share = period / (self.time_constant + period)
-        velocity = velocity_before + share * ((measured - before) / period - velocity_before)
-        # a difference of two differences spans two periods: the input is the mean of theirs, behind the velocity's low-pass
-        given = given + share * (0.5 * (earlier + last) - given)
-        still = acceleration(jnp.zeros_like(velocity))
-        friction = acceleration(0.5 * (velocity + velocity_before)) - still
-        disturbance = disturbance + share * ((velocity - velocity_before) / period - given - friction - disturbance)
-        new = predict_next(measured, velocity, acceleration, period, held=disturbance)
-        further = measured, velocity, last, still, given, disturbance
-        return ObserverState(*new, further), Estimate(measured, velocity, disturbance)
+        velocity = old_velocity + share * ((measured - old_position) / period - old_velocity)
+        # the second difference spans two periods: the input's acceleration is the mean over both, behind the low-pass
+        filtered_input = filtered_input + share * (0.5 * (older_input + old_input) - filtered_input)
+        present_input = acceleration(jnp.zeros_like(velocity))
+        friction = acceleration(0.5 * (velocity + old_velocity)) - present_input
+        difference = (velocity - old_velocity) / period
+        disturbance = disturbance + share * (difference - filtered_input - friction - disturbance)
+        new = predict_next(measured, velocity, acceleration, period, disturbance=disturbance)
+        extra_states = measured, velocity, old_input, present_input, filtered_input, disturbance
+        return ObserverState(*new, extra_states), Estimate(measured, velocity, disturbance)

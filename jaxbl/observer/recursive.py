@@ -1,12 +1,13 @@
-"""Recursive least squares (22)-(28) on the equivalent control, both sides at once.
+"""Recursive least squares (22)-(28) on the equivalent control, for both sides at once.
 
-The paper integrates the estimate and its covariance, (27)-(28). Their exact discrete solution is (23) with sums for the
-integrals, and that is what is kept here: the information matrix sum(phi phi^T), and sum(phi z_2). Sums do not drift as
-an integrated covariance does. They have two levels: samples are added to a recent part, and :meth:`Identifier.settle`
-moves that, every few hundred samples, into a total which carries its rounding error along (Kahan). 10^6 samples in
-float32 thus cost no digits, at half the price of compensating every sample. Regressors are taken in torque, phi = r(z),
-and the right-hand side is the torque that the equivalent control stands for, J z_2 / gain: the corrected (20), in which
-inertias and gear ratio are divided out. Both sides thus share one information matrix.
+The paper integrates the estimate and its covariance, (27)-(28). Their exact discrete solution is (23) with sums in place of
+integrals, theta = (sum phi phi^T)^-1 sum phi tau. These sums, the information matrix and the moments, are stored here: they
+do not drift as an integrated covariance does. Each sum has two levels. Samples are added to its recent part; every few
+hundred samples :meth:`Identifier.settle` moves that part into a total, with the rounding error carried along (Kahan). 10^6
+samples in float32 thus lose no digits, at half the cost of compensating every sample.
+
+Regressors are those of the law, phi = r(z), and tau is the torque that the equivalent control stands for, J z_2 / gain.
+This is (20) with inertias and gear ratio divided out, so that both sides share one information matrix.
 """
 
 from typing import Literal, NamedTuple
@@ -25,29 +26,37 @@ Number = Float[Array, ""]
 
 
 class RunningSum(NamedTuple):
-    """A sum in two levels: recent samples, and the total before them with the rounding error it has made."""
+    """A sum in two levels: recent samples, and the total before them with its rounding error."""
 
     recent: Number
     total: Number
     error: Number
 
-    def add(self, forgetting: Scalar, value: Number) -> "RunningSum":
-        return self._replace(recent=forgetting * self.recent + value)
+    def add(self, forgetting: Scalar, term: Number) -> "RunningSum":
+        """Add the term of a sample; older terms are multiplied by `forgetting`."""
+        return self._replace(recent=forgetting * self.recent + term)
 
     def settle(self, weight: Number) -> "RunningSum":
-        """Move the recent part into the total, which has lost in `weight` since the last time."""
+        """Move the recent part into the total, of which forgetting has left the part `weight` since the last time."""
         corrected = self.recent - weight * self.error
         decayed = weight * self.total
         total = decayed + corrected
         return RunningSum(jnp.zeros_like(self.recent), total, (total - decayed) - corrected)
 
     def value(self, weight: Number) -> Number:
+        """The whole sum; `weight` as in :meth:`settle`."""
         return weight * self.total + self.recent
 
 
 class IdentifierState(NamedTuple):
-    """Filtered regressors (n), upper triangle of the information matrix (n (n + 1) / 2), right-hand sides (n a side), and
-    the weight that forgetting leaves to what is settled."""
+    """State of the identifier, for n unknowns.
+
+    Attributes:
+        regressors: filtered regressors, n numbers.
+        information: upper triangle of the information matrix, n (n + 1) / 2 sums.
+        moments: n sums for each side.
+        weight: the part of settled totals that forgetting has left.
+    """
 
     regressors: tuple[Number, ...]
     information: tuple[RunningSum, ...]
@@ -56,7 +65,7 @@ class IdentifierState(NamedTuple):
 
 
 class Identifier(eqx.Module):
-    """Least squares of the torque on the regressors of a transmission law, with n = 1 or 2 unknowns."""
+    """Least squares of the torque on the regressors of a transmission law, tau = sum_i phi_i theta_i, i = 1 or 1, 2."""
 
     start: Scalar = parameter("s", "time from which samples count", default=0.0, minimum=0.0)
     forgetting: Scalar = parameter("", "weight of a sample relative to the next", default=1.0, above=0.0, maximum=1.0)
@@ -65,7 +74,7 @@ class Identifier(eqx.Module):
     )
 
     def init(self, law: AbstractTransmission, sides: tuple[str, ...], zero: Number) -> IdentifierState:
-        """Empty sums; `zero` gives the dtype."""
+        """Return the state without samples; `zero` has the dtype."""
         n = len(law.regressors(zero))
         empty = RunningSum(zero, zero, zero)
         return IdentifierState(
@@ -85,39 +94,49 @@ class Identifier(eqx.Module):
         time: Number,
         step: Scalar,
     ) -> IdentifierState:
-        """Take in one sample: measured twist z (rad), and the torque (N m) by each side's equivalent control."""
+        """Add a sample.
+
+        Args:
+            state: before the sample.
+            law: transmission law with nominal numbers.
+            low_pass: the filter of the equivalent control, for the regressors.
+            z: measured twist, rad.
+            torque: by each side's equivalent control, N m.
+            time: s.
+            step: sampling period, s.
+        """
         raw = law.regressors(z)
         filtered = tuple(low_pass.filter(old, new, step) for old, new in zip(state.regressors, raw, strict=True))
-        # the equivalent control at a sample balances what acted up to it: it is one sample late, and so must phi be
+        # the equivalent control at a sample balances the torque before it: it is one sample late, and so must phi be
         phi = state.regressors if self.regressor_filter == "matched" else raw
-        # half a sample period of slack: time is a rounded multiple of it
+        # half a period of slack, as time is a rounded multiple of the period
         counts = (time > self.start - 0.5 * step).astype(z.dtype)
         weighted = tuple(counts * p for p in phi)
-        # before the start nothing must be forgotten either: the sums are still zero
+        # forgetting needs no start time: before it the sums are zero
         n = len(raw)
         pairs = [(i, j) for i in range(n) for j in range(i, n)]
         information = tuple(
             total.add(self.forgetting, weighted[i] * phi[j]) for total, (i, j) in zip(state.information, pairs, strict=True)
         )
-        right = {
-            side: tuple(total.add(self.forgetting, w * torque[side]) for total, w in zip(totals, weighted, strict=True))
+        moments = {
+            side: tuple(total.add(self.forgetting, p * torque[side]) for total, p in zip(totals, weighted, strict=True))
             for side, totals in state.moments.items()
         }
-        return IdentifierState(filtered, information, right, self.forgetting * state.weight)
+        return IdentifierState(filtered, information, moments, self.forgetting * state.weight)
 
     def settle(self, state: IdentifierState) -> IdentifierState:
-        """The same sums, ready for further samples without loss; :func:`jaxbl.simulate.scan` calls it block by block."""
-        settled = jax.tree.map(
+        """Settle all sums, so that further samples lose no digits; :func:`jaxbl.simulate.scan` does so block by block."""
+        information, moments = jax.tree.map(
             lambda total: total.settle(state.weight),
             (state.information, state.moments),
             is_leaf=lambda node: isinstance(node, RunningSum),
         )
-        return IdentifierState(state.regressors, *settled, weight=jnp.ones_like(state.weight))
+        return IdentifierState(state.regressors, information, moments, weight=jnp.ones_like(state.weight))
 
     def estimate(self, state: IdentifierState, law: AbstractTransmission) -> dict[str, dict[str, Number]]:
-        """Parameters of the law by each side: {"motor": {"stiffness": ..., "dead_zone": ..., "half_gap": ...}, ...}.
+        """Parameters of the law, as each side identifies them, e.g. `{"motor": {"stiffness": ..., "half_gap": ...}, ...}`.
 
-        NaN where the excitation so far determines nothing.
+        They are NaN if the excitation does not determine them yet.
         """
         return {
             side: law.from_theta(tuple(jnp.where(determined, x, jnp.nan) for x in theta))
@@ -125,14 +144,14 @@ class Identifier(eqx.Module):
         }
 
     def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
-        """Of each side, whether the excitation so far determines the coefficients theta, and theta: finite in any case."""
+        """By side: True if the excitation determines the coefficients theta, and theta, which is finite in any case."""
         information = _sum_values(state, state.information)
         return {
             side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.moments.items()
         }
 
     def excitation(self, state: IdentifierState) -> Number:
-        """Smallest eigenvalue of the information matrix scaled to unit diagonal: 0 undetermined, 1 orthogonal."""
+        """Smallest eigenvalue of the information matrix, scaled to unit diagonal: 0 is undetermined, 1 is orthogonal."""
         information = _sum_values(state, state.information)
         if len(information) == 1:
             return (information[0] > 0.0).astype(information[0].dtype)
@@ -144,21 +163,23 @@ def _sum_values(state: IdentifierState, sums: tuple[RunningSum, ...]) -> tuple[N
 
 
 def _regressor_correlation(information: tuple[Number, ...]) -> Number:
-    first, both, second = information
+    first, product, second = information
     size = jnp.sqrt(first) * jnp.sqrt(second)
-    return jnp.where(size > 0.0, both / jnp.where(size > 0.0, size, 1.0), 1.0)
+    return jnp.where(size > 0.0, product / jnp.where(size > 0.0, size, 1.0), 1.0)
 
 
-def _solve_normal_equations(information: tuple[Number, ...], right: tuple[Number, ...]) -> tuple[Number, tuple[Number, ...]]:
-    """Whether the scaled normal equations for n = 1 or 2 have a solution, and it; elementwise over lanes."""
-    if len(right) == 1:
+def _solve_normal_equations(
+    information: tuple[Number, ...], moments: tuple[Number, ...]
+) -> tuple[Number, tuple[Number, ...]]:
+    """True if the scaled normal equations for n = 1 or 2 have one solution, and the solution; elementwise over lanes."""
+    if len(moments) == 1:
         total = information[0]
         determined = total > 0.0
-        return determined, (right[0] / jnp.where(determined, total, 1.0),)
+        return determined, (moments[0] / jnp.where(determined, total, 1.0),)
     first, second = jnp.sqrt(information[0]), jnp.sqrt(information[2])
     correlation = _regressor_correlation(information)
     determinant = 1.0 - correlation * correlation
     determined = determinant > 4.0 * jnp.finfo(determinant.dtype).eps
     first, second, determinant = (jnp.where(determined, x, 1.0) for x in (first, second, determinant))
-    a, b = right[0] / first, right[1] / second
+    a, b = moments[0] / first, moments[1] / second
     return determined, ((a - correlation * b) / (determinant * first), (b - correlation * a) / (determinant * second))

@@ -30,7 +30,7 @@ def observed(observer, measured, acceleration=nominal, period=H):
 def model(period=H):
     """The prediction of position, velocity and disturbance as a matrix, and what the nominal input adds."""
     still = np.array([*map(float, predict_next(0.0, 0.0, nominal, period)), 0.0])
-    columns = [np.array([*map(float, predict_next(x, v, nominal, period, held=d)), d]) for x, v, d in np.eye(3)]
+    columns = [np.array([*map(float, predict_next(x, v, nominal, period, disturbance=d)), d]) for x, v, d in np.eye(3)]
     return np.stack(columns, axis=1) - np.outer(still, [1.0, 1.0, 1.0]), still
 
 
@@ -113,7 +113,9 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
         own = correction(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
         still = np.array([*predict_next(0.0, 0.0, lambda v, f=friction: -f * v, h), 0.0])
         assert not still.any()
-        a = np.stack([[*predict_next(x, v, lambda v, f=friction: -f * v, h, held=d), d] for x, v, d in np.eye(3)], axis=1)
+        a = np.stack(
+            [[*predict_next(x, v, lambda v, f=friction: -f * v, h, disturbance=d), d] for x, v, d in np.eye(3)], axis=1
+        )
         q = slow**2 * np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2], [h**3 / 6, h**2 / 2, h]])
         q += fast**2 * np.array([[h**3 / 3, h**2 / 2, 0.0], [h**2 / 2, h, 0.0], [0.0, 0.0, 0.0]])
         scale = np.diag([1.0, h, h * h]) / noise
