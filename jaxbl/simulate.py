@@ -172,9 +172,9 @@ class Signals(NamedTuple):
 def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
     """Return the state at t = 0; with `measured` positions (rad), the state of a replay that begins there, at standstill."""
     zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
-    rest = dict.fromkeys(experiment.sides, zero)
+    zeros = dict.fromkeys(experiment.sides, zero)
     plant = experiment.plant.init(experiment.initial) if measured is None else None
-    position, velocity = measured or {}, rest
+    position, velocity = measured or {}, zeros
     if plant is not None:
         velocity = plant.velocity
         position = {side: experiment.plant.read(side, plant.position[side], velocity[side]) for side in experiment.sides}
@@ -187,7 +187,7 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
-    return State(plant, observer_states, rest, identifier)
+    return State(plant, observer_states, zeros, identifier)
 
 
 def initial_observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
@@ -376,7 +376,7 @@ def scan(
     seed: Int[Array, ""],
     reducers: tuple[Reducer, ...] = (),
     record: Callable[[State, Signals], Any] | None = None,
-    every: int = 1,
+    stride: int = 1,
 ) -> tuple[dict[str, Array], Any]:
     """Simulate one experiment.
 
@@ -385,7 +385,7 @@ def scan(
         seed: seed of the encoder noise.
         reducers: the metrics to compute.
         record: `record(state, signals)` returns what the trace has of a sample; None: no trace.
-        every: the trace has every `every`-th sample.
+        stride: the trace has one sample of each `stride` samples.
 
     Returns:
         The metrics by name, and the trace with a leading time axis, shape (samples, ...); None without `record`.
@@ -397,7 +397,7 @@ def scan(
     def draw_noise(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
         return (unit_noise(seed, indices, experiment.sides),)
 
-    return _scan(experiment, initial_carry(experiment, reducers), experiment.run.steps, draw_noise, reducers, record, every)
+    return _scan(experiment, initial_carry(experiment, reducers), experiment.run.steps, draw_noise, reducers, record, stride)
 
 
 def replay(
@@ -406,7 +406,7 @@ def replay(
     measured: dict[str, Float[Array, " samples"]],
     reducers: tuple[Reducer, ...] = (),
     record: Callable[[State, Signals], Any] | None = None,
-    every: int = 1,
+    stride: int = 1,
     state: State | None = None,
     added_accelerations: dict[str, Float[Array, " samples"]] | None = None,
 ) -> tuple[dict[str, Array], Any]:
@@ -416,7 +416,7 @@ def replay(
         experiment: with array leaves; its sample period is that of the record.
         torque: input, N m, shape (samples,).
         measured: position of each side, rad, shape (samples,).
-        reducers, record, every: as in :func:`scan`.
+        reducers, record, stride: as in :func:`scan`.
         state: before the first sample; left out, standstill at the first positions.
         added_accelerations: by side, rad/s^2, shape (samples,): part of the model (:class:`Sample`), so that the equivalent
             control has only what is missing beyond them.
@@ -433,7 +433,7 @@ def replay(
         return None, *jax.tree.map(lambda column: column[indices], columns)
 
     carry = initial_carry(experiment, reducers, state)
-    return _scan(experiment, carry, len(torque), take_samples, reducers, record, every)
+    return _scan(experiment, carry, len(torque), take_samples, reducers, record, stride)
 
 
 def _scan(
@@ -443,7 +443,7 @@ def _scan(
     sample_inputs: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
     reducers: tuple[Reducer, ...],
     record: Callable[[State, Signals], Any] | None,
-    every: int,
+    stride: int,
 ) -> tuple[dict[str, Array], Any]:
     """Loop over time, block by block; `sample_inputs(indices)` returns the inputs of :func:`advance_sample` for a block."""
 
@@ -454,9 +454,9 @@ def _scan(
     def run_block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
         carry, trace = jax.lax.scan(run_sample, carry, (indices, sample_inputs(indices)))
-        return end_block(experiment, carry), jax.tree.map(lambda x: x[::every], trace)
+        return end_block(experiment, carry), jax.tree.map(lambda x: x[::stride], trace)
 
-    length = block_length(steps) if record is None or every == 1 else every
+    length = block_length(steps) if record is None or stride == 1 else stride
     blocks, remaining = divmod(steps, length)
     starts = jnp.arange(blocks, dtype=jnp.int32)
     carry, trace = jax.lax.scan(lambda carry, i: run_block(carry, i * length, length), carry, starts)

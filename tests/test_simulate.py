@@ -30,7 +30,7 @@ def figures(experiment, seed=SEED):
 
 @jit
 def trace(experiment, seed=SEED, every=1):
-    return scan(experiment, seed, record=everything, every=every)[1]
+    return scan(experiment, seed, record=everything, stride=every)[1]
 
 
 def identification_errors(result):
@@ -318,7 +318,7 @@ def test_a_replayed_record_gives_what_the_observers_gave(every):
     experiment = paper(noise=1e-4, start=0.1, steps=700)
     seen = trace(experiment)
     measured = {side: seen.side(side).measured for side in experiment.sides}
-    run = jit(lambda *given: replay(*given, record=everything, every=every, state=initial_state(experiment)))
+    run = jit(lambda *given: replay(*given, record=everything, stride=every, state=initial_state(experiment)))
     _, again = run(experiment, seen.input, measured)
     for side in experiment.sides:
         mine, theirs = again.side(side), seen.side(side)

@@ -65,7 +65,7 @@ class IdentifierState(NamedTuple):
 
 
 class Identifier(eqx.Module):
-    """Least squares of the torque on the regressors of a transmission law, tau = sum_i phi_i theta_i, i = 1 or 1, 2."""
+    """Least squares of the torque on the regressors of a transmission law, tau = sum phi_i theta_i, with 1 or 2 unknowns."""
 
     start: Scalar = parameter("s", "time from which samples count", default=0.0, minimum=0.0)
     forgetting: Scalar = parameter("", "weight of a sample relative to the next", default=1.0, above=0.0, maximum=1.0)
@@ -144,7 +144,7 @@ class Identifier(eqx.Module):
         }
 
     def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
-        """By side: True if the excitation determines the coefficients theta, and theta, which is finite in any case."""
+        """Return for each side if the excitation determines the coefficients theta, and theta, which is always finite."""
         information = _sum_values(state, state.information)
         return {
             side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.moments.items()

@@ -163,7 +163,7 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
         def last(state, signals):
             return experiment.identifier.estimate(state.identifier, experiment.transmission)
 
-        return replay(experiment, jnp.asarray(torque), noisy(states, noise, key), record=last, every=len(torque) - 1)[1]
+        return replay(experiment, jnp.asarray(torque), noisy(states, noise, key), record=last, stride=len(torque) - 1)[1]
 
     keys = jax.random.split(jax.random.key(11), 40)
     windows = realisations(torque, states, noise, keys, 500, period)
