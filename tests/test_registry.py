@@ -37,13 +37,13 @@ class Base(abc.ABC):
 
 
 def registry():
-    known = Registry("jaxbl.tests", lambda name, found: check_subclass(name, found, Base))
+    table = Registry("jaxbl.tests", lambda name, cls: check_subclass(name, cls, Base))
 
-    @known.add
+    @table.add
     class BuiltIn(Base):
         name = "built_in"
 
-    return known, BuiltIn
+    return table, BuiltIn
 
 
 @pytest.fixture
@@ -56,16 +56,16 @@ def install(tmp_path, monkeypatch):
 
 def test_built_in_classes_come_first_and_entry_points_after_them(install, caplog):
     install(good="Good")
-    known, built_in = registry()
-    assert list(known) == ["built_in", "good"]
-    assert known["built_in"] is built_in
-    assert known["good"].__module__ == "some_addon"
-    assert len(known) == 2 and "nothing" not in known
+    table, built_in = registry()
+    assert list(table) == ["built_in", "good"]
+    assert table["built_in"] is built_in
+    assert table["good"].__module__ == "some_addon"
+    assert len(table) == 2 and "nothing" not in table
     assert not caplog.records
 
 
 @pytest.mark.parametrize(
-    ("name", "member", "said"),
+    ("name", "member", "fault"),
     [
         ("gone", "Missing", "AttributeError: module 'some_addon' has no attribute 'Missing'"),
         ("gone", "number", "TypeError: should be a class derived from Base"),
@@ -75,25 +75,25 @@ def test_built_in_classes_come_first_and_entry_points_after_them(install, caplog
         ("<b>", "Markup", "ValueError: its name should be a lower-case word of letters, digits and _"),
     ],
 )
-def test_a_wrong_entry_is_left_out_with_one_line(install, caplog, name, member, said):
+def test_a_wrong_entry_is_left_out_with_one_line(install, caplog, name, member, fault):
     install(**{name: member})
-    known, built_in = registry()
-    assert dict(known) == {"built_in": built_in}
-    assert caplog.messages == [f"warning: jaxbl.tests: '{name}' (some_addon:{member}) is left out: {said}"]
-    assert list(known) == ["built_in"] and len(caplog.messages) == 1  # said once
+    table, built_in = registry()
+    assert dict(table) == {"built_in": built_in}
+    assert caplog.messages == [f"warning: jaxbl.tests: '{name}' (some_addon:{member}) is left out: {fault}"]
+    assert list(table) == ["built_in"] and len(caplog.messages) == 1  # said once
 
 
 @pytest.mark.parametrize("statement", ["import nothing_of_this_name", "syntax error", "raise SystemExit(3)"])
 def test_an_entry_that_cannot_be_imported_is_left_out(tmp_path, monkeypatch, caplog, statement):
     monkeypatch.syspath_prepend(tmp_path)
     install_package(tmp_path, "broken_addon", statement, {"jaxbl.tests": {"one": "One"}})
-    known, _ = registry()
-    assert "one" not in known
+    table, _ = registry()
+    assert "one" not in table
     assert len(caplog.messages) == 1 and "\n" not in caplog.messages[0]
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "fault"),
     [
         (None, "unit should be text"),
         ("N$m", "unit should be one line without control characters and without $, not 'N$m'"),
@@ -101,8 +101,8 @@ def test_an_entry_that_cannot_be_imported_is_left_out(tmp_path, monkeypatch, cap
         ("\u202e", "unit should be one line without control characters and without $, not '\\u202e'"),
     ],
 )
-def test_texts_that_figures_cannot_show_are_refused(text, said):
+def test_texts_that_figures_cannot_show_are_refused(text, fault):
     with pytest.raises((TypeError, ValueError)) as error:
         check_text("unit", text)
-    assert str(error.value) == said
+    assert str(error.value) == fault
     check_text("unit", "√rad/s <b> {0} %s")

@@ -29,8 +29,8 @@ def figures(experiment, seed=SEED):
 
 
 @jit
-def trace(experiment, seed=SEED, every=1):
-    return scan(experiment, seed, record=everything, stride=every)[1]
+def trace(experiment, seed=SEED, stride=1):
+    return scan(experiment, seed, record=everything, stride=stride)[1]
 
 
 def identification_errors(result):
@@ -112,14 +112,14 @@ def independent(experiment, noise, steps):
 
     z = measured[:, 0] - n0 * measured[:, 1]
     phi = low_pass(np.stack([z, -4.0 * np.tanh(10.0 * z)], 1))
-    found = {}
+    signals = {}
     for side, scale in (("motor", -je), ("load", js / n0)):
         estimate = np.array(estimates[side])
         torque = scale * low_pass(estimate[:, 2])
         # the equivalent control of a sample belongs to the twist of the one before
         theta, *_ = np.linalg.lstsq(phi[start - 1 : -1], torque[start:])
-        found[side] = estimate, torque, (theta[0], theta[1] / theta[0])
-    return truth, measured, law(truth[:, 0] - n0 * truth[:, 2]), found
+        signals[side] = estimate, torque, (theta[0], theta[1] / theta[0])
+    return truth, measured, law(truth[:, 0] - n0 * truth[:, 2]), signals
 
 
 def test_whole_trace_against_an_independent_copy():
@@ -137,7 +137,7 @@ def test_whole_trace_against_an_independent_copy():
     signals = trace(experiment)
     result = figures(experiment)
     noise = unit_noise(SEED, jnp.arange(steps), experiment.sides)
-    truth, measured, torque, found = independent(experiment, np.stack([noise["motor"], noise["load"]], 1), steps)
+    truth, measured, torque, expected = independent(experiment, np.stack([noise["motor"], noise["load"]], 1), steps)
     np.testing.assert_allclose(signals.time, 1e-3 * np.arange(steps), rtol=1e-14)
     np.testing.assert_allclose(signals.input, 0.1 * np.sin(2.0 * np.pi * 0.16 * signals.time), rtol=1e-12)
     # the plant's own second order, at 0.1 ms, is what differs
@@ -145,7 +145,7 @@ def test_whole_trace_against_an_independent_copy():
     np.testing.assert_allclose(signals.twist, measured[:, 0] - 5.0 * measured[:, 1], atol=1e-9)
     for j, side in enumerate(("motor", "load")):
         mine = signals.side(side)
-        estimate, reconstructed, (stiffness, dead_zone) = found[side]
+        estimate, reconstructed, (stiffness, dead_zone) = expected[side]
         position, velocity = truth[:, 2 * j], truth[:, 2 * j + 1]
         np.testing.assert_allclose(mine.measured, measured[:, j], atol=1e-9)
         np.testing.assert_allclose(mine.true.position, position, atol=1e-9)
@@ -164,17 +164,17 @@ def test_whole_trace_against_an_independent_copy():
 
 def test_unit_noise_is_a_function_of_seed_and_index():
     sides = ("motor", "load")
-    whole = unit_noise(SEED, jnp.arange(20_000), sides)
+    noise = unit_noise(SEED, jnp.arange(20_000), sides)
     part = unit_noise(SEED, jnp.arange(777, 1000), sides)
     for side in sides:
-        np.testing.assert_array_equal(whole[side][777:1000], part[side])
+        np.testing.assert_array_equal(noise[side][777:1000], part[side])
         # standard normal: 5 sigma of mean, variance and kurtosis
-        np.testing.assert_allclose(np.mean(whole[side]), 0.0, atol=5.0 / np.sqrt(2e4))
-        np.testing.assert_allclose(np.var(whole[side]), 1.0, atol=5.0 * np.sqrt(2.0 / 2e4))
-        np.testing.assert_allclose(np.mean(whole[side] ** 4), 3.0, atol=5.0 * np.sqrt(96.0 / 2e4))
-        assert abs(np.corrcoef(whole[side][1:], whole[side][:-1])[0, 1]) < 5.0 / np.sqrt(2e4)
-    assert abs(np.corrcoef(whole["motor"], whole["load"])[0, 1]) < 5.0 / np.sqrt(2e4)
-    assert not np.any(np.asarray(unit_noise(jnp.asarray(4), jnp.arange(100), sides)["motor"]) == whole["motor"][:100])
+        np.testing.assert_allclose(np.mean(noise[side]), 0.0, atol=5.0 / np.sqrt(2e4))
+        np.testing.assert_allclose(np.var(noise[side]), 1.0, atol=5.0 * np.sqrt(2.0 / 2e4))
+        np.testing.assert_allclose(np.mean(noise[side] ** 4), 3.0, atol=5.0 * np.sqrt(96.0 / 2e4))
+        assert abs(np.corrcoef(noise[side][1:], noise[side][:-1])[0, 1]) < 5.0 / np.sqrt(2e4)
+    assert abs(np.corrcoef(noise["motor"], noise["load"])[0, 1]) < 5.0 / np.sqrt(2e4)
+    assert not np.any(np.asarray(unit_noise(jnp.asarray(4), jnp.arange(100), sides)["motor"]) == noise["motor"][:100])
 
 
 def test_noise_is_the_same_in_runs_of_any_length_precision_and_level():
@@ -260,11 +260,11 @@ def test_rigid_drive_observes_what_resists_beyond_the_model(discretisation):
     assert not any(name.startswith("load.") or "stiffness" in name for name in result)
 
 
-@pytest.mark.parametrize("every", [1, 7, 64, 100, 1000])
-def test_record_keeps_every_so_many_samples(every):
+@pytest.mark.parametrize("stride", [1, 7, 64, 100, 1000])
+def test_record_keeps_every_so_many_samples(stride):
     experiment = paper(time_constant=0.01, noise=1e-4, steps=523, substeps=1)
-    whole, kept = trace(experiment), trace(experiment, every=every)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x[::every], rtol=1e-9, atol=1e-12), whole, kept)
+    full, thin = trace(experiment), trace(experiment, stride=stride)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x[::stride], rtol=1e-9, atol=1e-12), full, thin)
 
 
 def test_reducers_see_every_sample_whatever_is_recorded():
@@ -274,8 +274,8 @@ def test_reducers_see_every_sample_whatever_is_recorded():
         lambda experiment, carry, state: {"sum": carry},
     )
     experiment = paper(steps=523, substeps=1)
-    for record, every in ((None, 1), (everything, 1), (everything, 10)):
-        out, _ = jit(lambda e, record=record, every=every: scan(e, SEED, (count,), record, every))(experiment)
+    for record, stride in ((None, 1), (everything, 1), (everything, 10)):
+        out, _ = jit(lambda e, record=record, stride=stride: scan(e, SEED, (count,), record, stride))(experiment)
         assert out == {"sum": 523 * 522 // 2}
 
 
@@ -289,13 +289,13 @@ def test_derivatives_through_the_run(discretisation):
         motor = signals.motor
         return motor.true.position, motor.position_estimate, motor.velocity_estimate, motor.torque_estimate
 
-    one = jnp.asarray(1.0)
-    _, slopes = jit(lambda: jax.jvp(run, (one,), (one,)))()
+    unit = jnp.asarray(1.0)
+    _, slopes = jit(lambda: jax.jvp(run, (unit,), (unit,)))()
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
     compiled = jit(run)
-    change = (compiled(one + 1e-5)[0] - compiled(one - 1e-5)[0]) / 2e-5
+    change = (compiled(unit + 1e-5)[0] - compiled(unit - 1e-5)[0]) / 2e-5
     np.testing.assert_allclose(slopes[0], change, rtol=1e-5, atol=1e-12)
-    gradient = jit(jax.grad(lambda k: run(k)[0][-1] + run(k)[2][-1]))(one)
+    gradient = jit(jax.grad(lambda k: run(k)[0][-1] + run(k)[2][-1]))(unit)
     np.testing.assert_allclose(gradient, slopes[0][-1] + slopes[2][-1], rtol=1e-9)
 
 
@@ -313,38 +313,42 @@ def test_one_compilation_serves_all_values():
     assert traces == 1
 
 
-@pytest.mark.parametrize("every", [1, 7])
-def test_a_replayed_record_gives_what_the_observers_gave(every):
+@pytest.mark.parametrize("stride", [1, 7])
+def test_a_replayed_record_gives_what_the_observers_gave(stride):
     experiment = paper(noise=1e-4, start=0.1, steps=700)
-    seen = trace(experiment)
-    measured = {side: seen.side(side).measured for side in experiment.sides}
-    run = jit(lambda *given: replay(*given, record=everything, stride=every, state=initial_state(experiment)))
-    _, again = run(experiment, seen.input, measured)
+    signals = trace(experiment)
+    measured = {side: signals.side(side).measured for side in experiment.sides}
+    run = jit(lambda *columns: replay(*columns, record=everything, stride=stride, state=initial_state(experiment)))
+    _, again = run(experiment, signals.input, measured)
     for side in experiment.sides:
-        mine, theirs = again.side(side), seen.side(side)
-        np.testing.assert_allclose(mine.velocity_estimate, theirs.velocity_estimate[::every], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(mine.torque_estimate, theirs.torque_estimate[::every], rtol=1e-12, atol=1e-12)
+        mine, theirs = again.side(side), signals.side(side)
+        np.testing.assert_allclose(mine.velocity_estimate, theirs.velocity_estimate[::stride], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(mine.torque_estimate, theirs.torque_estimate[::stride], rtol=1e-12, atol=1e-12)
         assert mine.true is None
-    np.testing.assert_allclose(again.time, seen.time[::every])
+    np.testing.assert_allclose(again.time, signals.time[::stride])
 
 
 def test_what_observers_are_told_is_not_in_their_equivalent_control():
     experiment = paper(noise=0.0, steps=2000)
-    seen = trace(experiment)
-    measured = {side: seen.side(side).measured for side in experiment.sides}
+    signals = trace(experiment)
+    measured = {side: signals.side(side).measured for side in experiment.sides}
     # of the true acceleration, its mean over each sampling period
-    known = {side: seen.side(side).true.perturbation for side in experiment.sides}
-    run = jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), added_accelerations=known))
-    _, told = run(experiment, seen.input, measured)
+    perturbations = {side: signals.side(side).true.perturbation for side in experiment.sides}
+    run = jit(
+        lambda *columns: replay(
+            *columns, record=everything, state=initial_state(experiment), added_accelerations=perturbations
+        )
+    )
+    _, with_perturbations = run(experiment, signals.input, measured)
     for side in experiment.sides:
-        plain = seen.side(side).equivalent_control[500:]
-        assert np.std(told.side(side).equivalent_control[500:]) < 0.02 * np.std(plain)
+        plain = signals.side(side).equivalent_control[500:]
+        assert np.std(with_perturbations.side(side).equivalent_control[500:]) < 0.02 * np.std(plain)
 
 
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
     experiment = paper(steps=300)
-    seen = trace(experiment)
-    states = jit(lambda u: plant_trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
+    signals = trace(experiment)
+    states = jit(lambda u: plant_trajectory(experiment, experiment.plant.init(experiment.initial), u))(signals.input)
     for side in experiment.sides:
-        np.testing.assert_allclose(states.position[side], seen.side(side).true.position, rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(states.velocity[side], seen.side(side).true.velocity, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(states.position[side], signals.side(side).true.position, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(states.velocity[side], signals.side(side).true.velocity, rtol=1e-12, atol=1e-14)

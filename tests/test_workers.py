@@ -81,13 +81,13 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, heeded):
 
 
 def test_processes_end_with_the_one_they_work_for(tmp_path):
-    code = "import sys, pathlib, test_workers as t; list(t.each(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
+    code = "import sys, pathlib, test_workers as t; list(t.map_jobs(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
     paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"PYTHONPATH": paths}) as parent:
-        while not (found := list(tmp_path.iterdir())):
+        while not (files := list(tmp_path.iterdir())):
             time.sleep(0.05)
         parent.kill()
-    child = int(found[0].name)
+    child = int(files[0].name)
     for _ in range(200):
         if not alive(child):
             return
@@ -126,30 +126,28 @@ def home(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("given", [None, "", "relative"])
-def test_compiled_programs_are_kept_in_a_folder_of_the_user_alone(home, monkeypatch, given):
+@pytest.mark.parametrize("caches", [None, "", "relative"])
+def test_compiled_programs_are_kept_in_a_folder_of_the_user_alone(home, monkeypatch, caches):
     """An empty or relative XDG_CACHE_HOME says nothing, least of all the working folder."""
     monkeypatch.chdir(home)
-    if given is not None:
-        monkeypatch.setenv("XDG_CACHE_HOME", given)
-    own = home / ".cache" / "jaxbl"
-    assert _find_cache_folder() == own / sys.implementation.cache_tag
-    assert [folder.stat().st_mode & 0o777 for folder in (own, _find_cache_folder())] == [0o700, 0o700]
+    if caches is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", caches)
+    folder = home / ".cache" / "jaxbl"
+    assert _find_cache_folder() == folder / sys.implementation.cache_tag
+    assert [path.stat().st_mode & 0o777 for path in (folder, _find_cache_folder())] == [0o700, 0o700]
     assert [path.name for path in home.iterdir()] == [".cache"]
 
 
 def test_compiled_programs_of_others_are_not_run(home, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "caches"))
-    own = home / "caches" / "jaxbl"
-    assert _find_cache_folder() == own / sys.implementation.cache_tag
-    own.chmod(0o770)
+    folder = home / "caches" / "jaxbl"
+    assert _find_cache_folder() == folder / sys.implementation.cache_tag
+    folder.chmod(0o770)
     assert [_find_cache_folder(), _find_cache_folder()] == [None, None]
-    said = (
-        f"jaxbl: {own}: can be written to by others; remove it, to have it made anew; compiled programs are not stored there"
-    )
-    assert capsys.readouterr().err == f"{said}\n"
-    own.chmod(0o700)
-    monkeypatch.setattr(os, "geteuid", lambda: own.stat().st_uid + 1)
+    line = f"jaxbl: {folder}: can be written to by others; remove it, to have it made anew; compiled programs are not stored there"
+    assert capsys.readouterr().err == f"{line}\n"
+    folder.chmod(0o700)
+    monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
     assert _find_cache_folder() is None
 
 

@@ -51,22 +51,22 @@ def right_side(t, y, u, law, effects, drive):
 
     def bristle(name, v, z):
         """Torque of LuGre's model and dz/dt, in its own numbers sigma_0, sigma_1, g."""
-        own = effects.get(f"{name}.presliding_friction")
-        if own is None:
+        numbers = effects.get(f"{name}.presliding_friction")
+        if numbers is None:
             return 0.0, 0.0
-        stiffness = own["torque"] / own["length"]
-        fall = np.exp(-((v / own["stribeck_velocity"]) ** 2))
-        g = own["torque"] + (own["breakaway_ratio"] * own["torque"] - own["torque"]) * fall
+        stiffness = numbers["torque"] / numbers["length"]
+        fall = np.exp(-((v / numbers["stribeck_velocity"]) ** 2))
+        g = numbers["torque"] + (numbers["breakaway_ratio"] * numbers["torque"] - numbers["torque"]) * fall
         z_dot = v - stiffness * abs(v) * z / g
-        return stiffness * z + own["damping"] * z_dot, z_dot
+        return stiffness * z + numbers["damping"] * z_dot, z_dot
 
-    def tabulated(name, theta, v):
+    def interpolate_tables(name, theta, v):
         table = effects.get(f"{name}.tabulated")
         if table is None:
             return 0.0
         theta = np.mod(theta, 2.0 * np.pi) if table.get("turn") else theta
-        of_position = np.interp(theta, table["positions"], table["position_torques"]) if "positions" in table else 0.0
-        return of_position + (np.interp(v, table["speeds"], table["speed_torques"]) if "speeds" in table else 0.0)
+        position_torque = np.interp(theta, table["positions"], table["position_torques"]) if "positions" in table else 0.0
+        return position_torque + (np.interp(v, table["speeds"], table["speed_torques"]) if "speeds" in table else 0.0)
 
     theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s, w, twist, third = y
     u = u * (1.0 + value("actuator.gain_error", "relative"))
@@ -97,8 +97,8 @@ def right_side(t, y, u, law, effects, drive):
     at_motor = side("motor", omega_e) + value("motor.cogging", "amplitude") * np.sin(
         value("motor.cogging", "harmonic") * theta_e + value("motor.cogging", "phase")
     )
-    at_motor += tabulated("motor", theta_e, omega_e)
-    at_load = side("load", omega_s) + tabulated("load", theta_s, omega_s)
+    at_motor += interpolate_tables("motor", theta_e, omega_e)
+    at_load = side("load", omega_s) + interpolate_tables("load", theta_s, omega_s)
     for k, name in ((1, ""), (2, "_2"), (3, "_3")):
         turn = k * value("motor.cogging_harmonics", "harmonic") * theta_e
         at_motor += value("motor.cogging_harmonics", f"sine{name}") * np.sin(turn)
@@ -131,17 +131,17 @@ def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQU
     """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
     y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], *[0.0] * 6]
     states = []
-    late = (effects or {}).get("actuator.delay", {"delay": 0.0})["delay"] / hold
+    delay_samples = (effects or {}).get("actuator.delay", {"delay": 0.0})["delay"] / hold
     # a delayed input changes within a hold
-    whole, edge = int(late), (late - int(late)) * hold
-    arriving = [*[0.0] * (whole + 1), *torques]
+    full_samples, edge = int(delay_samples), (delay_samples - int(delay_samples)) * hold
+    arriving = [*[0.0] * (full_samples + 1), *torques]
     for k in range(len(torques)):
         spans = [(0.0, edge, arriving[k]), (edge, hold, arriving[k + 1])] if edge else [(0.0, hold, arriving[k + 1])]
-        for start_of, end, u in spans:
+        for begin, end, u in spans:
             # max_step: an adaptive step must not leap over a gap
             solution = solve_ivp(
                 right_side,
-                (k * hold + start_of, k * hold + end),
+                (k * hold + begin, k * hold + end),
                 y,
                 method="DOP853",
                 rtol=1e-12,
@@ -169,7 +169,7 @@ def block(*effects, inertia=0.05, viscous=0.0, dtype=jnp.float64):
 def _trajectory(plant, initial, torques, substeps, hold):
     step = hold / substeps.astype(hold.dtype)
 
-    def over(carry, torque):
+    def advance_hold(carry, torque):
         state, start = carry
         effects, arriving = plant.receive(state.effects, torque, hold)
         state = eqx.tree_at(lambda s: s.effects, state, effects)
@@ -182,7 +182,7 @@ def _trajectory(plant, initial, torques, substeps, hold):
         sides = [(part, side) for part in (state.position, state.velocity) for side in plant.drive.sides]
         return (state, start + hold), jnp.stack([part[side] for part, side in sides])
 
-    return jax.lax.scan(over, (plant.init(initial), jnp.zeros_like(hold)), torques)[1]
+    return jax.lax.scan(advance_hold, (plant.init(initial), jnp.zeros_like(hold)), torques)[1]
 
 
 def trajectory(plant, substeps, start=START, torques=TORQUES, hold=HOLD, dtype=jnp.float64):

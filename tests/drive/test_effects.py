@@ -20,7 +20,7 @@ from jaxbl.drive.parameters import parameter
 DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 
 
-def made(values):
+def make_effects(values):
     return [make_effect(name, **numbers) for name, numbers in values.items()]
 
 
@@ -28,27 +28,27 @@ def errors(values, *substeps):
     """How far the drive is from the reference, by so many substeps; and the reference."""
     expected = reference(effects=values)
     assert expected[:, 2:].min() > 0.1  # sliding forwards
-    return *(np.abs(trajectory(plant(*made(values)), n) - expected).max() for n in substeps), expected
+    return *(np.abs(trajectory(plant(*make_effects(values)), n) - expected).max() for n in substeps), expected
 
 
 @pytest.fixture(scope="module")
-def without():
+def motion_without_effects():
     """The reference without effects."""
     return reference()
 
 
 def test_the_names_are_the_contract():
-    every = VALUES | ENCODERS
-    assert set(EFFECTS) == set(every)
-    for name, effect in zip(every, made(every), strict=True):
+    values = VALUES | ENCODERS
+    assert set(EFFECTS) == set(values)
+    for name, effect in zip(values, make_effects(values), strict=True):
         assert effect.name == name
         assert inspect.getdoc(EFFECTS[name]) and list(parameters(effect))
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_each_effect_is_what_its_equation_says_to_second_order(name, without):
+def test_each_effect_is_what_its_equation_says_to_second_order(name, motion_without_effects):
     coarse, fine, expected = errors({name: VALUES[name]}, 128, 1024)
-    assert np.abs(expected - without).max() > 0.1  # it matters
+    assert np.abs(expected - motion_without_effects).max() > 0.1  # it matters
     # a hard gap is only piecewise smooth: of second order in the mean
     tolerance = 0.2 if name == "transmission.backlash" else 0.01
     assert np.log2(coarse / fine) / 3.0 == pytest.approx(2.0, abs=tolerance)
@@ -56,14 +56,14 @@ def test_each_effect_is_what_its_equation_says_to_second_order(name, without):
 
 
 def test_effects_on_an_encoder_change_its_reading_alone():
-    every = made(ENCODERS)
-    np.testing.assert_array_equal(trajectory(plant(*every), 8), trajectory(plant(), 8))
-    both, one = plant(*every), block(*every)
-    assert float(both.read("motor", 0.3, 2.0)) == pytest.approx(0.4)
-    late = 0.3 - 2e-3 * 2.0
-    assert float(both.read("load", 0.3, 2.0)) == pytest.approx(late + 0.01 * np.sin(2.0 * late + 0.4))
+    effects = make_effects(ENCODERS)
+    np.testing.assert_array_equal(trajectory(plant(*effects), 8), trajectory(plant(), 8))
+    two_inertia, rigid = plant(*effects), block(*effects)
+    assert float(two_inertia.read("motor", 0.3, 2.0)) == pytest.approx(0.4)
+    skewed = 0.3 - 2e-3 * 2.0
+    assert float(two_inertia.read("load", 0.3, 2.0)) == pytest.approx(skewed + 0.01 * np.sin(2.0 * skewed + 0.4))
     # a rigid drive has one encoder
-    assert float(one.read("motor", 0.3, 2.0)) == pytest.approx(0.1 + late + 0.01 * np.sin(2.0 * (late + 0.1) + 0.4))
+    assert float(rigid.read("motor", 0.3, 2.0)) == pytest.approx(0.1 + skewed + 0.01 * np.sin(2.0 * (skewed + 0.1) + 0.4))
     assert float(plant().read("load", 0.3, 2.0)) == pytest.approx(0.3)
 
 
@@ -74,8 +74,8 @@ def test_effects_add_up_in_any_order():
     coarse, fine, _ = errors(values, 256, 4096)
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
-    shuffled = sorted(made(values), key=lambda effect: (effect.place == "actuator", effect.place))
-    there, back = (trajectory(plant(*order), 64) for order in (made(values), shuffled))
+    shuffled = sorted(make_effects(values), key=lambda effect: (effect.place == "actuator", effect.place))
+    there, back = (trajectory(plant(*order), 64) for order in (make_effects(values), shuffled))
     np.testing.assert_allclose(there, back, rtol=1e-11)
 
 
@@ -88,14 +88,14 @@ def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
 
 @pytest.mark.parametrize("name", VALUES)
 def test_float32_stays_float32_and_close(name):
-    effect = made({name: VALUES[name]})
+    effect = make_effects({name: VALUES[name]})
     double, single = (trajectory(plant(*effect, dtype=dtype), 32, dtype=dtype) for dtype in (jnp.float64, jnp.float32))
     np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["motor.viscous_friction", "load.quadratic_drag"])
 def test_drags_are_odd(name):
-    (effect,) = made({name: VALUES[name]})
+    (effect,) = make_effects({name: VALUES[name]})
     assert effect.resist((), Motion(0.0, 0.0, 2.0)) == -effect.resist((), Motion(0.0, 0.0, -2.0)) != 0.0
 
 
@@ -106,7 +106,7 @@ STRIBECK = StribeckFriction(side="motor", torque=0.05, breakaway_torque=0.1, str
 REST = dict.fromkeys(START, 0.0)
 
 
-def moved(friction, torque, seconds, dtype=jnp.float64, velocity=0.0, **block_values):
+def slide_block(friction, torque, seconds, dtype=jnp.float64, velocity=0.0, **block_values):
     """Position and velocity of a block at every default sample (1 ms in 10 substeps) under a constant torque."""
     torques = np.full(round(seconds * 1000), torque)
     start = REST | {"motor_velocity": velocity}
@@ -117,12 +117,12 @@ def moved(friction, torque, seconds, dtype=jnp.float64, velocity=0.0, **block_va
 @pytest.mark.parametrize("friction", [COULOMB, STRIBECK])
 @pytest.mark.parametrize("torque", [0.0999, -0.0999, 0.05])
 def test_a_block_below_breakaway_does_not_creep_at_all(friction, torque, dtype):
-    assert not moved(friction, torque, 10.0, dtype).any()
+    assert not slide_block(friction, torque, 10.0, dtype).any()
 
 
 @DTYPES
 def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
-    weight = made({"load.constant_torque": {"torque": 0.3}, "motor.coulomb_friction": {"torque": 0.02}})
+    weight = make_effects({"load.constant_torque": {"torque": 0.3}, "motor.coulomb_friction": {"torque": 0.02}})
     drive = plant(*weight, CoulombFriction(side="load", torque=0.31), dtype=dtype)
     # the motor holds too, and with it the load sees its weight alone
     assert not trajectory(drive, 10, REST, np.full(10_000, 0.019), 1e-3, dtype).any()
@@ -134,11 +134,11 @@ def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
 
 def test_a_block_above_breakaway_accelerates_as_the_closed_form_says():
     time = 1e-3 * np.arange(1, 2001)
-    position, velocity = moved(COULOMB, -0.11, 2.0)
+    position, velocity = slide_block(COULOMB, -0.11, 2.0)
     np.testing.assert_allclose(velocity, -0.01 / 0.05 * time, rtol=1e-9)
     np.testing.assert_allclose(position, -0.5 * 0.01 / 0.05 * time**2, rtol=1e-9)
     # with viscous friction v = (u - F) / f (1 - exp(-f t / J)): viscous friction is of second order in the step
-    position, velocity = moved(COULOMB, 0.15, 2.0, viscous=0.1)
+    position, velocity = slide_block(COULOMB, 0.15, 2.0, viscous=0.1)
     np.testing.assert_allclose(velocity, 0.5 * (1.0 - np.exp(-2.0 * time)), atol=1e-8)
     np.testing.assert_allclose(position, 0.5 * (time - 0.5 * (1.0 - np.exp(-2.0 * time))), atol=1e-8)
 
@@ -146,7 +146,7 @@ def test_a_block_above_breakaway_accelerates_as_the_closed_form_says():
 @DTYPES
 def test_a_sliding_block_stops_where_and_when_the_closed_form_says_and_stays(dtype):
     velocity = 1.2345
-    position, speed = moved(COULOMB, 0.03, 10.0, dtype, velocity=velocity)
+    position, speed = slide_block(COULOMB, 0.03, 10.0, dtype, velocity=velocity)
     deceleration = (0.1 - 0.03) / 0.05
     stop = velocity / deceleration
     # it stops within one substep of h = 1e-4 s, so at most a h^2 / 2 off
@@ -161,7 +161,7 @@ def test_a_block_turns_around_when_the_closed_form_says(velocity):
     """Within a substep: friction changes its sign at the turn, not at the step's end."""
     torque = -0.15 * np.sign(velocity)
     turn = abs(velocity) / ((0.15 + 0.1) / 0.05)
-    position, speed = moved(COULOMB, torque, 1.0, velocity=velocity)
+    position, speed = slide_block(COULOMB, torque, 1.0, velocity=velocity)
     assert speed[-1] == pytest.approx((1.0 - turn) * (0.15 - 0.1) / 0.05 * np.sign(torque), rel=1e-9)
     end = 0.5 * velocity * turn + 0.5 * speed[-1] * (1.0 - turn)
     # a h^2 / 4 at most in the step of the turn
@@ -170,13 +170,13 @@ def test_a_block_turns_around_when_the_closed_form_says(velocity):
 
 def test_stribeck_friction_holds_what_it_would_let_slide():
     """Between sliding friction and break-away: at rest it stays, in motion it goes on."""
-    assert not moved(STRIBECK, 0.08, 2.0).any()
+    assert not slide_block(STRIBECK, 0.08, 2.0).any()
     time = 2.0
-    _, velocity = moved(STRIBECK, 0.08, time, velocity=2.0)
+    _, velocity = slide_block(STRIBECK, 0.08, time, velocity=2.0)
     # far above the Stribeck velocity friction is F_c
     assert velocity[-1] == pytest.approx(2.0 + (0.08 - 0.05) / 0.05 * time, rel=1e-9)
     # above break-away it runs away, faster and faster
-    _, velocity = moved(STRIBECK, 0.105, time)
+    _, velocity = slide_block(STRIBECK, 0.105, time)
     assert velocity[-1] > 2.0 * velocity[999] > 0.0
 
 
@@ -193,15 +193,15 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
     while abs(turning[-1]) > level / stiffness:
         turning.append(-np.sign(turning[-1]) * (abs(turning[-1]) - 2.0 * level / stiffness))
     half_period = np.pi * np.sqrt(inertia / stiffness)
-    at = np.round(half_period * np.arange(1, len(turning)) * 1000).astype(int) - 1
+    samples = np.round(half_period * np.arange(1, len(turning)) * 1000).astype(int) - 1
     tolerance = 3e-6 if dtype == jnp.float64 else 5e-5
-    np.testing.assert_allclose(motor[at], turning[1:], atol=tolerance)
-    assert (motor[at[-1] + 2 :] == motor[-1]).all()
+    np.testing.assert_allclose(motor[samples], turning[1:], atol=tolerance)
+    assert (motor[samples[-1] + 2 :] == motor[-1]).all()
     assert motor[-1] == pytest.approx(turning[-1], abs=tolerance)
 
 
 def test_the_gain_of_the_input_is_that_of_small_ones():
-    chain = made({name: numbers for name, numbers in VALUES.items() if name.startswith("actuator.")})
+    chain = make_effects({name: numbers for name, numbers in VALUES.items() if name.startswith("actuator.")})
     assert block(*chain).input_gain == pytest.approx(1.1 * 0.02 / 0.01)
     assert block().input_gain == 1.0
 
@@ -209,15 +209,15 @@ def test_the_gain_of_the_input_is_that_of_small_ones():
 @pytest.mark.parametrize("samples", [0.0, 0.3, 1.0, 2.7, 16.0])
 def test_a_delayed_input_is_the_input_shifted(samples):
     period, inputs = 2e-3, np.random.default_rng(0).standard_normal(40)
-    late = samples * period
-    drive = block(make_effect("actuator.delay", delay=late))
+    delay = samples * period
+    drive = block(make_effect("actuator.delay", delay=delay))
     states, quarters = (drive.effects[0].init(),), 0.25 * period * np.arange(4)
     for k, torque in enumerate(inputs):
         states, arriving = drive.receive(states, torque, period)
         for since in quarters:
             # the mean of what was commanded so much earlier, zero before the first command
-            at = k * period + since - late + 0.25 * period * (np.arange(1000) + 0.5) / 1000
-            index = np.floor(at / period + 1e-9).astype(int)
+            times = k * period + since - delay + 0.25 * period * (np.arange(1000) + 0.5) / 1000
+            index = np.floor(times / period + 1e-9).astype(int)
             expected = np.mean(np.where(index < 0, 0.0, inputs[np.maximum(index, 0)]))
             assert arriving(since, 0.25 * period) == pytest.approx(expected, abs=5e-3)
 
@@ -236,26 +236,26 @@ class TorsionSpring(SideEffect):
 
 
 @pytest.fixture
-def installed(monkeypatch):
+def install(monkeypatch):
     """Pretend that packages with these entry points are installed."""
 
-    def install(**found):
+    def install_effects(**effects):
         def entry_points(*, group):
             assert group == "jaxbl.effects"
-            return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in found.items()]
+            return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in effects.items()]
 
         monkeypatch.setattr("jaxbl.registry.entry_points", entry_points)
         monkeypatch.setattr(EFFECTS, "_members", dict(BUILT_IN))
         monkeypatch.setattr(EFFECTS, "_loaded", False)
 
-    return install
+    return install_effects
 
 
 BUILT_IN = {name: EFFECTS[name] for name in VALUES}
 
 
-def test_other_packages_add_effects_through_entry_points(installed):
-    installed(**{"motor.torsion_spring": TorsionSpring})
+def test_other_packages_add_effects_through_entry_points(install):
+    install(**{"motor.torsion_spring": TorsionSpring})
     assert EFFECTS["motor.torsion_spring"] is TorsionSpring
     assert set(EFFECTS) == {*VALUES, "motor.torsion_spring"}
     spring = make_effect("motor.torsion_spring", spring_stiffness=0.8)
@@ -265,8 +265,8 @@ def test_other_packages_add_effects_through_entry_points(installed):
     np.testing.assert_allclose(states[:, 0], 0.5 * np.cos(4e-3 * np.arange(1, 1001)), atol=1e-7)
 
 
-def test_other_packages_cannot_replace_a_built_in_effect(installed):
-    installed(**{"motor.coulomb_friction": TorsionSpring})
+def test_other_packages_cannot_replace_a_built_in_effect(install):
+    install(**{"motor.coulomb_friction": TorsionSpring})
     assert set(EFFECTS) == set(VALUES)
     assert EFFECTS["motor.coulomb_friction"] is CoulombFriction
 
@@ -312,7 +312,7 @@ class Costly(SideEffect):
 
 
 @pytest.mark.parametrize(
-    ("name", "found", "wrong"),
+    ("name", "cls", "wrong"),
     [
         ("load.spring", TorsionSpring, "acts as motor.torsion_spring or load.torsion_spring"),
         ("actuator.torsion_spring", TorsionSpring, "acts as motor.torsion_spring or load"),
@@ -325,8 +325,8 @@ class Costly(SideEffect):
         ("motor.costly", Costly, r"torque: unit should be one line without control characters and without \$, not '\$'"),
     ],
 )
-def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, found, wrong, installed, caplog):
-    installed(**{name: found})
+def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, cls, wrong, install, caplog):
+    install(**{name: cls})
     assert set(EFFECTS) == set(VALUES)
     (record,) = caplog.records
     assert re.search(wrong, record.message) and name in record.message and "\n" not in record.message
@@ -398,7 +398,7 @@ def test_memory_moves_with_the_positions_to_second_order():
     errors = []
     for samples in (100, 200, 400):
         start = REST | {"motor_position": 0.2}
-        found = trajectory(drive, 1, start, np.full(samples, 0.1), 2.0 / samples)[-1]
-        errors.append(np.abs(found - expected).max())
+        end = trajectory(drive, 1, start, np.full(samples, 0.1), 2.0 / samples)[-1]
+        errors.append(np.abs(end - expected).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
     assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)

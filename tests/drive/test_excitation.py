@@ -16,7 +16,7 @@ DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 PERIODS = pytest.mark.parametrize("period", [1e-3, 7e-4, 1.0 / 3000.0])
 
 
-def sampled(excitation, times, dtype=jnp.float64):
+def sample(excitation, times, dtype=jnp.float64):
     values = jax.jit(jax.vmap(as_arrays(excitation, dtype)))(jnp.asarray(times, dtype))
     assert values.dtype == dtype and values.shape == np.shape(times)
     return np.asarray(values)
@@ -37,7 +37,7 @@ def test_sine(amplitude, frequency, phase, offset, time):
 @pytest.mark.parametrize("count", [1, 2, 8, 31])
 def test_multisine_has_the_power_of_a_sine_flat_lines_and_a_low_crest(count):
     samples = 4096
-    u = sampled(Multisine(amplitude=0.3, frequency=0.5, count=count), np.arange(samples) * 2.0 / samples)
+    u = sample(Multisine(amplitude=0.3, frequency=0.5, count=count), np.arange(samples) * 2.0 / samples)
     assert np.mean(u**2) == pytest.approx(0.3**2 / 2.0)
     lines = 2.0 * np.abs(np.fft.rfft(u)) / samples
     np.testing.assert_allclose(lines[1 : count + 1], 0.3 / np.sqrt(count))
@@ -50,15 +50,15 @@ def test_chirp_against_scipy_and_steady_afterwards():
     excitation = Chirp(amplitude=2.0, start_frequency=0.5, stop_frequency=5.0, sweep_time=4.0)
     inside, after = np.linspace(0.0, 4.0, 401), np.linspace(4.0, 6.0, 201)
     expected = 2.0 * chirp(inside, 0.5, 4.0, 5.0, method="linear", phi=-90.0)
-    np.testing.assert_allclose(sampled(excitation, inside), expected, atol=1e-12)
+    np.testing.assert_allclose(sample(excitation, inside), expected, atol=1e-12)
     turns = 0.5 * (0.5 + 5.0) * 4.0 + 5.0 * (after - 4.0)
-    np.testing.assert_allclose(sampled(excitation, after), 2.0 * np.sin(2.0 * np.pi * turns), atol=1e-12)
+    np.testing.assert_allclose(sample(excitation, after), 2.0 * np.sin(2.0 * np.pi * turns), atol=1e-12)
 
 
 @pytest.fixture(scope="module")
 def bits():
     """That repeat only after the run: each tells its own index."""
-    return sampled(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(60_000))
+    return sample(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(60_000))
 
 
 @DTYPES
@@ -68,13 +68,13 @@ def test_levels_change_at_the_sample_of_the_edge(bits, dtype, period, samples_pe
     """Whatever the precision rounds to, over a minute of samples."""
     expected = bits[np.arange(bits.size) // samples_per_hold]
     prbs = Prbs(amplitude=1.0, hold=samples_per_hold * period, order=16)
-    np.testing.assert_array_equal(sampled(prbs, sample_times(bits.size, period, dtype), dtype), expected)
+    np.testing.assert_array_equal(sample(prbs, sample_times(bits.size, period, dtype), dtype), expected)
 
 
 @pytest.mark.parametrize("order", [2, 5, 10])
 def test_prbs_is_balanced_periodic_and_white(order):
     length = 2**order - 1
-    u = sampled(Prbs(amplitude=0.2, hold=0.1, order=order), (np.arange(2 * length) + 0.5) * 0.1)
+    u = sample(Prbs(amplitude=0.2, hold=0.1, order=order), (np.arange(2 * length) + 0.5) * 0.1)
     np.testing.assert_allclose(np.unique(u), [-0.2, 0.2])
     np.testing.assert_array_equal(u[:length], u[length:])
     levels = np.sign(u[:length])
@@ -85,15 +85,15 @@ def test_prbs_is_balanced_periodic_and_white(order):
 
 def test_steps_are_uniform_levels_fixed_by_the_seed_in_either_precision():
     excitation = Steps(amplitude=0.5, hold=0.02, seed=3)
-    u = sampled(excitation, sample_times(40_000, 1e-3, jnp.float64)).reshape(-1, 20)
+    u = sample(excitation, sample_times(40_000, 1e-3, jnp.float64)).reshape(-1, 20)
     assert (u == u[:, :1]).all()
     levels = u[:, 0]
     assert len(np.unique(levels)) == len(levels)
     assert np.abs(levels).max() <= 0.5
     assert levels.mean() == pytest.approx(0.0, abs=0.03) and levels.var() == pytest.approx(0.25 / 3.0, rel=0.1)
-    single = sampled(excitation, sample_times(40_000, 1e-3, jnp.float32), jnp.float32)
+    single = sample(excitation, sample_times(40_000, 1e-3, jnp.float32), jnp.float32)
     np.testing.assert_allclose(single, u.ravel(), rtol=1e-6)
-    assert not np.array_equal(sampled(Steps(amplitude=0.5, hold=0.02, seed=4), np.arange(2000) * 0.02), levels)
+    assert not np.array_equal(sample(Steps(amplitude=0.5, hold=0.02, seed=4), np.arange(2000) * 0.02), levels)
 
 
 @DTYPES
@@ -101,28 +101,28 @@ def test_steps_are_uniform_levels_fixed_by_the_seed_in_either_precision():
 def test_recorded_samples_come_back_at_their_own_times(dtype, period):
     torques = np.random.default_rng(0).uniform(-1.0, 1.0, 60_000).astype(np.float32)
     record = Recorded(times=jnp.arange(60_000) * period, torques=jnp.asarray(torques, dtype), gain=2.0)
-    np.testing.assert_array_equal(sampled(record, sample_times(60_000, period, dtype), dtype), 2.0 * torques)
+    np.testing.assert_array_equal(sample(record, sample_times(60_000, period, dtype), dtype), 2.0 * torques)
 
 
 def test_recorded_is_held_between_and_beyond_uneven_stamps():
     record = Recorded(times=jnp.asarray([0.1, 0.2, 0.5]), torques=jnp.asarray([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(sampled(record, [0.0, 0.1, 0.19, 0.2, 0.49, 0.5, 9.0]), [1, 1, 1, 2, 2, 3, 3])
+    np.testing.assert_array_equal(sample(record, [0.0, 0.1, 0.19, 0.2, 0.49, 0.5, 9.0]), [1, 1, 1, 2, 2, 3, 3])
 
 
 @DTYPES
 def test_every_signal_scales_with_its_amplitude_as_a_grid_axis(dtype):
-    others = {
+    numbers = {
         "sine": {"frequency": 1.0},
         "multisine": {"frequency": 1.0},
         "chirp": {"start_frequency": 0.0, "stop_frequency": 2.0, "sweep_time": 1.0},
         "steps": {"hold": 0.1},
         "prbs": {"hold": 0.1},
     }
-    assert set(others) | {"recorded"} == set(EXCITATIONS)
-    for name, settings_ in others.items():
+    assert set(numbers) | {"recorded"} == set(EXCITATIONS)
+    for name, other_numbers in numbers.items():
         values = jax.vmap(
-            lambda amplitude, name=name, settings_=settings_: as_arrays(
-                EXCITATIONS[name](amplitude=amplitude, **settings_), dtype
+            lambda amplitude, name=name, other_numbers=other_numbers: as_arrays(
+                EXCITATIONS[name](amplitude=amplitude, **other_numbers), dtype
             )(jnp.asarray(0.37, dtype))
         )(jnp.asarray([0.0, 1.0, -3.0], dtype))
         assert values.dtype == dtype
@@ -136,6 +136,6 @@ def test_steps_are_independent_of_encoder_noise():
     from jaxbl.simulate import unit_noise
 
     steps = Steps(1.0, 1.0, seed=3)
-    levels = sampled(steps, np.arange(40) + 0.5)
+    levels = sample(steps, np.arange(40) + 0.5)
     for noise in unit_noise(jnp.asarray(3), jnp.arange(40), ("motor", "load")).values():
         assert abs(np.corrcoef(levels, 2.0 * norm.cdf(np.asarray(noise)) - 1.0)[0, 1]) < 0.5

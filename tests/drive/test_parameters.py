@@ -39,14 +39,14 @@ class Whole(eqx.Module):
     encoders: Encoders
 
 
-def whole(*effects):
+def Study(*effects):
     law = SigmoidBacklash(stiffness=1.0, dead_zone=0.02, slope=20.0)
     drive = TwoInertia(motor_inertia=0.05, motor_viscous=0.15, load_inertia=7.0, load_viscous=16.0, gear_ratio=5.0)
     return Whole(Plant(drive, law, effects), Gains(lambda_=2.0), Encoders())
 
 
 FRICTION = CoulombFriction(side="load", torque=0.1)
-TREE = whole(FRICTION, CoulombFriction(side="motor", torque=0.2), Hardening(cubic_stiffness=3.0))
+TREE = Study(FRICTION, CoulombFriction(side="motor", torque=0.2), Hardening(cubic_stiffness=3.0))
 PATHS = sorted(leaf_paths(TREE))
 
 
@@ -64,7 +64,7 @@ def test_paths_name_the_numbers_that_an_axis_may_vary():
 
 
 def test_members_that_share_a_name_go_by_position():
-    twice = whole(FRICTION, Hardening(cubic_stiffness=3.0), CoulombFriction(side="load", torque=0.3))
+    twice = Study(FRICTION, Hardening(cubic_stiffness=3.0), CoulombFriction(side="load", torque=0.3))
     assert get_leaf(twice, "plant.effects.2.torque") == 0.3
     assert get_leaf(twice, "plant.effects.transmission.hardening.cubic_stiffness") == 3.0
     with pytest.raises(KeyError):
@@ -116,8 +116,8 @@ def test_every_number_of_the_package_is_declared_with_a_text():
         *EFFECTS.values(),
     }
     for module in modules:
-        declared = {field.name: what for field, what in parameters(module)}
+        declared = {field.name: declaration for field, declaration in parameters(module)}
         numbers = {name for name, kind in module.__annotations__.items() if "Scalar" in str(kind) or kind in (float, int)}
         assert numbers <= set(declared), module
-        assert all(what.doc for what in declared.values()), module
+        assert all(declaration.doc for declaration in declared.values()), module
     assert {field.name for field, _ in parameters(Rigid)} == {"motor_inertia", "motor_viscous"}

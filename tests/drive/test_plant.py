@@ -129,11 +129,11 @@ def test_effects_and_drive_parameters_are_differentiable():
         drive = eqx.tree_at(lambda p: (p.transmission.stiffness, p.effects[0].drag), drive, (stiffness, drag))
         return _end(drive)
 
-    at = (jnp.asarray(3.0), jnp.asarray(0.05))
+    values = (jnp.asarray(3.0), jnp.asarray(0.05))
     for i, step in enumerate((1e-4, 1e-5)):
         direction = tuple(jnp.asarray(float(i == j)) for j in range(2))
-        _, derivative = jax.jvp(end, at, direction)
-        ahead, behind = (end(*(x + sign * step * d for x, d in zip(at, direction, strict=True))) for sign in (1.0, -1.0))
+        _, derivative = jax.jvp(end, values, direction)
+        ahead, behind = (end(*(x + sign * step * d for x, d in zip(values, direction, strict=True))) for sign in (1.0, -1.0))
         assert float(derivative) == pytest.approx(float(ahead - behind) / (2.0 * step), rel=1e-6)
         assert abs(derivative) > 1e-3
 
@@ -155,25 +155,25 @@ def _end(drive):
     """Motor position after all `TORQUES`, in steps of an eighth of a hold."""
     step = HOLD / 8.0
 
-    def over(state, given):
-        torque, time = given
+    def advance_sample(state, inputs):
+        torque, time = inputs
         return drive.advance(state, torque, time, jnp.asarray(step)), None
 
     torques = jnp.repeat(jnp.asarray(TORQUES), 8)
     times = step * jnp.arange(len(torques))
-    state, _ = jax.lax.scan(over, drive.init(as_arrays(Initial(**START), jnp.float64)), (torques, times))
+    state, _ = jax.lax.scan(advance_sample, drive.init(as_arrays(Initial(**START), jnp.float64)), (torques, times))
     return state.position["motor"]
 
 
 def test_what_the_observers_know_of_a_drive():
-    two, one = TwoInertia(**PAPER), Rigid(motor_inertia=0.05, motor_viscous=0.15)
-    assert {drive.name: type(drive) for drive in (two, one)} == DRIVES
-    for drive in (two, one):
+    two_inertia, rigid = TwoInertia(**PAPER), Rigid(motor_inertia=0.05, motor_viscous=0.15)
+    assert {drive.name: type(drive) for drive in (two_inertia, rigid)} == DRIVES
+    for drive in (two_inertia, rigid):
         assert drive.acceleration("motor", 2.0, 0.5) == pytest.approx((0.5 - 0.15 * 2.0) / 0.05)
         assert drive.torque_gain("motor") == -1.0 and drive.ratio("motor") == 1.0
-    assert two.acceleration("load", 2.0, 0.5) == pytest.approx(-16.0 * 2.0 / 7.0)  # the input does not act there
-    assert two.torque_gain("load") == two.ratio("load") == 5.0
-    heavier = Plant(two, LinearShaft(1.0), (make_effect("load.inertia", inertia=0.5),))
+    assert two_inertia.acceleration("load", 2.0, 0.5) == pytest.approx(-16.0 * 2.0 / 7.0)  # the input does not act there
+    assert two_inertia.torque_gain("load") == two_inertia.ratio("load") == 5.0
+    heavier = Plant(two_inertia, LinearShaft(1.0), (make_effect("load.inertia", inertia=0.5),))
     assert (heavier.inertia("motor"), heavier.inertia("load")) == (0.05, 7.5)
 
 
@@ -181,5 +181,5 @@ def test_initial_state_has_the_sides_of_the_drive():
     initial = as_arrays(Initial(motor_position=1.0, motor_velocity=2.0, load_position=3.0, load_velocity=4.0), jnp.float64)
     two = plant(make_effect("actuator.lag", time_constant=0.1)).init(initial)
     assert (two.position, two.velocity, two.effects) == ({"motor": 1.0, "load": 3.0}, {"motor": 2.0, "load": 4.0}, ((0.0,),))
-    one = Plant(Rigid(0.05, 0.15), None).init(initial)
-    assert (one.position, one.velocity) == ({"motor": 1.0}, {"motor": 2.0})
+    rigid = Plant(Rigid(0.05, 0.15), None).init(initial)
+    assert (rigid.position, rigid.velocity) == ({"motor": 1.0}, {"motor": 2.0})

@@ -24,14 +24,14 @@ TABLE = {
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_table_of_the_design(dtype):
-    alpha, one = jnp.asarray(list(TABLE), dtype), jnp.ones(len(TABLE), dtype)
-    found = {name: least(alpha, one) for name, least in LEAST.items()}
-    assert {column.dtype for column in found.values()} == {jnp.dtype(dtype)}
+    alpha, f_plus = jnp.asarray(list(TABLE), dtype), jnp.ones(len(TABLE), dtype)
+    limits = {name: least(alpha, f_plus) for name, least in LEAST.items()}
+    assert {column.dtype for column in limits.values()} == {jnp.dtype(dtype)}
     exact, davila_fridman, seeber_horn, levant = np.transpose(list(TABLE.values()))
-    np.testing.assert_allclose(found["exact"], exact, atol=6e-4)
-    np.testing.assert_allclose(found["davila_fridman"], davila_fridman, atol=6e-3)
-    np.testing.assert_allclose(found["seeber_horn"], seeber_horn, atol=6e-4)
-    np.testing.assert_allclose(found["levant"], levant, atol=6e-3)
+    np.testing.assert_allclose(limits["exact"], exact, atol=6e-4)
+    np.testing.assert_allclose(limits["davila_fridman"], davila_fridman, atol=6e-3)
+    np.testing.assert_allclose(limits["seeber_horn"], seeber_horn, atol=6e-4)
+    np.testing.assert_allclose(limits["levant"], levant, atol=6e-3)
 
 
 def test_davila_fridman_grows_with_q():
@@ -102,20 +102,20 @@ def test_peak_ratio_is_that_of_quadrature_and_of_the_simulated_worst_case(case):
 LANES = 300
 
 
-def compiled(function):
+def compile_function(function):
     """For up to so many cases, of whatever shape: one program of each precision."""
     wide = jax.jit(function)
 
-    def call(*given):
-        given = np.broadcast_arrays(*given)
-        shape, size = given[0].shape, given[0].size
-        return np.asarray(wide(*(np.resize(x, LANES) for x in given)))[:size].reshape(shape)
+    def call(*arguments):
+        arguments = np.broadcast_arrays(*arguments)
+        shape, size = arguments[0].shape, arguments[0].size
+        return np.asarray(wide(*(np.resize(x, LANES) for x in arguments)))[:size].reshape(shape)
 
     return call
 
 
-RATIO, BOUND = compiled(conditions.peak_ratio), compiled(conditions.convergence_time_bound)
-LEAST = {name: compiled(least) for name, (_, least) in conditions.CONDITIONS.items()}
+RATIO, BOUND = compile_function(conditions.peak_ratio), compile_function(conditions.convergence_time_bound)
+LEAST = {name: compile_function(least) for name, (_, least) in conditions.CONDITIONS.items()}
 POSITIVE = st.floats(0.1, 10.0)
 
 
@@ -145,18 +145,18 @@ def test_least_lambda_exact_is_where_the_ratio_is_one(ratio, f_plus):
 def test_largest_bound_of_the_exact_condition_is_where_it_is_just_met():
     alpha = np.array([1.1, 3.0, 80.0])
     lambdas = np.stack([LEAST["exact"](alpha, np.ones(3)), np.zeros(3), np.full(3, 1e3)])
-    found = conditions.largest_f_plus_exact(jnp.asarray(lambdas), jnp.stack([alpha] * 3))
+    largest = conditions.largest_f_plus_exact(jnp.asarray(lambdas), jnp.stack([alpha] * 3))
     # with a large lambda it is alpha that limits, with none nothing is withstood
-    np.testing.assert_allclose(found, [np.ones(3), np.zeros(3), alpha], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(largest, [np.ones(3), np.zeros(3), alpha], rtol=1e-9, atol=1e-12)
 
 
 def test_gains_are_judged_by_every_condition():
-    found = conditions.judge_gains(1.5, 1.1, 1.0)
+    summary = conditions.judge_gains(1.5, 1.1, 1.0)
     # the usual pair, docs/theory.md
-    assert [name for name, holds in found["holds"].items() if holds] == ["seeber_horn", "exact"]
-    assert list(found["least_lambda"]) == list(conditions.CONDITIONS)
-    assert found["peak_ratio"] == pytest.approx(0.54, abs=0.005)
-    assert 1.0 < found["largest_f_plus"] <= 1.1
+    assert [name for name, holds in summary["holds"].items() if holds] == ["seeber_horn", "exact"]
+    assert list(summary["least_lambda"]) == list(conditions.CONDITIONS)
+    assert summary["peak_ratio"] == pytest.approx(0.54, abs=0.005)
+    assert 1.0 < summary["largest_f_plus"] <= 1.1
     missed = conditions.judge_gains(1.5, 1.0, 1.0)
     assert (missed["peak_ratio"], set(missed["least_lambda"].values())) == (None, {None})
     assert not any(missed["holds"].values())
@@ -191,10 +191,10 @@ def test_quadratic_lyapunov_functions_end_where_shorten_and_narendra_say(ratio, 
     alpha = ratio * f_plus
     least = float(LEAST["moreno_osorio"](alpha, f_plus))
     for lambda_, shared in ((least * (1.0 + off), True), (least / (1.0 + off), False)):
-        one, other = extremes(lambda_, alpha, f_plus)
-        assert max(np.linalg.eigvals(one).real.max(), np.linalg.eigvals(other).real.max()) < 0.0
-        assert np.linalg.matrix_rank(one - other) == 1
-        eigenvalues = np.linalg.eigvals(one @ other)
+        first, second = extremes(lambda_, alpha, f_plus)
+        assert max(np.linalg.eigvals(first).real.max(), np.linalg.eigvals(second).real.max()) < 0.0
+        assert np.linalg.matrix_rank(first - second) == 1
+        eigenvalues = np.linalg.eigvals(first @ second)
         negative = (np.abs(eigenvalues.imag) < 1e-9 * np.abs(eigenvalues)) & (eigenvalues.real < 0.0)
         assert negative.any() != shared
 
@@ -227,17 +227,17 @@ def test_derivatives_of_the_exact_condition(dtype, tolerance):
     change = np.array(change) / np.array([alpha, f_plus])
     # Euler: the condition is homogeneous of degree 1/2
     np.testing.assert_allclose(change[0] * alpha + change[1] * f_plus, 0.5 * LEAST["exact"](alpha, f_plus), rtol=1e-6)
-    found = jax.jit(jax.vmap(jax.grad(least, (0, 1))))(jnp.asarray(alpha, dtype), jnp.asarray(f_plus, dtype))
-    assert found[0].dtype == dtype
-    np.testing.assert_allclose(found, change, rtol=tolerance, atol=tolerance)
+    slopes = jax.jit(jax.vmap(jax.grad(least, (0, 1))))(jnp.asarray(alpha, dtype), jnp.asarray(f_plus, dtype))
+    assert slopes[0].dtype == dtype
+    np.testing.assert_allclose(slopes, change, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.float64, 1e-12)])
 def test_exact_condition_far_above_the_bound(dtype, tolerance):
     """log rho tends to f / alpha - pi lambda / sqrt(8 alpha) for small f: without cancellation in either precision."""
     ratio = np.logspace(7, 20, 14).astype(dtype)
-    found = LEAST["exact"](ratio, np.ones_like(ratio))
-    np.testing.assert_allclose(found * np.sqrt(ratio), np.sqrt(8.0) / np.pi, rtol=tolerance)
+    limits = LEAST["exact"](ratio, np.ones_like(ratio))
+    np.testing.assert_allclose(limits * np.sqrt(ratio), np.sqrt(8.0) / np.pi, rtol=tolerance)
 
 
 def test_nan_only_where_an_argument_is():
@@ -245,10 +245,10 @@ def test_nan_only_where_an_argument_is():
     alpha, f_plus = (x.ravel() for x in np.meshgrid(values, values))
     unknown = np.isnan(alpha) | np.isnan(f_plus)
     for name, least in LEAST.items():
-        found = np.asarray(least(alpha, f_plus))
-        np.testing.assert_array_equal(np.isnan(found), unknown, err_msg=name)
-        np.testing.assert_array_equal(found[~unknown] == np.inf, (alpha <= f_plus)[~unknown], err_msg=name)
-        assert np.all(found[~unknown] >= 0.0), name
+        limits = np.asarray(least(alpha, f_plus))
+        np.testing.assert_array_equal(np.isnan(limits), unknown, err_msg=name)
+        np.testing.assert_array_equal(limits[~unknown] == np.inf, (alpha <= f_plus)[~unknown], err_msg=name)
+        assert np.all(limits[~unknown] >= 0.0), name
 
 
 def test_without_a_disturbance():
@@ -277,9 +277,9 @@ def test_continuous_across_the_double_root(dtype, tolerance):
     steps = np.concatenate([s * np.logspace(-9, -1, 60) for s in (-1.0, 1.0)])
     lambdas = (double * (1.0 + np.sort(steps))).astype(dtype)
     alpha, f_plus = (np.asarray(x, dtype) for x in (alpha, f_plus))
-    found = jax.vmap(conditions.peak_ratio, (0, None, None))(lambdas, alpha, f_plus)
+    ratios = jax.vmap(conditions.peak_ratio, (0, None, None))(lambdas, alpha, f_plus)
     true = [ratio_by_quadrature(*(float(x) for x in (lambda_, alpha, f_plus))) for lambda_ in lambdas]
-    np.testing.assert_allclose(found, true, rtol=tolerance)
+    np.testing.assert_allclose(ratios, true, rtol=tolerance)
 
 
 @pytest.mark.parametrize("case", [(1.5, 1.1, 1.0), (0.7, 1.5, 1.0), (9.0, 1.5, 1.0), (1.0, 0.5, 1.0)])
@@ -291,7 +291,7 @@ def test_derivatives_are_finite_on_every_branch(case):
         np.testing.assert_allclose(gradient, change, rtol=1e-6, atol=1e-12)
 
 
-def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, duration, step, rest=1e-3):
+def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, duration, step, tolerance=1e-3):
     """Simulate x1' = x2 - lambda sqrt|x1| sign x1, x2' = d - alpha sign x1, for lanes of cases.
 
     A small step of the set-valued terms taken implicitly, so that rest at the origin is not lost. Returns the time after
@@ -308,7 +308,7 @@ def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, d
         beyond = np.maximum(np.abs(b) - reach, 0.0)
         x = np.sign(b) * (0.5 * (-step * lambda_ + np.sqrt((step * lambda_) ** 2 + 4.0 * beyond))) ** 2
         v = v + step * d - np.clip(b, -reach, reach) / step
-        last = np.where(np.abs(v) > rest * largest, (i + 1) * step, last)
+        last = np.where(np.abs(v) > tolerance * largest, (i + 1) * step, last)
     return last
 
 
@@ -351,7 +351,7 @@ def test_bound_is_infinite_where_32_fails():
     assert conditions.convergence_time_bound(4.3, 2.0, 1.0, 0.0, 1.0) < jnp.inf
 
 
-WORST, SLOWEST = compiled(conditions.convergence_time_worst), compiled(conditions.slowest_ray)
+WORST, SLOWEST = compile_function(conditions.convergence_time_worst), compile_function(conditions.slowest_ray)
 
 
 def convergent_gains(seed, nearest=1.02, farthest=40.0):
@@ -379,7 +379,7 @@ def switching(ray):
     return disturbance
 
 
-HALF = jax.jit(lambda *given, ray, homeward: half_cycle(*given, ray=ray, homeward=homeward))
+HALF = jax.jit(lambda *arguments, ray, homeward: half_cycle(*arguments, ray=ray, homeward=homeward))
 
 
 def whole_time(cycle):
@@ -390,19 +390,19 @@ def whole_time(cycle):
 
 def test_worst_time_is_that_of_simulated_half_cycles_and_of_no_other_ray():
     gains = convergent_gains(0)
-    zero, one = np.zeros(LANES), np.ones(LANES)
-    worst, ray, root = np.asarray(WORST(*gains, zero, one)), np.asarray(SLOWEST(*gains)), root_ray(*gains)
+    zeros, unit = np.zeros(LANES), np.ones(LANES)
+    worst, ray, root = np.asarray(WORST(*gains, zeros, unit)), np.asarray(SLOWEST(*gains)), root_ray(*gains)
     at_root = np.isclose(ray, root, rtol=1e-6, atol=0.0)
     assert 50 < at_root.sum() < 250
     assert np.all(ray <= 0.0)
     held = HALF(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
     np.testing.assert_allclose(whole_time(held), worst, rtol=1e-4)
     # every other ray: as shares of the root's, or of all directions where there is none
-    found = [whole_time(HALF(*gains, ray=zero, homeward=one))]
+    times = [whole_time(HALF(*gains, ray=zeros, homeward=unit))]
     for share in np.linspace(0.0, 1.0, 100, endpoint=False):
         rays = np.where(np.isnan(root), -np.sqrt(gains[1]) * share / (1.0 - share), share * root)
-        found.append(whole_time(HALF(*gains, ray=rays, homeward=-one)))
-    longest = np.nanmax(found, axis=0)
+        times.append(whole_time(HALF(*gains, ray=rays, homeward=-unit)))
+    longest = np.nanmax(times, axis=0)
     assert np.all(longest <= worst * (1.0 + 1e-4))
     assert np.all(longest >= worst * (1.0 - 1e-3))
 
@@ -444,12 +444,12 @@ def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_lon
         lambda t, x, speed: np.sin(2.0 * np.pi * 30.0 * t + phases[1]),
     ]
 
-    def every(t, x, speed):
+    def disturbances(t, x, speed):
         columns = zip(family, x.reshape(-1, cases), speed.reshape(-1, cases), strict=True)
         return np.concatenate([d(t, a, b) for d, a, b in columns])
 
-    given = [np.tile(column, len(family)) for column in (lambda_, alpha, f_plus, position, velocity)]
-    times = convergence_times(*given, every, 1.1, 5e-5, rest=1e-4).reshape(len(family), cases)
+    arguments = [np.tile(column, len(family)) for column in (lambda_, alpha, f_plus, position, velocity)]
+    times = convergence_times(*arguments, disturbances, 1.1, 5e-5, tolerance=1e-4).reshape(len(family), cases)
     # a step too long in one arc lasts as much longer in the next as it is slower
     off = 1e-3 + 1e-4 * (alpha + f_plus) / (alpha - f_plus)
     assert np.all(times <= 1.0 + off)
@@ -501,19 +501,19 @@ def test_worst_time_is_infinite_where_peaks_do_not_fall():
 
 def test_derivatives_of_the_worst_time():
     position, velocity = np.random.default_rng(1).uniform(-1.0, 1.0, (2, LANES))
-    given = [*convergent_gains(0), position, velocity]
-    found = jax.jit(jax.grad(lambda *x: jnp.sum(conditions.convergence_time_worst(*x)), (0, 1, 2, 3, 4)))(*given)
-    for k, gradient in enumerate(found):
-        step = 1e-6 * np.abs(given[k])
-        above, below = (WORST(*(x + s * step if i == k else x for i, x in enumerate(given))) for s in (1.0, -1.0))
+    arguments = [*convergent_gains(0), position, velocity]
+    derivatives = jax.jit(jax.grad(lambda *x: jnp.sum(conditions.convergence_time_worst(*x)), (0, 1, 2, 3, 4)))(*arguments)
+    for k, gradient in enumerate(derivatives):
+        step = 1e-6 * np.abs(arguments[k])
+        above, below = (WORST(*(x + s * step if i == k else x for i, x in enumerate(arguments))) for s in (1.0, -1.0))
         change = np.asarray(above - below) / (2.0 * step)
-        scale = np.asarray(WORST(*given)) / np.abs(given[k])
+        scale = np.asarray(WORST(*arguments)) / np.abs(arguments[k])
         np.testing.assert_allclose(gradient / scale, change / scale, rtol=1e-3, atol=1e-5)
 
 
 def test_worst_time_in_float32():
     gains = convergent_gains(8, nearest=1.2)
     start = np.zeros(LANES), np.ones(LANES)
-    found = WORST(*(jnp.asarray(x, jnp.float32) for x in (*gains, *start)))
-    assert found.dtype == jnp.float32
-    np.testing.assert_allclose(found, WORST(*gains, *start), rtol=2e-3)
+    times = WORST(*(jnp.asarray(x, jnp.float32) for x in (*gains, *start)))
+    assert times.dtype == jnp.float32
+    np.testing.assert_allclose(times, WORST(*gains, *start), rtol=2e-3)

@@ -22,10 +22,10 @@ def free(velocity):
 
 
 @partial(jax.jit, static_argnames="acceleration")
-def observed(observer, measured, h, acceleration=free, velocity=0.0, further=None):
+def observe(observer, measured, h, acceleration=free, velocity=0.0, further=None):
     """Estimates, and states predicted from them, along measured positions; `further` states at the start."""
 
-    def one(state, y):
+    def step(state, y):
         state, estimate = observer.step(state, y, acceleration, h)
         return state, (estimate, state)
 
@@ -33,7 +33,7 @@ def observed(observer, measured, h, acceleration=free, velocity=0.0, further=Non
     start = observer.start(measured[0], jnp.asarray(velocity, dtype), acceleration, jnp.asarray(h, dtype))
     if further is not None:
         start = start._replace(extra_states=tuple(jnp.asarray(x, dtype) for x in further))
-    return jax.lax.scan(one, start, measured)[1]
+    return jax.lax.scan(step, start, measured)[1]
 
 
 @pytest.mark.parametrize(("dtype", "few"), [(np.float64, 1e-14), (np.float32, 5e-6)])
@@ -97,7 +97,7 @@ def backward_euler(order, lipschitz, h, measured):
     for _ in range(n):
         series.append(np.convolve(series[-1], logarithm)[: n + 1])
     outputs = np.array([[series[i][m] * h ** (m - i) for m in range(n + 1)] for i in range(n + 1)])
-    z, found = np.zeros(n + 1), []
+    z, rows = np.zeros(n + 1), []
     for y in measured:
         innovation = y - h ** np.arange(n + 1) @ z
         reach = h ** (n + 1) * gains[n]
@@ -111,8 +111,8 @@ def backward_euler(order, lipschitz, h, measured):
         above = 0.0
         for i in range(n, -1, -1):
             above = z[i] = z[i] + h * (corrections[i] + above)
-        found.append(outputs @ z)
-    return np.array(found)
+        rows.append(outputs @ z)
+    return np.array(rows)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -123,12 +123,12 @@ def test_the_scheme_is_backward_euler_with_exact_outputs(order):
     noise = np.where(t > 3.0, 1e-2 * np.random.default_rng(0).normal(size=t.size), 0.0)
     y = np.sin(3.0 * t) + noise
     lipschitz = 3.0 ** (order + 1)
-    estimate, _ = observed(DIFFERENTIATORS[order](lipschitz), y, h)
+    estimate, _ = observe(DIFFERENTIATORS[order](lipschitz), y, h)
     expected = backward_euler(order, lipschitz, h, y)
-    found = [estimate.position, estimate.velocity, *([estimate.control] if order >= 2 else [])]
+    estimates = [estimate.position, estimate.velocity, *([estimate.control] if order >= 2 else [])]
     # the roots of order 5 differ by rounding, which its gains magnify
-    for own, other in zip(found, expected.T, strict=False):
-        np.testing.assert_allclose(own, other, atol=1e-7 * np.abs(other).max())
+    for estimated, other in zip(estimates, expected.T, strict=False):
+        np.testing.assert_allclose(estimated, other, atol=1e-7 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -136,25 +136,25 @@ def test_known_accelerations_leave_it_exact(order):
     """A polynomial, and beside it any known acceleration that is held over each period."""
     h, count = 1e-2, 3000
     t = h * np.arange(count)
-    known = np.random.default_rng(2).uniform(-30.0, 30.0, count)
+    added = np.random.default_rng(2).uniform(-30.0, 30.0, count)
     # what the known acceleration makes of velocity and position at the samples
-    speed = np.concatenate([[0.0], h * np.cumsum(known)[:-1]])
-    place = np.concatenate([[0.0], np.cumsum(h * speed + 0.5 * h * h * known)[:-1]])
-    own = np.polynomial.Polynomial(0.5 ** np.arange(order + 1) / [factorial(i) for i in range(order + 1)])
+    speed = np.concatenate([[0.0], h * np.cumsum(added)[:-1]])
+    place = np.concatenate([[0.0], np.cumsum(h * speed + 0.5 * h * h * added)[:-1]])
+    polynomial = np.polynomial.Polynomial(0.5 ** np.arange(order + 1) / [factorial(i) for i in range(order + 1)])
     # acceleration of polynomials of degree 1 is zero: all of it is known
-    y = own(t) + place
+    y = polynomial(t) + place
     observer = DIFFERENTIATORS[order](40.0)
 
-    def one(state, given):
-        return observer.step(state, given[0], lambda _: given[1], h)
+    def step(state, inputs):
+        return observer.step(state, inputs[0], lambda _: inputs[1], h)
 
     start = observer.start(jnp.asarray(y[0]), jnp.asarray(0.3), free, jnp.asarray(h))
-    estimate = jax.lax.scan(one, start, (jnp.asarray(y), jnp.asarray(known)))[1]
+    estimate = jax.lax.scan(step, start, (jnp.asarray(y), jnp.asarray(added)))[1]
     late = slice(-300, None)
     rounding = np.finfo(float).eps * np.abs(y).max()
-    velocity = own.deriv()(t) + speed
+    velocity = polynomial.deriv()(t) + speed
     np.testing.assert_allclose(estimate.velocity[late], velocity[late], atol=2**order * 40.0 * rounding / h)
-    disturbance = own.deriv(2)(t) if order >= 2 else 0.0 * t
+    disturbance = polynomial.deriv(2)(t) if order >= 2 else 0.0 * t
     np.testing.assert_allclose(estimate.control[late], disturbance[late], atol=4**order * 40.0 * rounding / h**2)
 
 
@@ -172,7 +172,7 @@ def test_any_start_leads_into_the_sliding_set(order):
     taylor = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(n + 1)] for i in range(n + 1)])
     push = np.array([1.0 / factorial(n + 1 - i) for i in range(n + 1)])
 
-    def one(state, top):
+    def step(state, top):
         # the error is observed: true states zero, but for what the highest derivative does over the period
         new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
         position, velocity, *further = (
@@ -181,9 +181,9 @@ def test_any_start_leads_into_the_sliding_set(order):
         return ObserverState(position, velocity, tuple(further)), estimate.position
 
     position, velocity, *further = jnp.asarray(taylor @ error)
-    found = np.asarray(jax.lax.scan(one, ObserverState(position, velocity, tuple(further)), jnp.asarray(top))[1])
-    assert np.abs(found[0]).max() > 1e2
-    assert np.abs(found[-2000:]).max() == 0.0
+    errors = np.asarray(jax.lax.scan(step, ObserverState(position, velocity, tuple(further)), jnp.asarray(top))[1])
+    assert np.abs(errors[0]).max() > 1e2
+    assert np.abs(errors[-2000:]).max() == 0.0
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -193,16 +193,16 @@ def test_polynomials_are_differentiated_exactly_and_without_chatter(order):
     t = h * np.arange(count)
     powers = np.arange(order + 1)
     coefficients = 0.5**powers / np.array([1.0, *np.cumprod(powers[1:])])
-    own = np.polynomial.Polynomial(coefficients)
-    y = own(t)
-    estimate, _ = observed(DIFFERENTIATORS[order](40.0), y, h, velocity=0.3)
+    polynomial = np.polynomial.Polynomial(coefficients)
+    y = polynomial(t)
+    estimate, _ = observe(DIFFERENTIATORS[order](40.0), y, h, velocity=0.3)
     late = slice(-300, None)
     rounding = np.finfo(float).eps * np.abs(y).max()
     np.testing.assert_allclose(estimate.position[late], y[late], atol=8.0 * rounding)
     # a backward difference of the last n + 1 samples magnifies rounding by 2^n / h at most, per derivative
-    np.testing.assert_allclose(estimate.velocity[late], own.deriv()(t)[late], atol=2**order * 40.0 * rounding / h)
+    np.testing.assert_allclose(estimate.velocity[late], polynomial.deriv()(t)[late], atol=2**order * 40.0 * rounding / h)
     if order >= 2:
-        expected = own.deriv(2)(t)[late]
+        expected = polynomial.deriv(2)(t)[late]
         np.testing.assert_allclose(estimate.control[late], expected, atol=4**order * 40.0 * rounding / h**2)
 
 
@@ -212,7 +212,7 @@ def test_a_smooth_signal_never_leaves_the_sliding_set_again(order, dtype, h):
     """|y^(n+1)| <= L: the position has no error at all, and the velocity that of interpolation, h^n L / (n + 1)."""
     t = h * np.arange(8000)
     rounding = float(np.finfo(dtype).eps)
-    estimate, _ = observed(DIFFERENTIATORS[order](dtype(1.0)), np.sin(t).astype(dtype), h, velocity=1.0)
+    estimate, _ = observe(DIFFERENTIATORS[order](dtype(1.0)), np.sin(t).astype(dtype), h, velocity=1.0)
     assert estimate.velocity.dtype == dtype
     late = slice(-2000, None)
     assert np.abs(estimate.position - np.sin(t))[late].max() <= 9.0 * rounding
@@ -237,17 +237,17 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     waves = np.sign(np.sin(2.0 * np.pi * t / (pace[:, None] * 6.0) + np.random.default_rng(5).uniform(0.0, 6.0)))
     true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
 
-    def one(y, h, *further):
-        return observed(observer, y, h, velocity=0.9, further=further)
+    def step(y, h, *further):
+        return observe(observer, y, h, velocity=0.9, further=further)
 
-    estimate, state = jax.vmap(one)(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]))
-    found = [estimate.position, estimate.velocity]
+    estimate, state = jax.vmap(step)(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]))
+    estimates = [estimate.position, estimate.velocity]
     if n >= 2:
-        found.append(estimate.control)
+        estimates.append(estimate.control)
     # further states are predicted for the coming sample, a period that is short beside their own time
-    found += [np.roll(x, 1, axis=1) for x in state.extra_states[1:]]
+    estimates += [np.roll(x, 1, axis=1) for x in state.extra_states[1:]]
     late = slice(-20_000, None)
-    errors = [np.abs(x - y)[:, late].max(axis=1) for x, y in zip(found, true, strict=False)]
+    errors = [np.abs(x - y)[:, late].max(axis=1) for x, y in zip(estimates, true, strict=False)]
     slopes = [np.polyfit(np.log(sizes), np.log(column), 1)[0] for column in errors]
     expected = [(n + 1 - i) / (n + 1) for i in range(len(slopes))]
     np.testing.assert_allclose(slopes, expected, atol=0.05)

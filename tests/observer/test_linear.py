@@ -17,14 +17,14 @@ def nominal(velocity):
     return 0.7 - FRICTION * velocity
 
 
-def observed(observer, measured, acceleration=nominal, period=H):
+def observe(observer, measured, acceleration=nominal, period=H):
     """Estimates along measured positions, from the first one at rest."""
 
-    def one(state, y):
+    def step(state, y):
         return observer.step(state, y, acceleration, period)
 
     start = observer.start(jnp.asarray(measured[0]), jnp.zeros((), measured.dtype), acceleration, jnp.asarray(period))
-    return jax.jit(lambda y: jax.lax.scan(one, start, y)[1])(jnp.asarray(measured))
+    return jax.jit(lambda y: jax.lax.scan(step, start, y)[1])(jnp.asarray(measured))
 
 
 def model(period=H):
@@ -52,10 +52,10 @@ def signal(count=2000):
 
 @pytest.mark.parametrize("observer", [ExtendedState(150.0), Kalman(1e-4, 30.0), Kalman(1e-4, 30.0, 0.5)])
 def test_observers_with_a_disturbance_are_the_linear_system_of_their_shares(observer):
-    found = observed(observer, signal())
+    estimates = observe(observer, signal())
     expected = estimator(observer.correction(nominal, jnp.asarray(H)), signal(), 3)
-    for own, other in zip(found, expected.T, strict=True):
-        np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
+    for estimated, other in zip(estimates, expected.T, strict=True):
+        np.testing.assert_allclose(estimated, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("damping", [0.5, 1.0, 2.0])
@@ -72,9 +72,9 @@ def test_luenberger_is_the_linear_system_of_its_shares(damping):
     system = (a @ correct, a @ shares[:2, None], correct, shares[:2, None], 1.0)
     y = signal()
     expected = dlsim(system, y, x0=np.array([y[0], 0.0]))[1]
-    found = observed(observer, y, free)
-    for own, other in zip(found, expected.T, strict=False):
-        np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
+    estimates = observe(observer, y, free)
+    for estimated, other in zip(estimates, expected.T, strict=False):
+        np.testing.assert_allclose(estimated, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("damping", [0.4, 0.999999, 1.0, 1.000001, 2.5])
@@ -110,7 +110,7 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
         width = 10.0 ** rng.uniform(-3.0, 0.3) / h
         slow, fast = noise * h**0.5 * width**3, noise * h**0.5 * width**2 * rng.integers(2)
 
-        own = correction(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
+        shares = correction(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
         still = np.array([*predict_next(0.0, 0.0, lambda v, f=friction: -f * v, h), 0.0])
         assert not still.any()
         a = np.stack(
@@ -122,8 +122,8 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
         back = np.linalg.inv(scale)
         p = solve_discrete_are((scale @ a @ back).T, np.eye(3, 1), scale @ q @ scale, np.eye(1))
         expected = p[:, 0] / (p[0, 0] + 1.0) / np.array([1.0, h, h * h])
-        assert all(share.dtype == dtype for share in own)
-        np.testing.assert_allclose(np.array(own, float), expected, rtol=tolerance)
+        assert all(share.dtype == dtype for share in shares)
+        np.testing.assert_allclose(np.array(shares, float), expected, rtol=tolerance)
 
 
 def test_dirty_derivative_is_the_filters_of_scipy():
@@ -138,10 +138,10 @@ def test_dirty_derivative_is_the_filters_of_scipy():
     moved = np.diff(y, prepend=y[0]) / H
     velocity = lfilter(*lag, moved)
     disturbance = lfilter(*lag, np.diff(velocity, prepend=0.0) / H)
-    found = observed(DirtyDerivative(tau), y, free)
-    np.testing.assert_allclose(found.velocity, velocity, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.control, disturbance, rtol=1e-9, atol=1e-6)
-    assert (np.asarray(found.position) == y).all()
+    estimates = observe(DirtyDerivative(tau), y, free)
+    np.testing.assert_allclose(estimates.velocity, velocity, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(estimates.control, disturbance, rtol=1e-9, atol=1e-6)
+    assert (np.asarray(estimates.position) == y).all()
 
 
 @pytest.mark.parametrize(
@@ -156,8 +156,8 @@ def test_a_constant_disturbance_is_found_whatever_friction_and_input(observer):
     end = (0.7 + missing) * slope
     velocity = end * (1.0 - np.exp(-FRICTION * t))
     position = end * t - velocity * slope
-    found = observed(observer, position)
+    estimates = observe(observer, position)
     lag = FRICTION * (2.0 / 300.0 - 0.5 * H) if observer.name == "luenberger" else 0.0
-    np.testing.assert_allclose(found.control[-500:], missing / (1.0 + lag), rtol=2e-3)
+    np.testing.assert_allclose(estimates.control[-500:], missing / (1.0 + lag), rtol=2e-3)
     if observer.name in ("extended_state", "kalman"):
-        np.testing.assert_allclose(found.velocity[-500:], velocity[-500:], rtol=1e-5)
+        np.testing.assert_allclose(estimates.velocity[-500:], velocity[-500:], rtol=1e-5)

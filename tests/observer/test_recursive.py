@@ -24,20 +24,20 @@ def identify(identifier, law, z, torques, time_constant=0.0, dtype=jnp.float64, 
     torques = {side: jnp.asarray(torque, dtype) for side, torque in torques.items()}
     h = jnp.asarray(H, dtype)
 
-    def one(state, given):
-        i, z, torques = given
+    def add_sample(state, inputs):
+        i, z, torques = inputs
         return identifier.step(state, law, low_pass, z, torques, i.astype(dtype) * h, h), None
 
-    def blockwise(state, given):
-        return identifier.settle(jax.lax.scan(one, state, given)[0]), None
+    def add_block(state, samples):
+        return identifier.settle(jax.lax.scan(add_sample, state, samples)[0]), None
 
     def run():
         state = identifier.init(law, tuple(torques), jnp.asarray(0.0, dtype))
         samples = (jnp.arange(z.size), z, torques)
         if block is None:
-            state, _ = jax.lax.scan(one, state, samples)
+            state, _ = jax.lax.scan(add_sample, state, samples)
         else:
-            state, _ = jax.lax.scan(blockwise, state, jax.tree.map(lambda x: x.reshape(-1, block), samples))
+            state, _ = jax.lax.scan(add_block, state, jax.tree.map(lambda x: x.reshape(-1, block), samples))
         return matrix_of(state), identifier.estimate(state, law), identifier.excitation(state)
 
     return jax.jit(run)()
@@ -46,7 +46,7 @@ def identify(identifier, law, z, torques, time_constant=0.0, dtype=jnp.float64, 
 def matrix_of(state):
     """The information matrix from its upper triangle."""
     n = len(state.regressors)
-    upper = jnp.stack([one.value(state.weight) for one in state.information])
+    upper = jnp.stack([total.value(state.weight) for total in state.information])
     rows, columns = jnp.triu_indices(n)
     return jnp.zeros((n, n), upper.dtype).at[rows, columns].set(upper).at[columns, rows].set(upper)
 

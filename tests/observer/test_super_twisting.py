@@ -51,22 +51,22 @@ def test_implicit_step_solves_its_generalised_equation(dtype, magnitude, sign, l
 def observe(observer, measured, h, acceleration=zero, state=(0.0, 0.0)):
     """Estimates along measured positions."""
 
-    def one(state, y):
+    def step(state, y):
         return observer.step(state, y, acceleration, h)
 
     start = ObserverState(*(jnp.asarray(x, measured.dtype) for x in state))
-    return jax.jit(lambda y: jax.lax.scan(one, start, y)[1])(measured)
+    return jax.jit(lambda y: jax.lax.scan(step, start, y)[1])(measured)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_implicit_does_not_chatter(dtype):
     """At rest the estimate stands still; under a constant perturbation z_2 is that perturbation."""
     observer = ImplicitSuperTwisting(4.0, 9.0)
-    rest = observe(observer, jnp.full(3000, 0.3, dtype), 1e-3)
+    at_rest = observe(observer, jnp.full(3000, 0.3, dtype), 1e-3)
     # what is left of the velocity no longer moves the position in its own rounding
-    assert jnp.all(rest.velocity[-500:] == rest.velocity[-1])
-    assert abs(rest.velocity[-1]) <= 0.3 * float(jnp.finfo(dtype).eps) / 1e-3
-    assert jnp.all(rest.control[-500:] == 0.0)
+    assert jnp.all(at_rest.velocity[-500:] == at_rest.velocity[-1])
+    assert abs(at_rest.velocity[-1]) <= 0.3 * float(jnp.finfo(dtype).eps) / 1e-3
+    assert jnp.all(at_rest.control[-500:] == 0.0)
     t = 1e-3 * np.arange(3000)
     pushed = observe(observer, jnp.asarray(1.5 * t**2), 1e-3)
     np.testing.assert_allclose(pushed.control[-500:], 3.0, rtol=1e-6)
@@ -83,10 +83,10 @@ def test_explicit_is_forward_euler_of_the_paper():
         z1, z2 = lambda_ * abs(y - x1) ** 0.5 * sign, alpha * sign
         expected.append((x1, x2, z2))
         x1, x2 = x1 + h * (x2 + z1), x2 + h * (0.3 - 0.5 * x2 + z2)
-    found = observe(
+    estimates = observe(
         ExplicitSuperTwisting(lambda_, alpha), jnp.asarray(measured), h, lambda v: 0.3 - 0.5 * v, state=(0.1, -0.2)
     )
-    np.testing.assert_allclose(np.stack(found, 1), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.stack(estimates, 1), expected, rtol=1e-9, atol=1e-12)
 
 
 def order(sizes, errors):
@@ -97,9 +97,9 @@ def errors_of(observer, h, noise=0.0, duration=6.0):
     """Largest errors of position and velocity over the last third of a run on sin t, whose acceleration is unknown."""
     t = h * np.arange(round(duration / h))
     measured = jnp.asarray(np.sin(t) + noise * np.random.default_rng(1).uniform(-1.0, 1.0, t.size))
-    found = observe(observer, measured, h, state=(0.05, 0.8))
+    estimates = observe(observer, measured, h, state=(0.05, 0.8))
     late = t > 2.0 / 3.0 * duration
-    return [np.abs(x - y)[late].max() for x, y in ((np.sin(t), found.position), (np.cos(t), found.velocity))]
+    return [np.abs(x - y)[late].max() for x, y in ((np.sin(t), estimates.position), (np.cos(t), estimates.velocity))]
 
 
 def test_errors_fall_with_the_period_as_theory_says():
@@ -129,13 +129,13 @@ def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(dis
     experiment = paper(discretisation, time_constant=0.01, noise=1e-4, start=0.2, steps=1000, velocity_error=0.5)
 
     def keep(state, signals):
-        kept = [
+        numbers = [
             (side.position_estimate, side.velocity_estimate, side.equivalent_control, side.torque_estimate)
             for side in (signals.motor, signals.load)
         ]
         read = {side: signals.side(side).measured for side in experiment.sides}
-        information = [one.value(state.identifier.weight) for one in state.identifier.information]
-        return (signals.time, signals.input, read), (kept, information)
+        information = [total.value(state.identifier.weight) for total in state.identifier.information]
+        return (signals.time, signals.input, read), (numbers, information)
 
     _, ((time, torque, measured), simulated) = eqx.filter_jit(lambda e: scan(e, jnp.asarray(5), record=keep))(experiment)
 
@@ -143,12 +143,12 @@ def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(dis
         # the simulated observers start from true positions, not from the first noisy reading
         start = eqx.tree_at(lambda s: s.plant, initial_state(experiment), None)
 
-        def one(state, sample):
+        def replay_sample(state, sample):
             new, signals = step(experiment, state, sample)
             assert signals.motor.true is None and signals.torque is None
             return new, keep(new, signals)[1]
 
-        return jax.lax.scan(one, start, samples)[1]
+        return jax.lax.scan(replay_sample, start, samples)[1]
 
     replayed = eqx.filter_jit(replay)(experiment, Sample(time, input=torque, measured=measured))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-15), replayed, simulated)

@@ -323,7 +323,7 @@ def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
 
 def test_two_processes_do_not_write_into_one_folder(copy):
     program = (
-        "import sys, pathlib\nfrom jaxbl.files import locked\nwith locked(pathlib.Path(sys.argv[1])):\n"
+        "import sys, pathlib\nfrom jaxbl.files import lock_folder\nwith lock_folder(pathlib.Path(sys.argv[1])):\n"
         "    print('has it', flush=True)\n    sys.stdin.readline()\n"
     )
     other = subprocess.Popen(
