@@ -144,7 +144,10 @@ def test_compiled_programs_of_others_are_not_run(home, monkeypatch, capsys):
     assert _find_cache_folder() == folder / sys.implementation.cache_tag
     folder.chmod(0o770)
     assert [_find_cache_folder(), _find_cache_folder()] == [None, None]
-    line = f"jaxbl: {folder}: can be written to by others; remove it, to have it made anew; compiled programs are not stored there"
+    line = (
+        f"jaxbl: {folder}: can be written to by others; remove it, to have it made anew; "
+        "compiled programs are not stored there"
+    )
     assert capsys.readouterr().err == f"{line}\n"
     folder.chmod(0o700)
     monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
