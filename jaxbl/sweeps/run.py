@@ -23,7 +23,7 @@ _PREPARED = 60.0
 
 
 def begun(folder: Path, engine: Engine, *, insist: bool, overwrite: bool = False) -> tuple[Engine, Store]:
-    """The store in a folder that is ours (:func:`jaxbl.files.lock_folder`), begun or continued, and the engine for it: chunks
+    """The store in a folder that is ours (:func:`jaxbl.files.lock_folder`), begun or continued, and its engine: chunks
     stay what they were when it was begun, on whatever machine. `insist`: the engine's backend was asked for.
 
     Raises:
