@@ -34,12 +34,12 @@ from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
 from jaxbl.identification import identify as whole  # noqa: E402
 from jaxbl.identification import log_columns  # noqa: E402
+from jaxbl.identification.free_parameters import make_free_parameters  # noqa: E402
 from jaxbl.identification.intervals import spread  # noqa: E402
 from jaxbl.identification.logs import arrays, gains_for, on_record  # noqa: E402
 from jaxbl.identification.regression import errors, regress  # noqa: E402
 from jaxbl.identification.search import ParameterSearch  # noqa: E402
 from jaxbl.identification.segments import segments_of  # noqa: E402
-from jaxbl.identification.trajectory import free_parameters  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
 from jaxbl.simulate import plant_trajectory  # noqa: E402
 
@@ -146,7 +146,7 @@ def six(discretisation="implicit"):
 
 def by_derivatives(experiment, paths, record):
     """Value, half-width of the 95 % interval, and theta, by filtered derivatives and least squares."""
-    free = free_parameters(experiment, paths, float(np.std(record.torque)))
+    free = make_free_parameters(experiment, paths, float(np.std(record.torque)))
     kinematics = differentiated(record.time, record.torque, record.positions, 100.0)
     fit = regress(experiment, free, [kinematics], 10)
     reach = 1.96 * np.sqrt(np.diag(np.asarray(spread(fit).covariance)))

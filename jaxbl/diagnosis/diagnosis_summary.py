@@ -14,7 +14,7 @@ import pandas as pd
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import parameters
-from jaxbl.identification.trajectory import Free
+from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
@@ -213,7 +213,7 @@ def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def rival_tables(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
+def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> dict[str, Any]:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.numbers, free_values(own, rival.theta)).resolved()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}

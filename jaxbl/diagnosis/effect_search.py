@@ -16,8 +16,8 @@ from scipy.special import softmax
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import set_leaves
+from jaxbl.identification.free_parameters import PRIOR_DEVIATION, FreeParameter, make_free_parameters
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
@@ -190,7 +190,7 @@ class EffectSearch:
     def __init__(
         self,
         experiment: Experiment,
-        free: Sequence[Free],
+        free: Sequence[FreeParameter],
         prior: Sequence[float],
         segments: Sequence[Segment],
         bound: float = np.inf,
@@ -219,8 +219,8 @@ class EffectSearch:
         key = _key(values, theta)
         if self._refitted is None or self._refitted[0] != key:
             experiment = with_numbers(self.nominal, values)
-            added = free_parameters(experiment, paths_of(values), self._torque)
-            width = np.concatenate([self.prior, np.full(len(added), WIDE)])
+            added = make_free_parameters(experiment, paths_of(values), self._torque)
+            width = np.concatenate([self.prior, np.full(len(added), PRIOR_DEVIATION)])
             start = np.concatenate([theta, np.zeros(len(added))])
             self._refitted = key, refined(experiment, (*self.free, *added), start, width, self.segments)
         return self._refitted[1]
@@ -242,7 +242,7 @@ class EffectSearch:
             if len(self._recent) == _RECENT:
                 self._recent.pop(next(iter(self._recent)))
             experiment = with_numbers(self.nominal, values)
-            added = free_parameters(experiment, paths_of(values), self._torque)
+            added = make_free_parameters(experiment, paths_of(values), self._torque)
             widths = [EFFECTS[name].roles()[leaf].width for name in values for leaf in _fitted_numbers(name)]
             prior, at = np.concatenate([self.prior, widths]), np.concatenate([theta, np.zeros(len(added))])
             bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(added), np.inf)])
@@ -684,7 +684,7 @@ def paths_of(names: Iterable[str]) -> list[str]:
     return [f"effects.{name}.{leaf}" for name in names for leaf in _fitted_numbers(name)]
 
 
-def _owner(one: Free) -> tuple[str, str]:
+def _owner(one: FreeParameter) -> tuple[str, str]:
     """The effect that a number is of, and its name there."""
     name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
     return name, leaf

@@ -28,10 +28,10 @@ from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 from jaxbl.workers import map_in_threads
 
@@ -44,7 +44,7 @@ _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
 
 
-def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
+def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, segment: Segment) -> Part:
     """A model along a segment, where its free numbers are at theta."""
     sides, smoothed = experiment.sides, segment.smoothed
     experiment, added = with_torques(experiment)
@@ -95,7 +95,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
 
 
 def _directions(
-    free: Sequence[Free], theta: np.ndarray, states: int, order: Sequence[int], added: Sequence[str]
+    free: Sequence[FreeParameter], theta: np.ndarray, states: int, order: Sequence[int], added: Sequence[str]
 ) -> list[Direction]:
     """Each state, torque on each side (`added`: their paths), input, each free number."""
     return [
@@ -290,7 +290,7 @@ class Linear:
     def __init__(
         self,
         experiment: Experiment,
-        free: Sequence[Free],
+        free: Sequence[FreeParameter],
         theta: Float[np.ndarray, " numbers"],
         prior: np.ndarray,
         segments: Sequence[Segment],
@@ -307,7 +307,7 @@ class Linear:
         """
         self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
-        self.experiment = with_fitted(experiment, free, self.theta)
+        self.experiment = set_free_parameters(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
         self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
         self.signals = [

@@ -17,11 +17,11 @@ from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.errors import InputError
+from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.identification.intervals import UNSEEN, Spread
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
 from jaxbl.identification.segments import reading_noise, segments_of
-from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
@@ -107,7 +107,7 @@ def _set_up(task: DiagnosisTask) -> _Search:
     model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
     own = default_paths(config, bare)
     paths = {name: f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()}
-    free = free_parameters(model, [*own, *paths.values()], size)
+    free = make_free_parameters(model, [*own, *paths.values()], size)
     width = widths(free, np.e)
     width[: len(own)] = config.uncertainty.relative
     effects = {name: len(own) + i for i, name in enumerate(names)}
@@ -157,7 +157,7 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)))
 
 
-def _own(search: _Search) -> list[Free]:
+def _own(search: _Search) -> list[FreeParameter]:
     """The model's own numbers."""
     return [one for i, one in enumerate(search.model.free) if i not in search.effects.values()]
 
@@ -310,7 +310,7 @@ def _summary(
     }  # fmt: skip
 
 
-def _changes(search: _Search, alone: Alone) -> list[tuple[Free, float]]:
+def _changes(search: _Search, alone: Alone) -> list[tuple[FreeParameter, float]]:
     """Changes of the model's own numbers (theta)."""
     places = {one.path: float(x) for one, x in zip(search.model.free, alone.point.theta, strict=True)}
     return [(one, places[one.path]) for one in _own(search)]

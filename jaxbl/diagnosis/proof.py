@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters
-from jaxbl.identification.trajectory import Free
+from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -47,7 +47,7 @@ class FittedModel(NamedTuple):
 
     names: tuple[str, ...]
     experiment: Experiment
-    free: tuple[Free, ...]
+    free: tuple[FreeParameter, ...]
     theta: np.ndarray
     covariance: np.ndarray
     white: np.ndarray
@@ -96,7 +96,7 @@ def _least_gain(name: str) -> float:
     return SURE if EFFECTS[name].in_time else SEEN
 
 
-def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
+def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> dict[str, float]:
     """Values of free numbers, by path; theta may have others behind them."""
     return {one.path: float(one.value(theta[i])) for i, one in enumerate(free)}
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import simulate_plant
+from jaxbl.identification.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.identification.intervals import spread_of
 from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear, Predictor
@@ -72,7 +72,9 @@ class _Point(NamedTuple):
 class _Refiner:
     """Gauss-Newton with step control."""
 
-    def __init__(self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment]):
+    def __init__(
+        self, experiment: Experiment, free: Sequence[FreeParameter], width: np.ndarray, segments: Sequence[Segment]
+    ):
         self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
 
     def start(self) -> list[np.ndarray]:
@@ -92,7 +94,7 @@ class _Refiner:
     def _path(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> list[Segment]:
         """The segments with the filtered motion of a model in place of the smoothed one."""
         sides = self.experiment.sides
-        experiment = with_fitted(self.experiment, self.free, theta)
+        experiment = set_free_parameters(self.experiment, self.free, theta)
         gain = Linear.gain_of(smoothness, self.segments[0].period)
         gains = {side: gain[j] for j, side in enumerate(sides)}
         found = []
@@ -164,10 +166,10 @@ class _Refiner:
 
 
 def refined(
-    experiment: Experiment, free: Sequence[Free], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
+    experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
 ) -> Refined:
     """Refine the numbers of a model from theta; arguments as of :class:`.linearised_model.Linear` (`width`: its `prior`)."""
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
-    model = with_fitted(experiment, free, best.theta)
+    model = set_free_parameters(experiment, free, best.theta)
     return Refined(model, best.theta, *refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.errors import InputError
+from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import Segment, segments_of
-from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
@@ -68,7 +68,7 @@ class Setup(NamedTuple):
     sliding: list[str]
     bare: Experiment
     nominal: Experiment
-    own: tuple[Free, ...]
+    own: tuple[FreeParameter, ...]
     prior: np.ndarray
     recorded: Sequence[Segment]
     fitted: ReferenceLog
@@ -91,7 +91,7 @@ def set_up(task: DiagnosisTask) -> Setup:
     # one structure for all models, so that they share their compiled programs
     nominal = complete(bare)
     _check_order(bare)
-    own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
+    own = make_free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
     recorded, held = (segments_of(one, nominal.sides, rest) for one in (record, task.holdout))
@@ -116,7 +116,7 @@ def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
     return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
 
 
-def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> InputNoise:
+def _input_noise(size: float, nominal: Experiment, own: Sequence[FreeParameter], segments: Sequence[Segment]) -> InputNoise:
     """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
     `size`, that is not asked."""
     noise = estimate_white_noise([one.torque for one in segments])

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jaxbl.drive.effects import EFFECTS
+from jaxbl.identification.free_parameters import set_free_parameters
 from jaxbl.identification.intervals import long_run
-from jaxbl.identification.trajectory import with_fitted
 
 from .effect_search import EffectSearch
 from .proof import FittedModel
@@ -38,7 +38,7 @@ def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) 
     counts = [len(first[side]) for side in sides]
 
     def missing(theta: np.ndarray) -> np.ndarray:
-        experiment = with_fitted(fitted.experiment, fitted.free, theta)
+        experiment = set_free_parameters(fitted.experiment, fitted.free, theta)
         left, gain = log.missing(experiment), float(experiment.plant.input_gain)
         return np.concatenate([left[side] / (gain * scale[side]) for side in sides])
 
@@ -54,7 +54,7 @@ def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) 
         max_nfev=_EVALUATIONS,
     )
     jacobian, left = found.jac[: -len(root)], found.fun[: -len(root)]
-    experiment = with_fitted(fitted.experiment, fitted.free, found.x)
+    experiment = set_free_parameters(fitted.experiment, fitted.free, found.x)
     variance = float(np.mean((left * np.repeat(np.sqrt(list(apart.values())), counts)) ** 2))
     white = np.linalg.pinv(jacobian.T @ jacobian / variance + np.diag(prior), hermitian=True)
     middle = long_run(jacobian * left[:, None]) / variance**2 + np.diag(prior)

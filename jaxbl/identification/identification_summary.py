@@ -14,12 +14,13 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
+from .free_parameters import FreeParameter
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
 from .regression import Kinematics, errors, regress
 from .search import Found
 from .segments import long_enough, reading_noise, segments_of, windows_of
-from .trajectory import Fit, Free, projected_residual
+from .trajectory import Fit, projected_residual
 
 
 def torque_errors(
@@ -78,7 +79,7 @@ def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     return derived
 
 
-def _parameters(record: Record, free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
+def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
     """Values with standard errors and 95 % intervals, by path."""
     theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
     return {
@@ -94,7 +95,7 @@ def _parameters(record: Record, free: Sequence[Free], fit: Fit, width: Spread) -
 
 
 def by_regression(
-    nominal: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int, record: Record
+    nominal: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, record: Record
 ) -> dict[str, Any]:
     """Least squares on the equations of motion; numbers that they do not show are left out."""
     found = regress(nominal, free, parts, factor)

@@ -21,6 +21,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
+from .free_parameters import FreeParameter, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
@@ -29,7 +30,6 @@ from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_al
 from .regression import remembers_input
 from .search import ParameterSearch
 from .segments import Segment, led_in, long_enough, segments_of
-from .trajectory import Free, free_parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     with jax.enable_x64(True), limit_blas_threads():
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
-        free = free_parameters(nominal, paths, float(np.std(record.torque)))
+        free = make_free_parameters(nominal, paths, float(np.std(record.torque)))
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
         segments = segments_of(record, sides, rest)
         done()
@@ -159,7 +159,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
 
 
 def _from_motor(
-    task: LogTask, nominal: Experiment, free: tuple[Free, ...], segments: list[Segment], done: Callable[[], None]
+    task: LogTask, nominal: Experiment, free: tuple[FreeParameter, ...], segments: list[Segment], done: Callable[[], None]
 ) -> Identification:
     """The rest of an identification without the load's encoder; what needs both encoders is left out."""
     config, record = task.config, task.record

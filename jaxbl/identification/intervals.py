@@ -15,7 +15,8 @@ from scipy.special import chdtri, ndtri
 
 from jaxbl.simulate import Experiment
 
-from .trajectory import Fit, Free, Windows, fits
+from .free_parameters import FreeParameter
+from .trajectory import Fit, Windows, fits
 
 NORMAL = float(ndtri(0.975))
 """Standard errors on either side of a value that a 95 % interval reaches to."""
@@ -99,7 +100,7 @@ def long_run(scores: np.ndarray) -> np.ndarray:
     return sums.T @ sums / length
 
 
-def interval(one: Free, theta: float, deviation: float) -> tuple[float, float]:
+def interval(one: FreeParameter, theta: float, deviation: float) -> tuple[float, float]:
     """95 % interval of a value, from its theta; never below zero where the value must be positive."""
     reach = NORMAL * deviation
     low, high = (float(one.value(theta + side * reach)) for side in (-1.0, 1.0))
@@ -113,7 +114,7 @@ class Refusal(NamedTuple):
     deviation: float
 
 
-def refusals(free: Sequence[Free], found: Spread) -> tuple[list[Refusal], float]:
+def refusals(free: Sequence[FreeParameter], found: Spread) -> tuple[list[Refusal], float]:
     """Directions of theta with a standard deviation above :data:`UNSEEN`, and the condition number of the information.
 
     Directions are eigenvectors of the covariance, components below a tenth of the largest left out.
@@ -147,7 +148,9 @@ class Profile(NamedTuple):
     deviance: np.ndarray
 
 
-def profile(experiment: Experiment, free: Sequence[Free], windows: Windows, best: Fit, width: Spread) -> dict[str, Profile]:
+def profile(
+    experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, best: Fit, width: Spread
+) -> dict[str, Profile]:
     """Profile every fitted number, for intervals of 95 %.
 
     The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
@@ -181,7 +184,7 @@ def profile(experiment: Experiment, free: Sequence[Free], windows: Windows, best
 
 
 def _gathered(
-    one: Free, centre: float, below: list[tuple[float, float]], above: list[tuple[float, float]], limit: float
+    one: FreeParameter, centre: float, below: list[tuple[float, float]], above: list[tuple[float, float]], limit: float
 ) -> Profile:
     lower, upper = (_end(points, limit) for points in (below, above))
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])

@@ -21,9 +21,9 @@ from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
 
+from .free_parameters import PLANT_TABLES, is_positive
 from .observer_gains import ChosenGains, choose_gains
 from .segments import Segment
-from .trajectory import PHYSICAL, is_positive
 
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
@@ -267,7 +267,7 @@ def default_paths(config: Config, experiment: Experiment) -> list[str]:
     return [
         path
         for path, about in leaf_paths(experiment).items()
-        if path.split(".")[0] in PHYSICAL
+        if path.split(".")[0] in PLANT_TABLES
         and path not in config.uncertainty.exact
         and not (is_positive(about) and float(get_leaf(experiment, path)) <= 0.0)
         and not (about.role and about.role.kind == "held" and float(get_leaf(experiment, path)) == about.role.neutral)

@@ -17,10 +17,11 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
+from .free_parameters import FreeParameter
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .search import Found
 from .segments import Segment, reading_noise, segments_of
-from .trajectory import Free, Windows
+from .trajectory import Windows
 from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, inverse, is_known, widths
 
 
@@ -60,7 +61,7 @@ class Alone(NamedTuple):
 
 def search_alone(
     nominal: Experiment,
-    free: Sequence[Free],
+    free: Sequence[FreeParameter],
     segments: Sequence[Segment],
     settings: IdentifyTable,
     record: Record,

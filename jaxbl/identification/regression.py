@@ -21,7 +21,8 @@ from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
 from .compilation import jit
-from .trajectory import WIDE, Fit, Free, with_fitted
+from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
+from .trajectory import Fit
 
 _PASSES = 3
 """Fits, each with the weights of the residuals of the one before."""
@@ -258,7 +259,7 @@ def shortest(factor: int) -> int:
 
 
 @jit
-def regress(experiment: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int) -> Fit:
+def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int) -> Fit:
     """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
 
     Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
@@ -269,13 +270,13 @@ def regress(experiment: Experiment, free: Sequence[Free], parts: Sequence[Kinema
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
     def left(theta: Array, _: None = None) -> Array:
-        at = with_fitted(experiment, free, theta)
+        at = set_free_parameters(experiment, free, theta)
         each = [balance(at, part) for part in parts]
         columns = [jnp.concatenate([decimate(one[name].residual, factor) for one in each]) for name in names]
         return jnp.stack(columns, axis=-1)
 
     def weighted(theta: Array, weights: Array) -> tuple[Array, Array]:
-        return left(theta) * weights[None, :], theta / WIDE
+        return left(theta) * weights[None, :], theta / PRIOR_DEVIATION
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 

@@ -12,10 +12,11 @@ from jaxbl.config.logs import IdentifyTable
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 
+from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import Refusal, Spread, refusals, spread
 from .prediction import predictor
 from .segments import Segment, windows_of
-from .trajectory import Fit, Free, Windows, fits, with_fitted
+from .trajectory import Fit, Windows, fits
 
 _LONG, _SHORT = 500, 50
 """Samples of the windows that are tried where no length is asked for."""
@@ -50,7 +51,7 @@ class Fitted:
         between: by how much theta differs between the window lengths that were tried; None if there was one.
     """
 
-    free: tuple[Free, ...]
+    free: tuple[FreeParameter, ...]
     fit: Fit
     spread: Spread
     windows: Windows
@@ -81,7 +82,7 @@ class Found(Fitted):
     starts: list[dict[str, Any]]
 
 
-def _nearest_turn(free: Sequence[Free], theta: np.ndarray) -> np.ndarray:
+def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
     """Theta with phases within half a turn of their nominal values."""
     turns = np.array([2.0 * np.pi / one.scale if one.role == "angle" else 0.0 for one in free])
     return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
@@ -121,7 +122,7 @@ class ParameterSearch:
                 )
             self.lengths = [asked]
 
-    def run(self, free: tuple[Free, ...]) -> Found:
+    def run(self, free: tuple[FreeParameter, ...]) -> Found:
         """Fit; of directions that the record does not show, one number at a time is taken out.
 
         Raises:
@@ -145,7 +146,7 @@ class ParameterSearch:
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
         return windows_of(self.segments, self.experiment, samples, self.rest)
 
-    def _coarse(self, free: tuple[Free, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Best of several starts, on short windows from all over the record.
 
         Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.
@@ -172,7 +173,7 @@ class ParameterSearch:
         ]
         return _nearest_turn(free, found[best]), starts
 
-    def _whole(self, free: tuple[Free, ...], theta: np.ndarray, kept: np.ndarray) -> Fitted:
+    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, kept: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
 
         def fitted(windows: Windows) -> Fit:
@@ -185,7 +186,7 @@ class ParameterSearch:
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
-                    windows, smoothness = predictor(with_fitted(self.experiment, free, jnp.asarray(theta)), windows)
+                    windows, smoothness = predictor(set_free_parameters(self.experiment, free, jnp.asarray(theta)), windows)
                     theta = np.asarray(fitted(windows).theta)
             found = fitted(windows).only(np.flatnonzero(kept))
             width = spread(found)

@@ -20,11 +20,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
-from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment, PlantState, plant_trajectory
 
 from .compilation import jit
+from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 
 _INNER = 2
 """Initial states tried at each step of the fit."""
@@ -42,73 +41,6 @@ _AT_ONCE = 8
 """Fits that an accelerator does at once."""
 _GAINED = 1.0
 """Residuals' variances that new initial states must gain in a window for the solver to start again."""
-WIDE = 3.0
-"""Prior standard deviation of theta: a factor of e^3, wider than any number is known."""
-
-
-class Free(NamedTuple):
-    """A number to be fitted: value = scale exp(theta) where it must stay positive, nominal + scale theta elsewhere.
-
-    theta is 0 at the nominal value, and a change of theta is a relative change; of an angle, it is in rad. `role` is the
-    part that the number plays in its effect (:class:`jaxbl.drive.effects.Role`), if it is one of an effect; `most`: the
-    largest value that a study may give it.
-    """
-
-    path: str
-    unit: str
-    nominal: float
-    scale: float
-    positive: bool
-    role: str = ""
-    most: float | None = None
-
-    def value(self, theta: Any) -> Any:
-        value = self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
-        if self.most is None:
-            return value
-        return jnp.minimum(value, self.most) if isinstance(value, jax.Array) else np.minimum(value, self.most)
-
-    def slope(self, theta: Any) -> Any:
-        """Derivative of the value."""
-        return self.scale * (_exp(theta) if self.positive else 0.0 * theta + 1.0)
-
-
-def _exp(values: Any) -> Any:
-    """Of JAX only where it has to be: a number by itself would be a program."""
-    return jnp.exp(values) if isinstance(values, jax.Array) else np.exp(values)
-
-
-def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float) -> tuple[Free, ...]:
-    """Describe the numbers that dotted paths name; the input's size, N m, is the scale of torques whose nominal value is 0.
-
-    Raises:
-        InputError: unknown path, one that no trajectory depends on, or a positive number without a value to start from.
-    """
-    known = {path: known for path, known in leaf_paths(experiment).items() if path.split(".")[0] in PHYSICAL}
-    free = []
-    for path in paths:
-        if path not in known:
-            raise InputError(f"'{path}' is no number of the plant; fitted can be: {', '.join(known)}")
-        if path in paths[: len(free)]:
-            raise InputError(f"'{path}' is named twice; once is enough")
-        nominal, about = float(get_leaf(experiment, path)), known[path]
-        positive = is_positive(about)
-        if positive and nominal <= 0.0:
-            raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
-        role = about.role.kind if about.role else ""
-        # an angle has no relative size
-        scale = 1.0 if role == "angle" else abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
-        free.append(Free(path, about.unit, nominal, scale, positive, role, about.maximum))
-    return tuple(free)
-
-
-PHYSICAL = ("drive", "transmission", "effects")
-"""Tables of the config whose numbers move the plant."""
-
-
-def is_positive(about: Parameter) -> bool:
-    """Whether a number must not become negative."""
-    return any(limit is not None and limit >= 0.0 for limit in (about.minimum, about.above))
 
 
 class Windows(eqx.Module):
@@ -184,11 +116,6 @@ class Fit(eqx.Module):
         """Some of the numbers; the others were held."""
         theta, jacobian = (jnp.asarray(np.asarray(x)[..., which]) for x in (self.theta, self.jacobian))
         return dataclasses.replace(self, theta=theta, jacobian=jacobian)
-
-
-def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Array | np.ndarray) -> Experiment:
-    """The experiment with fitted numbers."""
-    return set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(free)})
 
 
 @eqx.filter_jit
@@ -293,15 +220,15 @@ def projected_residual(
 
 
 def _sloped(
-    experiment: Experiment, free: Sequence[Free], windows: Windows, theta: Float[Array, " parameters"]
+    experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Float[Array, " parameters"]
 ) -> tuple[Array, PlantState, Array]:
     """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
 
     def one(window: Windows) -> tuple[Array, PlantState, Array]:
-        found = _eliminate(with_fitted(experiment, free, theta), window, _INNER, False)
+        found = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
 
         def residual(theta: Array) -> tuple[Array, Array]:
-            value = _residual(with_fitted(experiment, free, theta), found.start, window)
+            value = _residual(set_free_parameters(experiment, free, theta), found.start, window)
             return value, value
 
         slope, value = jax.jacfwd(residual, has_aux=True)(theta)
@@ -342,7 +269,11 @@ class _Point(NamedTuple):
 
 
 def _reduced(
-    experiment: Experiment, free: Sequence[Free], windows: Windows, theta: Float[Array, " parameters"], moving: Array
+    experiment: Experiment,
+    free: Sequence[FreeParameter],
+    windows: Windows,
+    theta: Float[Array, " parameters"],
+    moving: Array,
 ) -> _Point:
     """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
 
@@ -351,9 +282,9 @@ def _reduced(
     """
     value, start, slope = _sloped(experiment, free, windows, theta)
     each = jnp.sum(value**2, axis=(1, 2))
-    total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
-    normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
-    towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / WIDE**2)
+    total = jnp.sum(each) + jnp.sum((theta / PRIOR_DEVIATION) ** 2)
+    normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / PRIOR_DEVIATION**2)
+    towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / PRIOR_DEVIATION**2)
     size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
     root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
     seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
@@ -423,7 +354,7 @@ def _solve(
 
 def fit(
     experiment: Experiment,
-    free: Sequence[Free],
+    free: Sequence[FreeParameter],
     windows: Windows,
     theta: Float[Array, " parameters"],
     most_steps: int | Int[Array, ""] = 100,
@@ -455,7 +386,7 @@ def fit(
 
     def anew(theta: Array) -> tuple[Array, PlantState]:
         """Initial states that do not depend on those found before, and what is left over then in each window."""
-        value, start = projected_residual(with_fitted(experiment, free, theta), windows)
+        value, start = projected_residual(set_free_parameters(experiment, free, theta), windows)
         return jnp.sum(value**2, axis=(1, 2)), start
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -487,7 +418,7 @@ _batch = jit(eqx.filter_vmap(fit, in_axes=(None, None, None, 0, None, 0, None)))
 
 def fits(
     experiment: Experiment,
-    free: Sequence[Free],
+    free: Sequence[FreeParameter],
     windows: Windows,
     thetas: np.ndarray,
     most_steps: int = 100,

@@ -31,11 +31,12 @@ from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
+from .free_parameters import PRIOR_DEVIATION, FreeParameter
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
 from .regression import begun
 from .segments import Segment
-from .trajectory import WIDE, Fit, Free
+from .trajectory import Fit
 
 _STEP, _SHORTEST = 1e-2, 1e-6
 """Largest and least change of theta, or of a start, for derivatives."""
@@ -120,7 +121,12 @@ class UnseenLoad:
     """
 
     def __init__(
-        self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment], rest: bool
+        self,
+        experiment: Experiment,
+        free: Sequence[FreeParameter],
+        width: np.ndarray,
+        segments: Sequence[Segment],
+        rest: bool,
     ):
         self.experiment, self.free, self.width, self.rest = experiment, tuple(free), np.asarray(width), rest
         self.segments = segments
@@ -512,24 +518,24 @@ def _stepped(experiment: Experiment, factor: int) -> Experiment:
     )
 
 
-def is_gap(one: Free) -> bool:
+def is_gap(one: FreeParameter) -> bool:
     """Whether a number makes a gap."""
     return one.path.endswith(GAPS)
 
 
-def half_gap_of(one: Free) -> float:
+def half_gap_of(one: FreeParameter) -> float:
     """Half gap for 1 of the number that makes it."""
     return 4.0 if one.path.endswith("dead_zone") else 1.0
 
 
-def is_known(one: Free) -> bool:
+def is_known(one: FreeParameter) -> bool:
     """Whether data sheets and CAD know a number within a small factor."""
     return one.path.endswith(("inertia", ".stiffness"))
 
 
-def widths(free: Sequence[Free], factor: float) -> np.ndarray:
+def widths(free: Sequence[FreeParameter], factor: float) -> np.ndarray:
     """Prior standard deviations of theta: inertias and stiffness are known within a factor, a gap not at all."""
-    each = [_ANY if is_gap(one) else np.log(factor) if is_known(one) else WIDE for one in free]
+    each = [_ANY if is_gap(one) else np.log(factor) if is_known(one) else PRIOR_DEVIATION for one in free]
     return np.array(each)
 
 

@@ -6,10 +6,10 @@ from hidden.cases import cases
 from hidden_log import driven, logged, model
 
 from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
+from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.identify import read_identification_task
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import segments_of
-from jaxbl.identification.trajectory import free_parameters
 
 SEED = 21
 _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}
@@ -23,7 +23,7 @@ def explained(case, tmp_path):
 def search(log, study):
     task = read_identification_task(log, study)
     nominal = on_record(task.config, task.record)
-    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    free = make_free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
     return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides))
 

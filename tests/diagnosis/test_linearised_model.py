@@ -15,9 +15,9 @@ from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.whittle import spectrum_of, weighted_products
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
+from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.segments import segments_of
 from jaxbl.identification.smoother import Smoothed
-from jaxbl.identification.trajectory import free_parameters
 from jaxbl.records import read_record
 from jaxbl.sweeps.trial import run
 
@@ -44,7 +44,7 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0
     log = tmp_path / "log.csv"
     trace[["t", "u", "theta_e", *(["theta_s"] if sides == 2 else [])]].to_csv(log, index=False)
     record = read_record(log)
-    free = free_parameters(experiment, PATHS[sides], 1.0)
+    free = make_free_parameters(experiment, PATHS[sides], 1.0)
     (segment,) = segments_of(record, experiment.sides)
     rng, smoothed = np.random.default_rng(3), {}
     for side, one in segment.smoothed.items():

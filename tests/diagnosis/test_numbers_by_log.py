@@ -10,7 +10,7 @@ import pytest
 
 from jaxbl.config import prepare, read_model
 from jaxbl.diagnosis.numbers_by_log import contradictions
-from jaxbl.identification.trajectory import free_parameters
+from jaxbl.identification.free_parameters import make_free_parameters
 
 INERTIA, VISCOUS, SAMPLES = 4e-5, 1e-4, 4000
 
@@ -64,7 +64,7 @@ def found(
     config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
     with jax.enable_x64(True):
         experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
-        free = free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
+        free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
         log = Torques(segments[: 1 if separate else 2], (first, second), turned, noise, rough)
         held = Torques(segments[1:], (first, second), turned, noise, rough)

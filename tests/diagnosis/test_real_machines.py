@@ -8,9 +8,9 @@ from small_study import rigid
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
 from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.residuals import narrowed
+from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import segments_of
-from jaxbl.identification.trajectory import free_parameters
 
 COULOMB = {"kind": "motor.coulomb_friction", "torque": 20.0}
 VISCOUS = {"kind": "motor.viscous_friction", "viscous": 206.0}
@@ -31,7 +31,7 @@ def emps(*effects):
 def explained(log, study):
     task = read_diagnosis_task(log, study)
     nominal = on_record(task.config, task.record)
-    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    free = make_free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
     return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 

@@ -13,10 +13,10 @@ from jaxbl.diagnosis.neutral_effects import complete
 from jaxbl.diagnosis.refit import _Refiner, refined
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import segments_of
-from jaxbl.identification.trajectory import free_parameters, with_fitted
 from jaxbl.simulate import plant_trajectory
 
 NAME = "motor.coulomb_friction"
@@ -30,8 +30,8 @@ def setting(tmp_path_factory):
     bare = on_record(task.config, task.record)
     experiment = with_numbers(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
     torque = float(np.std(task.record.torque))
-    own = free_parameters(bare, default_paths(task.config, bare), torque)
-    free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
+    own = make_free_parameters(bare, default_paths(task.config, bare), torque)
+    free = (*own, *make_free_parameters(experiment, paths_of([NAME]), torque))
     width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
     return experiment, free, width, segments_of(task.record, bare.sides)
 
@@ -46,7 +46,7 @@ def test_prediction_errors_are_least(setting):
 
     @jit
     def predicted(given):
-        one = with_fitted(experiment, free, given[2:] * 0.01)
+        one = set_free_parameters(experiment, free, given[2:] * 0.01)
         start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))
         return plant_trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
@@ -72,8 +72,8 @@ def test_deviations_are_those_of_repetitions(tmp_path):
         bare = on_record(task.config, task.record)
         experiment = with_numbers(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
         torque = float(np.std(task.record.torque))
-        own = free_parameters(bare, default_paths(task.config, bare), torque)
-        free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
+        own = make_free_parameters(bare, default_paths(task.config, bare), torque)
+        free = (*own, *make_free_parameters(experiment, paths_of([NAME]), torque))
         width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
         found = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
         values.append(found.theta[-1])

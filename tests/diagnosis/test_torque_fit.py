@@ -10,7 +10,7 @@ from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.proof import fit_model
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_fit import fit_to_torque
-from jaxbl.identification.trajectory import with_fitted
+from jaxbl.identification.free_parameters import set_free_parameters
 
 KIND, TORQUE = FRICTION["kind"], FRICTION["torque"]
 
@@ -30,7 +30,7 @@ def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins
         )
         assert np.all(deviation > 0.0) and by_torque.linear is not fitted.linear
         theta = fitted.theta + np.array([0.03, -0.03, 0.3])
-        away = fitted._replace(theta=theta, experiment=with_fitted(fitted.experiment, fitted.free, theta))
+        away = fitted._replace(theta=theta, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
         again = fit_to_torque(search, away, setup.fitted)
     # the prior weighs more where more torque is missing at first
     np.testing.assert_allclose(again.theta, by_torque.theta, atol=3.0 * np.max(deviation))

@@ -9,8 +9,9 @@ from small_study import rigid
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.intervals import interval, profile, spread
-from jaxbl.identification.trajectory import _fit, cut, fit, free_parameters
+from jaxbl.identification.trajectory import _fit, cut, fit
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 
@@ -34,7 +35,7 @@ def record(seed=0, size=0.2, drag=0.15):
 
 def fitted(paths, windows):
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
-    free = free_parameters(experiment, paths, 1.0)
+    free = make_free_parameters(experiment, paths, 1.0)
     found = _fit(experiment, free, windows, jnp.zeros(len(free)))
     return experiment, free, found
 

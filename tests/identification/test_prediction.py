@@ -8,10 +8,11 @@ from small_study import rigid
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import kalman_gain, predictor
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import cut, fit, free_parameters
+from jaxbl.identification.trajectory import cut, fit
 
 PERIOD, SAMPLES = 2e-3, 3000
 
@@ -49,7 +50,7 @@ def disturbed(force, seed=0):
 
 def experiment_and_free():
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
-    return experiment, free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
+    return experiment, make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
 
 
 @jit

@@ -10,6 +10,7 @@ from scipy import signal
 from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
+from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.identification.intervals import interval, spread
 from jaxbl.identification.regression import (
     Kinematics,
@@ -22,7 +23,6 @@ from jaxbl.identification.regression import (
     shortest,
 )
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import free_parameters, with_fitted
 from jaxbl.records import read_record
 
 T = jnp.linspace(0.0, 2.0, 4001)
@@ -117,7 +117,7 @@ def test_a_measured_torque_gives_stiffness_and_gap_directly():
     """No observer: torque over twist. The truth is a hard gap; 40 realisations of the noise."""
     t, load, z, c, random = geared_record(1e-4)
     experiment = prepare(read_config(small(transmission=LAW | {"stiffness": 40.0, "half_gap": 0.06})))
-    free = free_parameters(experiment, ["transmission.stiffness", "transmission.half_gap"], 1.0)
+    free = make_free_parameters(experiment, ["transmission.stiffness", "transmission.half_gap"], 1.0)
     in_contact = np.abs(c) > 0.5
     hits = np.zeros(2)
     for _ in range(40):
@@ -146,13 +146,13 @@ def test_emps_by_the_published_method_and_measure():
     experiment = prepare(config)
     paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque",
              "effects.motor.constant_torque.torque"]  # fmt: skip
-    free = free_parameters(experiment, paths, 50.0)
+    free = make_free_parameters(experiment, paths, 50.0)
     records = [read_record(real(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
     parts = [differentiated(r.time, r.torque, r.positions, 100.0) for r in records]
     found = regress(experiment, free, parts[:1], 10)
     values = [float(one.value(found.theta[i])) for i, one in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
-    fitted = with_fitted(experiment, free, found.theta)
+    fitted = set_free_parameters(experiment, free, found.theta)
     assert errors(fitted, parts[:1], 10)["motor"]["relative"] < 0.042
     assert errors(fitted, parts[1:], 10)["motor"]["relative"] < 0.054
     # the smoother in place of the filter says the same

@@ -16,9 +16,10 @@ from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit, free_parameters, with_fitted
+from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit
 from jaxbl.simulate import plant_trajectory, replay
 
 TRUE = {
@@ -94,7 +95,7 @@ def fitted(kind):
     integrator."""
     experiment = drive(3)
     torque, states = map(jnp.asarray, recorded(kind, 600))
-    free = free_parameters(experiment, list(TRUE), 1.0)
+    free = make_free_parameters(experiment, list(TRUE), 1.0)
     keys = jax.random.split(jax.random.key(7), 200)
     windows = realisations(torque, states, {"motor": 3e-4, "load": 6e-5}, keys, 300)
     starts = 0.03 * jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 1), (len(free),)))(keys)
@@ -110,7 +111,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
 
     @jit
     def residual(both):
-        at = with_fitted(experiment, free, both[:6])
+        at = set_free_parameters(experiment, free, both[:6])
         starts = both[6:].reshape(2, 4)
 
         def one(x, u, motor, load):
@@ -157,7 +158,7 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
     gains = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
     tables = {"observer": gains, "equivalent_control": {"time_constant": 0.01}, "identifier": {"start": 0.5}}
     experiment = drive(3, period, **tables)
-    free = free_parameters(experiment, list(TRUE), 1.0)
+    free = make_free_parameters(experiment, list(TRUE), 1.0)
 
     def by_chain(key):
         def last(state, signals):
@@ -193,7 +194,7 @@ def test_scales_that_one_record_cannot_part_are_refused():
     readings = {"motor": simulated + 1e-5 * jax.random.normal(jax.random.key(2), (1000,))}
     paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     paths.append("effects.actuator.gain_error.relative")
-    free = free_parameters(experiment, paths, 0.1)
+    free = make_free_parameters(experiment, paths, 0.1)
     smoothed = smooth(readings["motor"], PERIOD)
     start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
     windows = cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250)
@@ -238,7 +239,7 @@ def test_residual_correlation_widens_intervals():
 def test_what_cannot_be_fitted(paths, message):
     law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
     with pytest.raises(InputError, match=message):
-        free_parameters(read_config(small(transmission=law)).build(), paths, 1.0)
+        make_free_parameters(read_config(small(transmission=law)).build(), paths, 1.0)
 
 
 def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
@@ -265,6 +266,6 @@ def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
 def test_a_number_stays_within_what_a_study_may_say():
     """A fit may ask for more damping than the effect has."""
     damped = {"kind": "load.flexibility", "inertia": 0.01, "frequency": 5.0, "damping_ratio": 0.5}
-    (one,) = free_parameters(drive(6, effects=[damped]), ["effects.load.flexibility.damping_ratio"], 1.0)
+    (one,) = make_free_parameters(drive(6, effects=[damped]), ["effects.load.flexibility.damping_ratio"], 1.0)
     assert one.value(0.1) == pytest.approx(0.5 * np.exp(0.1))
     assert float(one.value(1.0)) == float(one.value(jnp.asarray(1.0))) == 0.95
