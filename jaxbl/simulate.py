@@ -294,7 +294,7 @@ class Reducer(NamedTuple):
     init: Callable[[Experiment], Any]
     update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
     result: Callable[[Experiment, Any, State], dict[str, Array]]
-    all_done: Callable[[Experiment, Any, State], Array] | None = None
+    done: Callable[[Experiment, Any, State], Array] | None = None
 
 
 def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
