@@ -26,7 +26,7 @@ from jaxbl.report.explorer.folder import Source, write_static  # noqa: E402
 from jaxbl.report.explorer.server import served  # noqa: E402
 from jaxbl.report.explorer.study import study_source, write_study  # noqa: E402
 from jaxbl.sweeps.sweep import open_study, sweep  # noqa: E402
-from jaxbl.sweeps.trial import neighbours, run  # noqa: E402
+from jaxbl.sweeps.trial import run, run_perturbed  # noqa: E402
 
 MAP = Path(__file__).parents[1] / "sweeps" / "gain_map.toml"
 ERROR = "motor.velocity_rmse"
@@ -109,7 +109,7 @@ def rounding(folder: Path) -> None:
     print(f"30 cells at a noise of 1e-4 rad, run again by scan: {np.sum(np.array(apart) > 1e-3)} differ by more than 0.1 % "
           f"from the sweep, the largest by {100 * max(apart):.2g} %")  # fmt: skip
     point = with_values(result.config, {NOISE: 1e-4, LAMBDA: 1.512, ALPHA: 5.268})
-    near = [one[ERROR] for one in neighbours(point, 0, 20)]
+    near = [one[ERROR] for one in run_perturbed(point, 0, 20)]
     seeds = [run(point, seed=seed, backend="scan").summary["metrics"][ERROR] for seed in range(20)]
     for name, values in (("numbers that differ in the last digits", near), ("seeds", seeds)):
         print(f"{name}: {np.mean(values):.4f} rad/s, standard deviation {100 * np.std(values) / np.mean(values):.2g} %")

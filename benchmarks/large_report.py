@@ -19,7 +19,7 @@ import pandas as pd
 
 from jaxbl.config import read_config
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.run import begun
+from jaxbl.sweeps.run import open_or_create_store
 
 SIDE = 100
 """Values of both axes of the map."""
@@ -54,10 +54,10 @@ finally:
 def make(folder: Path, rows: int) -> int:
     """Write a study of so many rows, to the next whole seed. Returns its rows."""
     config = read_config(_STUDY | {"sweep": {"seeds": -(-rows // SIDE**2), "chunk": 32768}})
-    engine, store = begun(folder, Engine(config, backend="fused"), insist=False)
+    engine, store = open_or_create_store(folder, Engine(config, backend="fused"), require_backend=False)
     rng = np.random.default_rng(0)
     for index in range(len(engine)):
-        labels = engine.labels(engine.chunk(index))
+        labels = engine.row_labels(engine.chunk(index))
         count = len(labels["seed"])
         alpha, lambda_ = labels["observer.motor.alpha"], labels["observer.motor.lambda"]
         noise = rng.normal(size=count)

@@ -164,7 +164,7 @@ class Pass:
 
     def left(self, client: Client, bundles: int) -> None:
         """Hand over bundles of which none ends, until the scheduler knows them all."""
-        Cluster(client, local=False).leave(done, [job for _, job in jobs(bundles, 1e6)])
+        Cluster(client, local=False).submit_jobs(done, [job for _, job in jobs(bundles, 1e6)])
         self.first = time.perf_counter() - self.start
         while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) < bundles:
             time.sleep(0.5)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from .cluster import Scheduler, connected
+from .cluster import Scheduler, connect
 from .errors import InputError
 from .files import make_folder, run_or_read
 from .lines import format_descriptions
@@ -71,11 +71,11 @@ def run_batch(
     progress(0, len(work))
     rows = []
     processes = useful_processes(len(work)) if processes is None else min(processes, len(work))
-    with connected(scheduler) as cluster:
+    with connect(scheduler) as cluster:
         if cluster is None:
             found = map_jobs(_diagnosed, work, processes)
         else:
-            found = cluster.each(_diagnosed, [job.absolute() for job in work])
+            found = cluster.map_jobs(_diagnosed, [job.absolute() for job in work])
         for row in found:
             rows.append(row)
             progress(len(rows), len(work))

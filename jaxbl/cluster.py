@@ -58,7 +58,7 @@ class Cluster:
             raise NoResult(_LOST) from None
         return max(len(workers), 1)
 
-    def each(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
+    def map_jobs(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results of a function (importable by name), in the order of its arguments."""
         found: dict[int, Result] = {}
         following = 0
@@ -107,7 +107,7 @@ class Cluster:
             if begun and self._client.status == "running":
                 self._client.cancel([future for _, future in begun.values()], force=True)
 
-    def leave(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
+    def submit_jobs(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""
         from distributed import fire_and_forget
 
@@ -163,7 +163,7 @@ class _Call:
 
 
 @contextmanager
-def connected(scheduler: Scheduler) -> Iterator[Cluster | None]:
+def connect(scheduler: Scheduler) -> Iterator[Cluster | None]:
     """A cluster by its scheduler: an address (`tcp://host:8786`), a scheduler's file (`….json`), `local:N` for N processes
     of this machine, or a client that is connected already; None for None.
 

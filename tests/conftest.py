@@ -51,9 +51,9 @@ def _few_programs():
 @pytest.fixture(scope="module")
 def compiled_once():
     """Studies of a file that differ in values of lanes alone share the program of their chunks."""
-    from jaxbl.sweeps.programs import sharing
+    from jaxbl.sweeps.programs import share_programs
 
-    with sharing():
+    with share_programs():
         yield
 
 

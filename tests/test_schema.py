@@ -9,7 +9,7 @@ import pytest
 from small_study import ALPHA, listed, rigid, small
 
 from jaxbl.config import Config
-from jaxbl.config.schema import schema
+from jaxbl.config.schema import build_schema
 from jaxbl.drive.effects import EFFECTS
 
 STUDIES = sorted((Path(__file__).parents[1] / "sweeps").glob("*.toml"))
@@ -18,8 +18,8 @@ STUDIES = sorted((Path(__file__).parents[1] / "sweeps").glob("*.toml"))
 @pytest.fixture(scope="module")
 def errors():
     """What is wrong with a study, by the schema."""
-    jsonschema.Draft7Validator.check_schema(schema())
-    validator = jsonschema.Draft7Validator(schema())
+    jsonschema.Draft7Validator.check_schema(build_schema())
+    validator = jsonschema.Draft7Validator(build_schema())
     return lambda data: [error.message for error in validator.iter_errors(data)]
 
 
@@ -57,7 +57,7 @@ def test_it_refuses_what_is_wrong(wrong, errors):
 
 
 def test_it_says_units_and_meanings_and_knows_every_effect():
-    found = schema()
+    found = build_schema()
     text = json.dumps(found)
     assert all(f'"const": "{kind}"' in text for kind in EFFECTS)
     assert '"null"' not in text
@@ -69,8 +69,8 @@ def test_it_says_units_and_meanings_and_knows_every_effect():
 
 def test_the_command_prints_or_writes_it_and_overwrites_nothing(call, tmp_path):
     code, lines, _ = call("schema")
-    assert code == 0 and json.loads("\n".join(lines)) == schema()
+    assert code == 0 and json.loads("\n".join(lines)) == build_schema()
     assert call("schema", "--out", "jaxbl.json")[:2] == (0, [])
-    assert json.loads((tmp_path / "jaxbl.json").read_text(encoding="utf-8")) == schema()
+    assert json.loads((tmp_path / "jaxbl.json").read_text(encoding="utf-8")) == build_schema()
     with pytest.raises(ValueError, match=r"^jaxbl\.json: is there already; --out needs a new name$"):
         call("schema", "--out", "jaxbl.json")

@@ -127,11 +127,11 @@ def schema(
     """Print the JSON schema of a study, by which editors complete and check its keys."""
     import json
 
-    from jaxbl.config.schema import schema as schema_of
+    from jaxbl.config.schema import build_schema
 
     if out is not None:
         check_new(out, "--out")
-    text = json.dumps(schema_of(), indent=1, ensure_ascii=False)
+    text = json.dumps(build_schema(), indent=1, ensure_ascii=False)
     if out is None:
         typer.echo(text)
     else:

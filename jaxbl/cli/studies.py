@@ -50,13 +50,13 @@ def simulate(
     workers.start_jax()
     from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.report.simulate import write_trial_report
-    from jaxbl.sweeps.store import claim
+    from jaxbl.sweeps.store import claim_folder
     from jaxbl.sweeps.trial import run
 
     study = _read(config)
     folder = folder_of(config, out)
     with remove_if_empty_on_error(folder), lock_folder(folder), working(context, "simulating"):
-        claim(folder, study, "simulate", overwrite=overwrite)
+        claim_folder(folder, study, "simulate", overwrite=overwrite)
         trial = run(study, seed=seed, every=every)
         lines = write_trial_report(trial, folder)
     return Outcome(lines, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
@@ -136,9 +136,9 @@ def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
 
 def status(folder: FolderArgument) -> Outcome:
     """Say how far a study is, by the parts that exist."""
-    from jaxbl.sweeps.status import statuses
+    from jaxbl.sweeps.status import list_statuses
 
-    return _state(statuses(folder))
+    return _state(list_statuses(folder))
 
 
 def _state(found: "list[Status]", *more: str) -> Outcome:
@@ -221,9 +221,9 @@ def verify(
 def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
     """A study, and the backend that is asked for."""
     workers.start_jax()
-    from jaxbl.sweeps.programs import backend_of
+    from jaxbl.sweeps.programs import check_backend
 
-    chosen = backend_of(backend, "--backend")
+    chosen = check_backend(backend, "--backend")
     return _read(config), chosen
 
 
@@ -276,7 +276,7 @@ def compute(
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
         lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    lines += (SCAN_MESSAGE % what for what in result.scanned)
+    lines += (SCAN_MESSAGE % what for what in result.fallback_reasons)
     lines += (f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))
     return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result), steps=following)
 

@@ -23,7 +23,7 @@ from jaxbl.records.files import read_log_file
 from jaxbl.simulate import Run
 from jaxbl.validation import table_error
 
-from .tables import Table, table_for, tagged
+from .tables import Table, table_for, tagged_union
 
 
 class RecordedTable(Table):
@@ -58,19 +58,19 @@ class RecordedTable(Table):
         return times, torques
 
 
-DriveTable = tagged([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")
-TransmissionTable = tagged([table_for(cls, law=name) for name, cls in TRANSMISSIONS.items()], "law")
-ExcitationTable = tagged(
+DriveTable = tagged_union([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")
+TransmissionTable = tagged_union([table_for(cls, law=name) for name, cls in TRANSMISSIONS.items()], "law")
+ExcitationTable = tagged_union(
     [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
 )
-EffectTable = tagged([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
+EffectTable = tagged_union([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)
 IdentifierTable = table_for(Identifier)
 
 
-OTHERS = "a gain of other kinds of observer"
+OTHER_KINDS = "a gain of other kinds of observer"
 """What the table of a kind says of it."""
 _GAINS = {field.name: config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
 """Gains of all observers: fields and config keys."""
@@ -100,7 +100,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
     """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
     own = {field.name for field, _ in parameters(cls)}
     others: dict[str, Any] = {
-        name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHERS))
+        name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHER_KINDS))
         for name, key in _GAINS.items()
         if name not in own
     }
@@ -115,7 +115,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
 
 _USUAL = "super_twisting"
 ObserverTable = Annotated[
-    tagged([_observer_table(name, cls) for name, cls in OBSERVERS.items()], "kind"),
+    tagged_union([_observer_table(name, cls) for name, cls in OBSERVERS.items()], "kind"),
     BeforeValidator(lambda given: {"kind": _USUAL} | dict(given) if isinstance(given, Mapping) else given),
 ]
 

@@ -15,7 +15,7 @@ from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
 from jaxbl.validation import Key, abbreviate, check_file, check_sizes, explain_first_error, explain_missing_file
 
-from .study import Config, nearest_path, numeric_paths
+from .study import Config, numeric_paths, suggest_path
 
 _MOST_BYTES = 8_000_000
 """Of a TOML file: 300 000 numbers of full length, some seconds of reading."""
@@ -249,7 +249,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     known = numeric_paths(config)
     for path, value in values.items():
         if path not in known:
-            raise InputError(f"unknown path '{path}'; {nearest_path(path, known)}")
+            raise InputError(f"unknown path '{path}'; {suggest_path(path, known)}")
         section, *keys = path.split(".")
         if section == "effects":
             kind, _, key = path.removeprefix("effects.").rpartition(".")

@@ -9,7 +9,7 @@ _LIMITS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", 
 """What pydantic leaves as it is on keys that may be left out."""
 
 
-def schema() -> dict[str, Any]:
+def build_schema() -> dict[str, Any]:
     """The schema of a TOML study (draft 7), with units and meanings of its keys.
 
     A table may get its other keys from a file that the study includes, and commands on logs need less than others, so that

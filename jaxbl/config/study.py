@@ -85,7 +85,7 @@ class Config(Table):
         known = numeric_paths(self)
         for path in self.uncertainty.exact:
             if path not in known and path != "drive.gear_ratio" and path not in EFFECTS:
-                raise table_error(f"uncertainty.exact: unknown path '{path}'; {nearest_path(path, known)}")
+                raise table_error(f"uncertainty.exact: unknown path '{path}'; {suggest_path(path, known)}")
         return self
 
     def build(self) -> Experiment:
@@ -216,7 +216,7 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
         table = getattr(config, section)
         if table is not None:
             found |= dict(_paths(table, section))
-    found[KIND] = Parameter("", "kind of observer")
+    found[KIND_PATH] = Parameter("", "kind of observer")
     for path in _of_other_kinds(config):
         found.pop(path, None)
     kinds = [effect.kind for effect in config.effects]
@@ -242,7 +242,7 @@ def _of_other_kinds(config: Config) -> Iterator[str]:
     yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in others)
 
 
-KIND = "observer.kind"
+KIND_PATH = "observer.kind"
 """Path of the kind of observer, which an axis may vary."""
 _FIXED = ("kind", "law", "file", "time_column", "torque_column", "precision")
 """Keys that no axis varies."""
@@ -259,7 +259,7 @@ def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
             yield path, Parameter(str(extra.get("unit", "")), field.description or "")
 
 
-def nearest_path(path: str, known: Mapping[str, Parameter]) -> str:
+def suggest_path(path: str, known: Mapping[str, Parameter]) -> str:
     """A hint that names the nearest valid path, or all of them where none is near."""
     close = difflib.get_close_matches(path, list(known), n=1, cutoff=0.3)
     return f"nearest valid path: '{close[0]}'" if close else f"valid paths: {', '.join(known)}"

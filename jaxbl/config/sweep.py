@@ -9,7 +9,7 @@ from jaxbl.validation import table_error
 
 from .tables import Table
 
-TOLERANCE = 0.1
+DEFAULT_TOLERANCE = 0.1
 """Relative difference of a numeric metric beyond which neighbours disagree, unless the study says otherwise."""
 
 
@@ -51,7 +51,8 @@ class SweepTable(Table):
     refine_tolerance: float | None = Field(
         default=None,
         gt=0.0,
-        description=f"relative difference beyond which they disagree in a numeric refine_metric; left out: {TOLERANCE:g}",
+        description="relative difference beyond which they disagree in a numeric refine_metric; "
+        f"left out: {DEFAULT_TOLERANCE:g}",
     )
 
     @model_validator(mode="after")
@@ -71,7 +72,7 @@ class SweepTable(Table):
         return self
 
     @property
-    def asked(self) -> tuple[str, ...] | None:
+    def requested_metrics(self) -> tuple[str, ...] | None:
         """The metrics asked for, whatever their order in the file; None for all."""
         return None if self.metrics is None else tuple(sorted(self.metrics))
 

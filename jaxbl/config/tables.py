@@ -60,6 +60,6 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     return model
 
 
-def tagged(tables: list[type[Table]], key: str) -> Any:
+def tagged_union(tables: list[type[Table]], key: str) -> Any:
     """The type of a table that is one of several, told apart by the value of a key (`kind`, `law`)."""
     return Annotated[Union[tuple(tables)], Field(discriminator=key)]  # noqa: UP007

@@ -53,7 +53,7 @@ class ObserverChoice:
     config: Config
     summary: dict[str, Any]
     cost: dict[str, float]
-    scanned: tuple[str, ...] = ()
+    fallback_reasons: tuple[str, ...] = ()
 
 
 class Place(NamedTuple):
@@ -127,7 +127,7 @@ def choose_observer(config: Config, table: TuneTable, stages: Stages) -> Observe
     for kind in table.observers:
         search.tune(kind)
     held_out = {kind: search.held_out(kind) for kind in table.observers}
-    return ObserverChoice(config, _summary(search, held_out), stages.cost, tuple(stages.scanned))
+    return ObserverChoice(config, _summary(search, held_out), stages.cost, tuple(stages.fallback_reasons))
 
 
 class _Search:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from jaxbl.cluster import Cluster, Scheduler, connected
+from jaxbl.cluster import Cluster, Scheduler, connect
 from jaxbl.config import Config
 from jaxbl.errors import InputError
 from jaxbl.files import (
@@ -20,8 +20,8 @@ from jaxbl.files import (
     write_atomic,
 )
 from jaxbl.sweeps import parts
-from jaxbl.sweeps.programs import Backend, backend_of, sharing
-from jaxbl.sweeps.store import claim, manifest_head
+from jaxbl.sweeps.programs import Backend, check_backend, share_programs
+from jaxbl.sweeps.store import claim_folder, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress
 
@@ -39,8 +39,8 @@ def stages_in(
         if out is not None:
             held.enter_context(remove_if_empty_on_error(to_path(out)))
             held.enter_context(lock_folder(to_path(out)))
-        held.enter_context(sharing())
-        yield Stages(config, command, out, cluster=held.enter_context(connected(scheduler)), **given)
+        held.enter_context(share_programs())
+        yield Stages(config, command, out, cluster=held.enter_context(connect(scheduler)), **given)
 
 
 class Stages:
@@ -68,18 +68,18 @@ class Stages:
         """The manifest that an earlier call left."""
         self.total = 0
         """Lanes of all stages."""
-        self.scanned: dict[str, None] = {}
+        self.fallback_reasons: dict[str, None] = {}
         """What the fused loop did not know of runs that were scanned in its place."""
         self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
         self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
-        self._backend: Backend | None = backend_of(backend)
+        self._backend: Backend | None = check_backend(backend)
         self._done = 0
         self._unsure = False
         """The manifest is damaged: written anew once a stage has not been refused, as the folder is this study's then."""
         self._kept: dict[str, Any] = {}
         if out is None:
             return
-        claim(to_path(out), config, command, overwrite=overwrite)
+        claim_folder(to_path(out), config, command, overwrite=overwrite)
         self.folder = to_path(out) / command
         if (self.folder / "manifest.json").exists():
             try:
@@ -91,7 +91,7 @@ class Stages:
             if backend not in (None, begun):
                 how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
                 raise InputError(f"{out}: was begun {how}, or choose another folder with --out")
-            self._backend = backend_of(begun)
+            self._backend = check_backend(begun)
 
     def keep(self, **found: Any) -> None:
         """Write the manifest, which makes the folder this study's, with something that was found before the stages."""
@@ -117,13 +117,13 @@ class Stages:
         if path is None:
             return compute()
         with suppress(FileNotFoundError, parts.Damaged):
-            mark, frame = parts.read(path)
+            mark, frame = parts.read_part(path)
             if mark.study.get("identity") != head["identity"]:
                 raise InputError(f"{path}: is of another study; choose another folder with --out, or --overwrite")
             return frame
         frame = compute()
         if not self._unsure:
-            parts.write(path, frame, parts.Mark(head, {}, "", 0, 0, {}))
+            parts.write_part(path, frame, parts.PartHeader(head, {}, "", 0, 0, {}))
         return frame
 
     def run(self, study: Config | dict[str, Any], name: str) -> StudyResult:
@@ -147,7 +147,7 @@ class Stages:
         if self._unsure:
             self._unsure = False
             self.keep(**self._kept)
-        self.scanned |= dict.fromkeys(result.scanned)
+        self.fallback_reasons |= dict.fromkeys(result.fallback_reasons)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result
 

@@ -49,7 +49,7 @@ class Tuning:
     summary: dict[str, Any]
     candidates: dict[str, pd.DataFrame]
     cost: dict[str, float]
-    scanned: tuple[str, ...] = ()
+    fallback_reasons: tuple[str, ...] = ()
 
 
 def tune(
@@ -102,4 +102,4 @@ def _tuned(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stage
     if table.certificate is not None:
         summary["certificates"] = certificates(search, stages.place("certificate.json"))
         summary["passed_over"] = passed_over
-    return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
+    return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.fallback_reasons))

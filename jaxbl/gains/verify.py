@@ -63,7 +63,7 @@ class Verdict:
     normalised: Normalised
     levels: dict[str, pd.DataFrame]
     counterexamples: pd.DataFrame
-    scanned: tuple[str, ...] = ()
+    fallback_reasons: tuple[str, ...] = ()
 
 
 def verify(
@@ -144,7 +144,7 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
     if stages.folder is not None:
         write_table(stages.folder.parent / "counterexamples.parquet", every)
         write_atomic(stages.folder.parent / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
-    return Verdict(config, summary, normalised, levels, every, tuple(stages.scanned))
+    return Verdict(config, summary, normalised, levels, every, tuple(stages.fallback_reasons))
 
 
 def judged_sides(config: Config) -> list[str]:

@@ -20,7 +20,7 @@ from matplotlib.patches import Patch
 from jaxbl.config import Config, is_boolean, numeric_paths
 from jaxbl.files import json_with_checksum, write_atomic
 from jaxbl.lines import TERMINAL_WIDTH, format_table
-from jaxbl.sweeps.compare import FALSE, Comparison, MetricChange
+from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
 from .figures import COLOURS, MISSING, Drawn, style, subplots, with_unit
@@ -77,7 +77,9 @@ def _noise(comparison: Comparison) -> str:
         )
     how = f"differences seed by seed, {seeds} seeds" if comparison.paired else "means over seeds, none of them in common"
     few = " So few seeds show only what is far beyond it." if comparison.paired and seeds < 4 else ""
-    return f"Noise: by {how}; of the points counted at most {100 * FALSE:g} % on average are not different.{few}"
+    return (
+        f"Noise: by {how}; of the points counted at most {100 * FALSE_DISCOVERY_RATE:g} % on average are not different.{few}"
+    )
 
 
 def _metric_lines(comparison: Comparison) -> list[str]:

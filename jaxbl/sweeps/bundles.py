@@ -18,8 +18,8 @@ from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .programs import Backend, Layout
-from .run import Run, Work
-from .store import Store, config_of
+from .run import Run, RunTotals
+from .store import Store, load_config
 
 _SECONDS = 20.0
 """Of a bundle: a scheduler spends some 1 ms on one, and what a lost worker has begun is lost."""
@@ -40,15 +40,15 @@ class Bundle(NamedTuple):
     identity: str
     layout: Layout
     backend: Backend
-    insist: bool
+    require_backend: bool
     chunks: tuple[int | Chunk, ...]
 
 
-class _Done(NamedTuple):
+class _BundleResult(NamedTuple):
     """What a worker has done of a bundle: checksums of its parts by index."""
 
     checksums: dict[int, str]
-    work: Work
+    work: RunTotals
     host: str
 
 
@@ -77,10 +77,10 @@ class ClusterRun(Run):
         first, before = self._cluster.workers, self.work.run_seconds
         self._wave(missing[:first], 1)
         rest = missing[first:]
-        self._wave(rest, _size((self.work.run_seconds - before) / first, len(rest), self._cluster.workers))
+        self._wave(rest, _bundle_size((self.work.run_seconds - before) / first, len(rest), self._cluster.workers))
 
     def _wave(self, chunks: Sequence[int | Chunk], size: int) -> None:
-        for part, done in self._cluster.done(compute, _bundles(self.engine, self.kept, chunks, size), self._look):
+        for part, done in self._cluster.done(compute_bundle, _bundles(self.engine, self.kept, chunks, size), self._look):
             for one in part:
                 chunk = self.engine.chunk(one) if isinstance(one, int) else one
                 _wait_for(self.kept.part(chunk.index), done.host)
@@ -97,19 +97,19 @@ class ClusterRun(Run):
             self._next_look = time.monotonic() + max(_LOOK, 10.0 * (time.monotonic() - start))
 
 
-def hand_over(cluster: Cluster, engine: Engine, store: Store) -> None:
+def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
     """Have all chunks of a study computed that are missing, without waiting for more than the first. Raises as
     :class:`ClusterRun`."""
-    missing = [index for index in engine.order() if not store.has(index)]
+    missing = [index for index in engine.chunk_order() if not store.has(index)]
     seconds = 0.0
-    for _, done in cluster.done(compute, _bundles(engine, store, missing[:1], 1)):
+    for _, done in cluster.done(compute_bundle, _bundles(engine, store, missing[:1], 1)):
         seconds = done.work.run_seconds
     rest = missing[1:]
-    size = _size(seconds, len(rest), cluster.workers)
-    cluster.leave(compute, [bundle for _, bundle in _bundles(engine, store, rest, size)])
+    size = _bundle_size(seconds, len(rest), cluster.workers)
+    cluster.submit_jobs(compute_bundle, [bundle for _, bundle in _bundles(engine, store, rest, size)])
 
 
-def _size(seconds: float, chunks: int, workers: int) -> int:
+def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
     """Chunks of a bundle, where one takes so long and so many are left."""
     by_time = int(_SECONDS / max(seconds, 1e-3))
     return max(min(by_time, math.ceil(chunks / (workers * _TURNS))), math.ceil(chunks / _MOST), 1)
@@ -120,7 +120,7 @@ def _bundles(
 ) -> Iterator[tuple[Sequence[int | Chunk], Bundle]]:
     """Chunks, `size` of them at once, with what a worker needs to know."""
     folder = store.folder if is_remote(store.folder) else store.folder.absolute()
-    about = str(folder), store.manifest["identity"], store.layout, store.backend, engine.insist
+    about = str(folder), store.manifest["identity"], store.layout, store.backend, engine.require_backend
     for first in range(0, len(chunks), size):
         part = chunks[first : first + size]
         yield part, Bundle(*about, tuple(part))
@@ -137,7 +137,7 @@ def _wait_for(part: Path, host: str) -> None:
         time.sleep(0.2)
 
 
-def compute(bundle: Bundle) -> _Done:
+def compute_bundle(bundle: Bundle) -> _BundleResult:
     """Compute the chunks of a bundle that are not there, on a worker."""
     folder, host = to_path(bundle.folder), socket.gethostname()
     if not (folder / "manifest.json").exists():
@@ -151,10 +151,10 @@ def compute(bundle: Bundle) -> _Done:
         run = Run(engine, store)
         run.ensure(engine.chunk(one) if isinstance(one, int) else one for one in bundle.chunks)
     indices = [one if isinstance(one, int) else one.index for one in bundle.chunks]
-    return _Done({index: store.manifest["checksums"][str(index)] for index in indices}, run.work, host)
+    return _BundleResult({index: store.manifest["checksums"][str(index)] for index in indices}, run.work, host)
 
 
 @functools.lru_cache(maxsize=2)
-def _engine(folder: str, identity: str, layout: Layout, backend: Backend, insist: bool) -> Engine:
+def _engine(folder: str, identity: str, layout: Layout, backend: Backend, require_backend: bool) -> Engine:
     """The engine of a study, with its compiled programs, from one bundle to the next."""
-    return Engine(config_of(to_path(folder)), layout, backend=backend, insist=insist)
+    return Engine(load_config(to_path(folder)), layout, backend=backend, require_backend=require_backend)

@@ -29,7 +29,7 @@ from .metrics import ROUNDING, find_metric, is_magnitude
 from .store import Store
 from .sweep import StudyResult, open_study
 
-FALSE = 0.05
+FALSE_DISCOVERY_RATE = 0.05
 """Share of the points named as different that are not, on average and at most."""
 _SURE = 0.99
 """Of intervals over all points: some forty metrics have one."""
@@ -39,7 +39,7 @@ _DECIDES_NOTHING = "title", "notes", "figures"
 """Keys that no number depends on."""
 
 
-class Moved(NamedTuple):
+class MeanChange(NamedTuple):
     """How a metric moved over all common points: the factor from the first study to the second (geometric mean over points),
     of `converged` and `finite` the difference of the share.
 
@@ -85,7 +85,7 @@ class MetricChange:
     differs: int | None
     up: int
     size: float
-    moved: Moved
+    moved: MeanChange
     where: dict[str, list[Any]]
     most: dict[str, Any] | None
 
@@ -390,7 +390,7 @@ def _p(mean: np.ndarray, variance: np.ndarray, freedom: np.ndarray) -> np.ndarra
 def _named(p: np.ndarray) -> np.ndarray:
     """Which p-values, NaN left out, are named as small: Benjamini and Yekutieli's rule for any dependence."""
     named, there = np.zeros(len(p), bool), np.isfinite(p)
-    named[there] = stats.false_discovery_control(p[there], method="by") <= FALSE
+    named[there] = stats.false_discovery_control(p[there], method="by") <= FALSE_DISCOVERY_RATE
     return named
 
 
@@ -438,7 +438,7 @@ def _range(column: pd.Series) -> list[Any]:
     return sorted(map(str, column.unique()))
 
 
-def _moved(values: _Values, boolean: bool, paired: bool) -> Moved:
+def _moved(values: _Values, boolean: bool, paired: bool) -> MeanChange:
     """The mean over points of each seed, and what its spread over seeds says."""
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = (one if boolean else np.log(one) for one in (values.first, values.second))
@@ -446,7 +446,7 @@ def _moved(values: _Values, boolean: bool, paired: bool) -> Moved:
     # the same points for all seeds
     whole = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if not whole.any():
-        return Moved(math.nan, math.nan, math.nan)
+        return MeanChange(math.nan, math.nan, math.nan)
     a, b = a[whole].mean(axis=0), b[whole].mean(axis=0)
     if paired:
         count, mean, variance = (one[0] for one in _spread((b - a)[None]))
@@ -457,4 +457,4 @@ def _moved(values: _Values, boolean: bool, paired: bool) -> Moved:
         freedom = (u + v) ** 2 / (u**2 / (m - 1.0) + v**2 / (n - 1.0)) if u + v > 0.0 else 1.0
     half = float(stats.t.ppf(0.5 + 0.5 * _SURE, freedom)) * math.sqrt(variance) if np.isfinite(variance) else math.nan
     ends = mean, mean - half, mean + half
-    return Moved(*(float(end) if boolean else math.exp(end) for end in ends))
+    return MeanChange(*(float(end) if boolean else math.exp(end) for end in ends))

@@ -22,10 +22,10 @@ from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import announce
 
 from .metrics import MetricNames, metrics_reducer
-from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
+from .programs import BACKENDS, Backend, Layout, compile_program, without_cache_writes
 
 
-class Work(NamedTuple):
+class Operations(NamedTuple):
     """What a sample takes, in operations that count as much as a sum: those that all lanes share, and each lane's own; the
     bytes that a lane carries from sample to sample; and how many equations there are to compile."""
 
@@ -56,11 +56,11 @@ class Costs(NamedTuple):
         """Of a backend."""
         return self.fused if backend == "fused" else self.scan
 
-    def compiling(self, backend: Backend, work: Work) -> float:
+    def compile_seconds(self, backend: Backend, work: Operations) -> float:
         """Seconds to compile a program."""
         return self.of(backend).equation * work.equations
 
-    def sample(self, backend: Backend, work: Work, layout: Layout) -> float:
+    def sample(self, backend: Backend, work: Operations, layout: Layout) -> float:
         """Seconds of a sample of a chunk. The fused loop takes seed after seed, and does for each what its lanes share; the
         scan has all lanes side by side, and starts kernels for all operations."""
         seeds, points = layout
@@ -70,7 +70,7 @@ class Costs(NamedTuple):
             return seeds * (cost.sample + cost.operation * work.shared) + lanes
         return cost.sample + cost.operation * (work.shared + work.lane) + lanes
 
-    def lanes(self, backend: Backend, work: Work, devices: int) -> int:
+    def lanes(self, backend: Backend, work: Operations, devices: int) -> int:
         """Lanes that a device computes at once: by the scan as many as its cache holds, by the fused loop so many that what
         they share counts little."""
         if backend == "scan":
@@ -94,7 +94,7 @@ _GPU = Costs(Cost(1e-6, 0.0, 0.0, 0.0), Cost(8e-6, 0.0, 0.0, 0.0), 0.0)
 """What a sample takes, published for a scan by XLA; not measured here."""
 
 
-def costs(devices: Sequence[Any]) -> Costs:
+def load_costs(devices: Sequence[Any]) -> Costs:
     """Of these devices. Of a processor's cores they are measured, once for this machine and what is installed on it, where
     programs are kept."""
     if devices[0].platform != "cpu":
@@ -105,20 +105,20 @@ def costs(devices: Sequence[Any]) -> Costs:
     found = program_cache.load(key)
     if found is None:
         announce("measuring this machine")
-        found = measured(list(devices))
+        found = measure_costs(list(devices))
         program_cache.save(key, found)
         announce("running")
     return found
 
 
-def lanes_at_once(devices: Sequence[Any], backend: Backend, work: Work) -> int:
+def lanes_at_once(devices: Sequence[Any], backend: Backend, work: Operations) -> int:
     """Lanes that a device computes at once where nothing else is asked for."""
-    return _LANES_ON_A_GPU if devices[0].platform == "gpu" else costs(devices).lanes(backend, work, len(devices))
+    return _LANES_ON_A_GPU if devices[0].platform == "gpu" else load_costs(devices).lanes(backend, work, len(devices))
 
 
-def faster(
+def choose_backend(
     devices: Sequence[Any],
-    works: Mapping[Backend, Work],
+    works: Mapping[Backend, Operations],
     layouts: Mapping[Backend, Layout],
     samples: Mapping[Backend, int],
     programs: int,
@@ -128,16 +128,16 @@ def faster(
     if devices[0].platform not in ("cpu", "gpu") or (devices[0].platform == "gpu" and len(devices) > 1):
         # the fused loop knows neither
         return "scan"
-    known = costs(devices)
+    known = load_costs(devices)
 
     def total(backend: Backend) -> float:
         running = samples[backend] * known.sample(backend, works[backend], layouts[backend])
-        return programs * known.compiling(backend, works[backend]) + running
+        return programs * known.compile_seconds(backend, works[backend]) + running
 
     return min(BACKENDS, key=total)
 
 
-def work_of(config: Config, paths: Sequence[str], names: MetricNames = None) -> Work:
+def count_operations(config: Config, paths: Sequence[str], names: MetricNames = None) -> Operations:
     """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
@@ -145,14 +145,14 @@ def work_of(config: Config, paths: Sequence[str], names: MetricNames = None) -> 
         # a study of many sweeps asks for the same one, also where nothing is kept on disk
         found = _works.get(key) or program_cache.load(key)
         if found is None:
-            found = _counted(experiment, paths, names)
+            found = _count_traced_operations(experiment, paths, names)
             program_cache.save(key, found)
         if key is not None:
             _works[key] = found
     return found
 
 
-_works: dict[str | None, Work] = {}
+_works: dict[str | None, Operations] = {}
 
 
 _COUNTED = 1009
@@ -167,7 +167,7 @@ _WEIGHTS = {
 """What an operation takes of a processor, about, where that is not as much as a sum."""
 
 
-def _counted(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Work:
+def _count_traced_operations(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Operations:
     def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
         return scan(set_leaves(experiment, values), seed, (metrics_reducer(names),))[0]
 
@@ -189,7 +189,7 @@ def _counted(experiment: Experiment, paths: Sequence[str], names: MetricNames) -
         else:
             shared += work
     steps = experiment.run.steps
-    return Work(shared / steps, own / steps, carried, equations)
+    return Operations(shared / steps, own / steps, carried, equations)
 
 
 def _equations(jaxpr: Any, times: float) -> Iterator[tuple[float, Any]]:
@@ -231,18 +231,18 @@ Tried = tuple[Backend, str, int]
 """Backend, path, and number of lanes."""
 
 
-def measured(devices: list[Any]) -> Costs:
+def measure_costs(devices: list[Any]) -> Costs:
     """Costs of this machine, from short runs of a small study."""
     # here, as it takes a quarter of a second, once
     from scipy.optimize import nnls
 
     config, count = read_config(_STUDY), len(devices)
-    works = {path: work_of(config, [path]) for path in _PATHS}
+    works = {path: count_operations(config, [path]) for path in _PATHS}
     few, many, more = _FEW * count, _MANY * count, _MORE * count
     # few scans: XLA compiles longer than they run
     fused: list[Tried] = [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
     scans: list[Tried] = [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
-    took, compiling = _times(config, devices, [*fused, *scans, ("scan", _PATHS[1], many)])
+    took, compiling = _time_programs(config, devices, [*fused, *scans, ("scan", _PATHS[1], many)])
 
     def cost(backend: Backend) -> Cost:
         rows = []
@@ -262,10 +262,12 @@ def measured(devices: list[Any]) -> Costs:
     return Costs(cost("fused"), cost("scan"), (_MORE if fits else _MANY) * works[_PATHS[0]].carried)
 
 
-def _times(config: Config, devices: list[Any], wanted: Sequence[Tried]) -> tuple[dict[Tried, float], dict[Backend, float]]:
+def _time_programs(
+    config: Config, devices: list[Any], wanted: Sequence[Tried]
+) -> tuple[dict[Tried, float], dict[Backend, float]]:
     """Seconds that a sample takes, the least of some rounds in turns; and those that a backend takes to compile."""
     runs, compiling = {}, dict.fromkeys(BACKENDS, math.inf)
-    with precision(config), not_put_into_cache():
+    with precision(config), without_cache_writes():
         experiment = prepare(config)
         for backend, path, count in wanted:
             columns = {path: np.full(count, get_leaf(experiment, path))}

@@ -19,10 +19,19 @@ import pandas as pd
 
 from jaxbl.config import Config, precision, prepare
 
-from .costs import Work, costs, faster, lanes_at_once, work_of
+from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
 from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
-from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, computed, not_put_into_cache
+from .programs import (
+    BACKENDS,
+    Backend,
+    Layout,
+    Program,
+    check_backend,
+    compile_program,
+    computed_metrics,
+    without_cache_writes,
+)
 
 
 class Chunk(NamedTuple):
@@ -91,10 +100,10 @@ class Engine:
     Args:
         config: the study.
         layout: chunk shape; left out, one that suits the devices.
-        devices: left out, all local ones.
+        devices: JAX devices to use; left out, all local ones.
         backend: left out, the faster one here.
-        insist: refuse a study that the fused loop cannot run; else it is scanned, and `scanned` says what the loop did not
-            know.
+        require_backend: refuse a study that the fused loop cannot run; otherwise the scan runs it, and `fallback_reasons`
+            says why.
     """
 
     def __init__(
@@ -103,17 +112,17 @@ class Engine:
         layout: Layout | None = None,
         devices: list[Any] | None = None,
         backend: Backend | None = None,
-        insist: bool = False,
+        require_backend: bool = False,
     ):
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.backend: Backend = backend_of(backend) or self._faster()
-        self.insist = insist
+        self.backend: Backend = check_backend(backend) or self._faster()
+        self.require_backend = require_backend
         self.layout = layout or self._layout(self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
-        self.scanned: list[str] = []
+        self.fallback_reasons: list[str] = []
         self._compiled: OrderedDict[int, Program] = OrderedDict()
         self._judging: set[str] = set()
 
@@ -127,7 +136,7 @@ class Engine:
         samples: dict[Backend, int] = {
             b: steps * self._chunks(layout, self.points.coarse_size) for b, layout in layouts.items()
         }
-        return faster(self.devices, self._works, layouts, samples, len(self.points.groups))
+        return choose_backend(self.devices, self._works, layouts, samples, len(self.points.groups))
 
     def _layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Chunk shape: as many lanes as asked for, or as the devices want at once."""
@@ -137,11 +146,13 @@ class Engine:
         return layout_for(self.config, self.points, len(self.devices), capacity)
 
     @functools.cached_property
-    def _works(self) -> dict[Backend, Work]:
+    def _works(self) -> dict[Backend, Operations]:
         """Of a sample by either backend, in the group that has most of them."""
         config = max(self.points.groups, key=lambda group: group.config.run.steps).config
-        asked: dict[Backend, MetricNames] = {backend: computed(backend, config.sweep.asked) for backend in BACKENDS}
-        found = {names: work_of(config, self._varied, names) for names in set(asked.values())}
+        asked: dict[Backend, MetricNames] = {
+            backend: computed_metrics(backend, config.sweep.requested_metrics) for backend in BACKENDS
+        }
+        found = {names: count_operations(config, self._varied, names) for names in set(asked.values())}
         return {backend: found[names] for backend, names in asked.items()}
 
     @property
@@ -151,9 +162,9 @@ class Engine:
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
-        return len(self.points.groups) * self.chunks_for(self.points.coarse_size)
+        return len(self.points.groups) * self.count_chunks(self.points.coarse_size)
 
-    def chunks_for(self, points: int) -> int:
+    def count_chunks(self, points: int) -> int:
         """Number of chunks that some points of a group take."""
         return self._chunks(self.layout, points)
 
@@ -174,7 +185,7 @@ class Engine:
         chunk = self.chunk(index)
         return len(chunk.seeds) * len(chunk.points)
 
-    def order(self) -> list[int]:
+    def chunk_order(self) -> list[int]:
         """Indices of all chunks, those first that cover the grid coarsely: the first seeds of every second block of points,
         of those between, and so on, then the next seeds. Groups take turns where their programs can all be kept."""
         blocks = math.ceil(self.points.coarse_size / self.layout.points)
@@ -223,13 +234,13 @@ class Engine:
             start = time.perf_counter()
             figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
-        data = self.labels(chunk)
+        data = self.row_labels(chunk)
         for name in self.points.metrics:
             own = np.asarray(figures.get(name, np.full((len(chunk.seeds), len(chunk.points)), np.nan)))
             data[name] = own[: len(chunk.seeds), : len(chunk.points)].ravel()
         return pd.DataFrame(data)
 
-    def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
+    def row_labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
         """What tells the rows of a chunk apart: values by axis path, and seeds."""
         group = self.points.groups[chunk.group]
         values = group.structural | self.points.columns(chunk.points)
@@ -248,7 +259,7 @@ class Engine:
         padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
-    def check(self) -> None:
+    def compile_all(self) -> None:
         """Compile the programs of all groups; the first ones are kept. Raises `InputError` if the backend cannot be had."""
         for group in reversed(range(len(self.points.groups))):
             self._program(group)
@@ -268,19 +279,25 @@ class Engine:
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
             program = compile_program(
-                experiment, self.layout, self.devices, self.backend, columns, names=config.sweep.asked, insist=self.insist
+                experiment,
+                self.layout,
+                self.devices,
+                self.backend,
+                columns,
+                metric_names=config.sweep.requested_metrics,
+                require_backend=self.require_backend,
             )
             self.compile_seconds += time.perf_counter() - start
-            if program.instead is not None and program.instead not in self.scanned:
-                self.scanned.append(program.instead)
+            if program.fallback_reason is not None and program.fallback_reason not in self.fallback_reasons:
+                self.fallback_reasons.append(program.fallback_reason)
             return program
 
     def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
         """Figures of a chunk with those that follow from them, if any of these is asked for."""
-        return add_gain_metrics(figures, gains) if needs_gain_metrics(self.config.sweep.asked) else figures
+        return add_gain_metrics(figures, gains) if needs_gain_metrics(self.config.sweep.requested_metrics) else figures
 
     def _compile_gain_metrics(self, dtype: str) -> None:
-        if dtype not in self._judging and needs_gain_metrics(self.config.sweep.asked):
+        if dtype not in self._judging and needs_gain_metrics(self.config.sweep.requested_metrics):
             self._judging.add(dtype)
             start = time.perf_counter()
             compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
@@ -291,13 +308,13 @@ class Engine:
         groups = self.points.groups
         group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
         config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
-        with not_put_into_cache():
+        with without_cache_writes():
             program = self._compile(config)
             a_program = self.compile_seconds
             with precision(config):
                 self._compile_gain_metrics(config.run.precision)
         compiling = a_program * len(groups) + self.compile_seconds - a_program
-        backend: Backend = "scan" if program.instead is not None else self.backend
+        backend: Backend = "scan" if program.fallback_reason is not None else self.backend
         # long enough for what a call costs not to count
         expected = self._seconds(backend, config) / config.run.steps
         steps = min(config.run.steps, max(_TRIED_SAMPLES, int(_TRIED_SECONDS / expected)))
@@ -336,8 +353,8 @@ class Engine:
 
     def _seconds(self, backend: Backend, config: Config) -> float:
         """That a chunk of a group should take."""
-        work = work_of(config, self._varied, computed(backend, config.sweep.asked))
-        return costs(self.devices).sample(backend, work, self.layout) * config.run.steps
+        work = count_operations(config, self._varied, computed_metrics(backend, config.sweep.requested_metrics))
+        return load_costs(self.devices).sample(backend, work, self.layout) * config.run.steps
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Damaged(Exception):
     """A part that is not what was written. The message says how."""
 
 
-class Mark(NamedTuple):
+class PartHeader(NamedTuple):
     """What a part says of itself.
 
     Attributes:
@@ -46,7 +46,7 @@ class Mark(NamedTuple):
     columns: dict[str, str]
 
 
-def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
+def write_part(path: Path, frame: pd.DataFrame, mark: PartHeader) -> None:
     """Write a part with its mark, whole or not at all; rows and checksums are those of the frame."""
     columns = {str(name): values.to_numpy() for name, values in frame.items()}
     checksums = {name: _checksum(values) for name, values in columns.items()}
@@ -61,7 +61,7 @@ def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
         pq.write_table(table, draft, write_page_checksum=True, use_dictionary=False)
 
 
-def mark_of(path: Path) -> Mark:
+def read_header(path: Path) -> PartHeader:
     """What a part says of itself. Raises `Damaged` where that cannot be read, or is not what was written."""
     try:
         with _opened(path) as file:
@@ -75,12 +75,12 @@ def mark_of(path: Path) -> Mark:
         raise Damaged("says nothing of the study and the chunk that it is of")
     if metadata.get(_SUM) != checksum(text).encode():
         raise Damaged("what it says of itself does not agree with its checksum")
-    return Mark(**json.loads(text))
+    return PartHeader(**json.loads(text))
 
 
-def read(path: Path, columns: Sequence[str] | None = None) -> tuple[Mark, pd.DataFrame]:
+def read_part(path: Path, columns: Sequence[str] | None = None) -> tuple[PartHeader, pd.DataFrame]:
     """A part's mark and rows; all columns, or some. Raises `Damaged` where these are not what was written."""
-    mark = mark_of(path)
+    mark = read_header(path)
     try:
         with _opened(path) as source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             frame = file.read(columns=columns).to_pandas()

@@ -26,52 +26,52 @@ Backend = Literal["fused", "scan"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
 
-def backend_of(name: str | None, given: str = "backend") -> Backend | None:
-    """A backend by its name, None for none. Raises `InputError` for another; `given` is what it was given as."""
+def check_backend(name: str | None, source: str = "backend") -> Backend | None:
+    """A backend by its name, None for none. Raises `InputError` for another; `source` is what it was given as."""
     if name is not None and name not in BACKENDS:
-        raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
+        raise InputError(f"{source}: there is no {name!r}; one of {', '.join(BACKENDS)}")
     return name
 
 
-def computed(backend: Backend, names: MetricNames) -> MetricNames:
+def computed_metrics(backend: Backend, names: MetricNames) -> MetricNames:
     """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
     computes all, so that those asked for are to the bit what they are beside the others."""
     return names if backend == "fused" else None
 
 
-Made = TypeVar("Made")
+Result = TypeVar("Made")
 
-_MOST = 16
+_MAX_SHARED = 16
 """Programs that studies share, at most."""
-_shared: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
+_shared_results: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
 
 
 @contextmanager
-def sharing() -> Iterator[None]:
+def share_programs() -> Iterator[None]:
     """Studies that are run inside share their programs, as those of the stages of one search: what differs in nothing but
     the values of its lanes is compiled once."""
-    before = _shared.set(OrderedDict())
+    before = _shared_results.set(OrderedDict())
     try:
         yield
     finally:
-        _shared.reset(before)
+        _shared_results.reset(before)
 
 
-def shared(experiment: Experiment, paths: Iterable[str], given: Any, make: Callable[[], Made]) -> Made:
-    """What `make` makes of an experiment whose leaves at `paths` may have any values, and of other hashable arguments
-    `given`; inside :func:`sharing`, what it has made of them before."""
-    known = _shared.get()
-    if known is None:
-        return make()
+def share_result(experiment: Experiment, paths: Iterable[str], arguments: Any, build: Callable[[], Result]) -> Result:
+    """What `build` makes of an experiment whose leaves at `paths` may have any values, and of other hashable arguments
+    `arguments`; inside :func:`sharing`, what it has made of them before."""
+    results = _shared_results.get()
+    if results is None:
+        return build()
     leaves, structure = jax.tree.flatten(set_leaves(experiment, dict.fromkeys(paths, np.zeros(()))))
     arrays = [np.asarray(leaf) for leaf in leaves]
-    key = given, tuple(paths), structure, tuple((one.dtype, one.shape, one.tobytes()) for one in arrays)
-    if key not in known:
-        known[key] = make()
-    known.move_to_end(key)
-    while len(known) > _MOST:
-        known.popitem(last=False)
-    return known[key]
+    key = arguments, tuple(paths), structure, tuple((array.dtype, array.shape, array.tobytes()) for array in arrays)
+    if key not in results:
+        results[key] = build()
+    results.move_to_end(key)
+    while len(results) > _MAX_SHARED:
+        results.popitem(last=False)
+    return results[key]
 
 
 class Layout(NamedTuple):
@@ -88,11 +88,11 @@ class Program(NamedTuple):
 
     run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
     megabytes: float
-    instead: str | None = None
+    fallback_reason: str | None = None
 
 
 @contextmanager
-def not_put_into_cache() -> Iterator[None]:
+def without_cache_writes() -> Iterator[None]:
     """What is compiled inside is not put into JAX's cache of programs, and taken from it if it is there: compiling takes as
     long as it would without."""
     least = "jax_persistent_cache_min_compile_time_secs"
@@ -111,32 +111,39 @@ def compile_program(
     backend: Backend,
     columns: dict[str, np.ndarray],
     *,
-    names: MetricNames = None,
-    insist: bool = False,
+    metric_names: MetricNames = None,
+    require_backend: bool = False,
 ) -> Program:
-    """Compile one, inside :func:`jaxbl.config.precision`, or take a :func:`shared` one; `columns` is an example of the
-    values, `(points,)` by path; `names` are the metrics asked for: its figures have these, and perhaps others.
+    """Compile a program for chunks of a study, or take one that studies share; call inside :func:`jaxbl.config.precision`.
 
-    Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
-    is refused.
+    Args:
+        experiment: experiment of all lanes, but for the values that differ between them.
+        layout: shape of the chunks.
+        devices: JAX devices to use.
+        backend: if the fused loop cannot run the experiment, the scan takes its place.
+        columns: an example of the values by path, `(points,)`.
+        metric_names: requested metrics; the program may compute others as well.
+        require_backend: refuse an experiment that the fused loop cannot run.
 
     Raises:
-        InputError: the fused loop was insisted on and cannot be had.
+        InputError: the fused loop is required and cannot run the experiment.
     """
 
     def compiled() -> Program:
         if backend == "fused":
             try:
                 with raising_unsupported():
-                    return _fused(experiment, layout, devices, tuple(columns), names)
+                    return _fused(experiment, layout, devices, tuple(columns), metric_names)
             except Unsupported as why:
-                if insist:
+                if require_backend:
                     raise InputError(f"--backend fused: the fused loop does not support {why}; use --backend scan") from None
-                return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
+                return _scanned(experiment, layout, devices, columns)._replace(fallback_reason=str(why))
         return _scanned(experiment, layout, devices, columns)
 
     dtypes = tuple(column.dtype for column in columns.values())
-    return shared(experiment, columns, (layout, tuple(devices), backend, dtypes, names, insist), compiled)
+    return share_result(
+        experiment, columns, (layout, tuple(devices), backend, dtypes, metric_names, require_backend), compiled
+    )
 
 
 def _fused(

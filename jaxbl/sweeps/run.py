@@ -16,23 +16,25 @@ from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .refine import refine_boundary
-from .store import Store, claim
+from .store import Store, claim_folder
 
 _PREPARED = 60.0
 """Seconds to wait for another process that prepares the folder."""
 
 
-def begun(folder: Path, engine: Engine, *, insist: bool, overwrite: bool = False) -> tuple[Engine, Store]:
-    """The store in a folder that is ours (:func:`jaxbl.files.lock_folder`), begun or continued, and its engine: chunks
-    stay what they were when it was begun, on whatever machine. `insist`: the engine's backend was asked for.
+def open_or_create_store(
+    folder: Path, engine: Engine, *, require_backend: bool, overwrite: bool = False
+) -> tuple[Engine, Store]:
+    """The store in a folder that is ours (:func:`jaxbl.files.lock_folder`), begun or gone on with, and the engine for it: chunks
+    stay what they were when it was begun, on whatever machine. `require_backend`: the engine's backend was asked for.
 
     Raises:
         InputError: it holds another study, or is by another backend.
     """
     config = engine.config
-    claim(folder, config, overwrite=overwrite)
+    claim_folder(folder, config, overwrite=overwrite)
     store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-    engine = _engine_for(store, engine, insist)
+    engine = _engine_for(store, engine, require_backend)
     if engine.points.refinement is not None:
         store.count_parts()
     elif store.manifest["parts"] != len(engine):
@@ -41,24 +43,24 @@ def begun(folder: Path, engine: Engine, *, insist: bool, overwrite: bool = False
     return engine, store
 
 
-def _engine_for(store: Store, engine: Engine, insist: bool) -> Engine:
-    if insist and store.backend != engine.backend and not store.manifest["finished"]:
+def _engine_for(store: Store, engine: Engine, require_backend: bool) -> Engine:
+    if require_backend and store.backend != engine.backend and not store.manifest["finished"]:
         raise InputError(
             f"{store.folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
         )
     if (store.layout, store.backend) == (engine.layout, engine.backend):
         return engine
-    return Engine(engine.config, store.layout, engine.devices, store.backend, insist)
+    return Engine(engine.config, store.layout, engine.devices, store.backend, require_backend)
 
 
 @contextmanager
-def joined(folder: Path, engine: Engine, *, insist: bool) -> Iterator[tuple[Engine, Store]]:
+def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterator[tuple[Engine, Store]]:
     """A folder into which other processes may write parts of the same study, begun by whichever is first: the engine for it,
     and its store, which leaves the manifest alone. Raises as :func:`begun`."""
     latest = time.monotonic() + _PREPARED
     while True:
         with suppress(FolderInUse), lock_folder(folder):
-            begun(folder, engine, insist=insist)
+            open_or_create_store(folder, engine, require_backend=require_backend)
         with ExitStack() as held:
             try:
                 held.enter_context(lock_folder(folder, shared=True))
@@ -67,25 +69,27 @@ def joined(folder: Path, engine: Engine, *, insist: bool) -> Iterator[tuple[Engi
                 if time.monotonic() > latest:
                     raise
             else:
-                claim(folder, engine.config, alone=False)
+                claim_folder(folder, engine.config, alone=False)
                 store = Store.open(folder, keeps_manifest=False)
-                yield _engine_for(store, engine, insist), store
+                yield _engine_for(store, engine, require_backend), store
                 return
         time.sleep(0.1)
 
 
-class Work(NamedTuple):
+class RunTotals(NamedTuple):
     """What was computed: lanes, seconds of compilation and of computing, what the fused loop did not know, damaged parts."""
 
     lanes: int = 0
     compile_seconds: float = 0.0
     run_seconds: float = 0.0
-    scanned: tuple[str, ...] = ()
+    fallback_reasons: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()
 
-    def __add__(self, other: Any) -> "Work":
+    def __add__(self, other: Any) -> "RunTotals":
         sums = (self.lanes + other.lanes, self.compile_seconds + other.compile_seconds, self.run_seconds + other.run_seconds)
-        return Work(*sums, tuple(dict.fromkeys(self.scanned + other.scanned)), self.damaged + other.damaged)
+        return RunTotals(
+            *sums, tuple(dict.fromkeys(self.fallback_reasons + other.fallback_reasons)), self.damaged + other.damaged
+        )
 
 
 class Run:
@@ -105,7 +109,7 @@ class Run:
         self, engine: Engine, store: Store | None, progress: Progress | None = None, indices: Sequence[int] | None = None
     ):
         self.engine, self.progress = engine, progress
-        self.elsewhere = Work()
+        self.elsewhere = RunTotals()
         self._lanes = 0
         self._store, self._indices = store, indices
         self._frames: dict[int, pd.DataFrame] = {}
@@ -113,10 +117,10 @@ class Run:
         self._chunks, self._total = len(engine), engine.rows
 
     @property
-    def work(self) -> Work:
+    def work(self) -> RunTotals:
         """What was computed, here and by workers."""
         engine, damaged = self.engine, () if self._store is None else tuple(self._store.damaged)
-        own = Work(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.scanned), damaged)
+        own = RunTotals(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.fallback_reasons), damaged)
         return own + self.elsewhere
 
     @property
@@ -134,7 +138,7 @@ class Run:
         if self.engine.points.refinement is None:
             if self._indices is not None:
                 self._chunks, self._total = len(self._indices), sum(map(self.engine.lanes, self._indices))
-            self.ensure(map(self.engine.chunk, self.engine.order() if self._indices is None else self._indices))
+            self.ensure(map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices))
             return
         for group in range(len(self.engine.points.groups)):
             self._refine(group)
@@ -158,7 +162,7 @@ class Run:
             nonlocal expected
             # the coarse grid is counted from the start
             self._total += (len(points) - expected) * seeds
-            self._chunks += self.engine.chunks_for(len(points)) - self.engine.chunks_for(expected)
+            self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(expected)
             expected = 0
             if self._store is not None:
                 self._store.grow(self._chunks, self._total)
@@ -212,7 +216,7 @@ class Run:
         return self.engine.points.refinement is None or self._stored(chunk, []) is not None
 
     def _stored(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame | None:
-        return self.kept.read_part(chunk.index, self.engine.labels(chunk), columns)
+        return self.kept.read_part(chunk.index, self.engine.row_labels(chunk), columns)
 
     def _read(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame:
         """Some columns of a chunk that is there."""

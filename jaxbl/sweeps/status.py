@@ -70,7 +70,7 @@ def status(folder: str | Path) -> Status:
     )
 
 
-def statuses(folder: str | Path) -> list[Status]:
+def list_statuses(folder: str | Path) -> list[Status]:
     """How far the study in a folder is, and those that `verify` and `tune` run for it. Raises `InputError` where there is
     none."""
     folder = to_path(folder)

@@ -40,7 +40,7 @@ from jaxbl.files import (
 )
 
 from . import parts
-from .parts import Damaged, Mark
+from .parts import Damaged, PartHeader
 from .programs import Backend, Layout
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def identity(config: Config, command: str = "sweep") -> str:
     data = config.resolved()
     data["sweep"].pop("chunk", None)
     if data["sweep"].pop("metrics", None) is not None and command == "sweep":
-        data["sweep"]["metrics"] = config.sweep.asked
+        data["sweep"]["metrics"] = config.sweep.requested_metrics
     for key in ("title", "notes", "figures", "identify", *_COMMANDS[command][2]):
         data.pop(key, None)
     for key in ("q", "marks"):
@@ -94,7 +94,9 @@ def manifest_head(config: Config, command: str) -> dict[str, Any]:
     return {"identity": identity(config, command), "single_run": identity(config, "simulate"), "title": config.title}
 
 
-def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, alone: bool = True) -> None:
+def claim_folder(
+    folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, alone: bool = True
+) -> None:
     """Make sure that a command may write its results for a study into a folder; make the folder.
 
     All commands of one study may share one folder. With `overwrite`, results of other studies are removed from it first;
@@ -114,11 +116,11 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
                     # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
                     unsure = True
                     continue
-                mark = _first_mark(folder) if other == "sweep" else None
+                mark = _read_first_header(folder) if other == "sweep" else None
                 if mark is None and not overwrite:
                     raise
                 found[other] = {} if mark is None else mark.study
-        elif other == "sweep" and (mark := _first_mark(folder)) is not None:
+        elif other == "sweep" and (mark := _read_first_header(folder)) is not None:
             found[other] = mark.study
     # a damaged file of ours is read as an empty one above
     if any(data and "single_run" not in data for data in found.values()):
@@ -146,25 +148,25 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         remove(path)
 
 
-def config_of(folder: Path) -> Config:
+def load_config(folder: Path) -> Config:
     """The study of a folder. Raises `InputError` where it is damaged."""
     path = folder / "study.toml"
     # it stands alone: what it included is in it
     return read_config(tomllib.loads(path.read_text()) if is_remote(path) else path)
 
 
-def _first_mark(folder: Path) -> Mark | None:
+def _read_first_header(folder: Path) -> PartHeader | None:
     """What the first whole part in a folder says of itself."""
     for path in list_paths(folder / "points", "part-*.parquet"):
         try:
-            return parts.mark_of(path)
+            return parts.read_header(path)
         except (Damaged, FileNotFoundError):
             continue
     return None
 
 
 @contextmanager
-def _refusing(part: Path) -> Iterator[None]:
+def _report_damage(part: Path) -> Iterator[None]:
     """Around what reads a part: one line where it is damaged."""
     try:
         yield
@@ -201,10 +203,10 @@ class Store:
             try:
                 store = cls.open(folder)
             except InputError:
-                if _first_mark(folder) is None:
+                if _read_first_header(folder) is None:
                     raise
         if store is None:
-            mark = _first_mark(folder)
+            mark = _read_first_header(folder)
             manifest = {
                 "format": FORMAT,
                 **manifest_head(config, "sweep"),
@@ -233,13 +235,13 @@ class Store:
         """Open a study that is there. Raises `InputError` where there is none."""
         path = folder / "manifest.json"
         if not has_file(folder, path.name):
-            if _first_mark(folder) is not None:
+            if _read_first_header(folder) is not None:
                 raise InputError(f"{folder}: has lost its manifest.json; 'jaxbl repair {folder}' writes it anew")
             raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first")
         try:
             manifest = read_json(path)
         except InputError:
-            if _first_mark(folder) is None:
+            if _read_first_header(folder) is None:
                 raise
             raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew by what the parts say") from None
         if manifest.get("format") != FORMAT:
@@ -295,13 +297,13 @@ class Store:
         where it is of another study."""
         known = self.manifest["checksums"].get(str(index))
         if known is None:
-            mark, _ = parts.read(path)
+            mark, _ = parts.read_part(path)
             self._check(path, mark, index)
             self.manifest["checksums"][str(index)] = parts.file_checksum(path)
         elif parts.file_checksum(path) != known:
             raise Damaged("does not agree with its checksum in manifest.json")
 
-    def _check(self, path: Path, mark: Mark, index: int) -> None:
+    def _check(self, path: Path, mark: PartHeader, index: int) -> None:
         """Whether a whole part is the one that belongs here."""
         if {name: mark.study.get(name) for name in self._head} != self._head:
             raise InputError(
@@ -324,7 +326,7 @@ class Store:
     def write(self, index: int, frame: pd.DataFrame) -> str:
         """Write a part; its checksum is to be noted (:meth:`note`). Changes nothing here: it may run in another thread."""
         head = self._head | {"title": self.manifest["title"]}
-        parts.write(self.part(index), frame, Mark(head, self.manifest["layout"], self.backend, index, 0, {}))
+        parts.write_part(self.part(index), frame, PartHeader(head, self.manifest["layout"], self.backend, index, 0, {}))
         return parts.file_checksum(self.part(index))
 
     def note(self, checksums: dict[int, str]) -> None:
@@ -342,7 +344,7 @@ class Store:
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
         try:
-            _, frame = parts.read(self.part(index), [*labels, *columns])
+            _, frame = parts.read_part(self.part(index), [*labels, *columns])
         except (Damaged, OSError):
             return None
         same = all(np.array_equal(frame[name].to_numpy(), values) for name, values in labels.items())
@@ -391,7 +393,7 @@ class Store:
 
     def columns(self) -> list[str]:
         """Names of the columns."""
-        mark = _first_mark(self.folder)
+        mark = _read_first_header(self.folder)
         return list(mark.columns) if mark is not None else list(next(self.batches()).columns)
 
     def batches(self, columns: list[str] | None = None) -> Iterator[pd.DataFrame]:
@@ -401,8 +403,8 @@ class Store:
             InputError: a part is damaged, or not of this study.
         """
         for part in self.parts():
-            with _refusing(part):
-                mark, frame = parts.read(self._near(part), columns)
+            with _report_damage(part):
+                mark, frame = parts.read_part(self._near(part), columns)
                 self._check(part, mark, int(part.stem.removeprefix("part-")))
             yield frame
 
@@ -418,11 +420,11 @@ class Store:
         found = self.parts()
         for part in found:
             index = int(part.stem.removeprefix("part-"))
-            with _refusing(part):
+            with _report_damage(part):
                 if check:
                     self._check_file(part, index)
                 else:
-                    self._check(part, parts.mark_of(part), index)
+                    self._check(part, parts.read_header(part), index)
         form = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )

@@ -11,19 +11,19 @@ import pandas as pd
 import pyarrow as pa
 from pyarrow.parquet import filters_to_expression
 
-from jaxbl.cluster import Scheduler, connected
+from jaxbl.cluster import Scheduler, connect
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import lock_folder, remove_drafts, remove_if_empty_on_error, to_path
 from jaxbl.workers import Progress
 
-from .bundles import ClusterRun, hand_over
+from .bundles import ClusterRun, submit_chunks
 from .engine import Engine, SweepEstimate
 from .metrics import find_metric
 from .programs import Backend
-from .run import Run, begun, joined
+from .run import Run, join_store, open_or_create_store
 from .status import Status, status
-from .store import Store, config_of
+from .store import Store, load_config
 
 if TYPE_CHECKING:
     import xarray
@@ -51,7 +51,7 @@ class StudyResult:
     config: Config
     source: Store | pd.DataFrame
     cost: dict[str, float] = dataclasses.field(default_factory=dict)
-    scanned: tuple[str, ...] = ()
+    fallback_reasons: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()
 
     @functools.cached_property
@@ -192,22 +192,22 @@ def sweep(
         NoResult: nothing can be written any more, as the disk is full, or the cluster is lost; what was written is whole.
     """
     config = read_config(study)
-    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
     if out is None:
         if scheduler is not None:
             raise InputError("--scheduler: its workers write into a folder; name it with --out")
         if backend == "fused":
-            engine.check()
+            engine.compile_all()
         run = Run(engine, None, progress)
         run.all()
         return _result(run, run.frame())
     folder = to_path(out)
     if backend == "fused" and not (folder / "manifest.json").exists():
         # refused, if it is, before anything is written
-        engine.check()
-    with remove_if_empty_on_error(folder), connected(scheduler) as cluster:
+        engine.compile_all()
+    with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _LET_GO):
-            engine, store = begun(folder, engine, insist=backend is not None, overwrite=overwrite)
+            engine, store = open_or_create_store(folder, engine, require_backend=backend is not None, overwrite=overwrite)
             store.refuse_others()
             if verify_store:
                 store.verify()
@@ -229,33 +229,44 @@ def _result(run: Run, source: Store | pd.DataFrame) -> StudyResult:
     """What a run leaves."""
     work = run.work
     cost = {"compile_seconds": work.compile_seconds, "run_seconds": work.run_seconds, "lanes": work.lanes}
-    return StudyResult(run.engine.config, source, cost, work.scanned, work.damaged)
+    return StudyResult(run.engine.config, source, cost, work.fallback_reasons, work.damaged)
 
 
 def share(
     study: str | Path | Mapping[str, Any] | Config,
     out: str | Path,
-    which: tuple[int, int],
+    portion: tuple[int, int],
     *,
     progress: Progress | None = None,
     devices: list[Any] | None = None,
     backend: Backend | None = None,
 ) -> Status:
-    """Compute the i-th of n shares of a study's chunks, `which` is (i, n), but for those that are there; other processes may
-    compute other shares into the same folder at the same time. Once all chunks are there, :func:`sweep` only reads them.
+    """Compute one of several shares of a study's chunks, apart from chunks that are stored already.
 
-    Other arguments are as of :func:`sweep`.
+    Other processes may compute other shares into the same folder at the same time. Once all chunks are stored,
+    :func:`sweep` only reads them.
+
+    Args:
+        study: as for :func:`sweep`.
+        out: as for :func:`sweep`.
+        portion: (i, n) computes the i-th of n shares, i = 1 ... n.
+        progress: as for :func:`sweep`.
+        devices: as for :func:`sweep`.
+        backend: as for :func:`sweep`.
 
     Raises:
-        InputError: as of :func:`sweep`; a refined study, whose points depend on one another.
+        InputError: as for :func:`sweep`; or a refined study, whose points depend on one another.
         NoResult: nothing can be written any more.
     """
     config, folder = read_config(study), to_path(out)
-    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
     _check_independent(engine, "--share")
-    number, count = which
-    with remove_if_empty_on_error(folder), joined(folder, engine, insist=backend is not None) as (engine, store):
-        run = Run(engine, store, progress, engine.order()[number - 1 :: count])
+    number, count = portion
+    with (
+        remove_if_empty_on_error(folder),
+        join_store(folder, engine, require_backend=backend is not None) as (engine, store),
+    ):
+        run = Run(engine, store, progress, engine.chunk_order()[number - 1 :: count])
         run.all()
     return status(folder)
 
@@ -276,13 +287,13 @@ def submit(
             with this process.
     """
     config, folder = read_config(study), to_path(out)
-    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
     _check_independent(engine, "--detach")
-    with remove_if_empty_on_error(folder), connected(scheduler) as cluster:
+    with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-        with joined(folder, engine, insist=backend is not None) as (engine, store):
-            hand_over(cluster, engine, store)
+        with join_store(folder, engine, require_backend=backend is not None) as (engine, store):
+            submit_chunks(cluster, engine, store)
     return status(folder)
 
 
@@ -295,7 +306,7 @@ def open_study(folder: str | Path) -> StudyResult:
     """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read
     on first use. Raises `InputError` where there is none."""
     store = Store.open(to_path(folder))
-    return StudyResult(config_of(store.folder), store)
+    return StudyResult(load_config(store.folder), store)
 
 
 def repair(folder: str | Path) -> tuple[int, Store]:
@@ -309,12 +320,12 @@ def repair(folder: str | Path) -> tuple[int, Store]:
     folder = to_path(folder)
     if not (folder / "study.toml").exists():
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
-    config = config_of(folder)
+    config = load_config(folder)
     with lock_folder(folder):
-        _, store = begun(folder, Engine(config), insist=False)
+        _, store = open_or_create_store(folder, Engine(config), require_backend=False)
         return store.verify(), store
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:
     """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
-    return Engine(read_config(study), backend=backend, insist=backend is not None).estimate()
+    return Engine(read_config(study), backend=backend, require_backend=backend is not None).estimate()

@@ -70,7 +70,7 @@ def run(
     return Trial(config, trace, _summary(config, last, metrics, seed))
 
 
-def neighbours(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
+def run_perturbed(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
     """Metrics of runs whose gains λ and motor inertia differ from a study's in their last digits: how far figures come apart
     by rounding, which an observer may amplify under noise, and a plant with a gap."""
     experiment = study.build()

@@ -110,7 +110,9 @@ class FusedStudy:
         self._study, self._round = of, 0
         devices, layout = jax.local_devices(backend="cpu"), Layout(of.seeds, of.lanes)
         with precision(of.config):
-            self._program: Program = compile_program(of.experiment, layout, devices, "fused", of.values, insist=True)
+            self._program: Program = compile_program(
+                of.experiment, layout, devices, "fused", of.values, require_backend=True
+            )
 
     def __call__(self) -> dict[str, np.ndarray]:
         """Figures `(seeds, lanes)` by name."""

@@ -70,7 +70,7 @@ def looped():
 def test_a_sweep_is_scanned(swept, unknown, caplog):
     said = unknown()
     result = jaxbl.sweep(SWEPT)
-    (why,) = result.scanned
+    (why,) = result.fallback_reasons
     np.testing.assert_array_equal(result.frame[NAME], swept[NAME])
     assert re.fullmatch(said, why)
     with pytest.raises(

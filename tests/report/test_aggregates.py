@@ -10,7 +10,7 @@ from jaxbl.report.aggregates import Column, Groups, spread
 from jaxbl.report.maps import draw
 from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.run import begun
+from jaxbl.sweeps.run import open_or_create_store
 from jaxbl.sweeps.sweep import open_study
 
 NUMBERS = {
@@ -60,10 +60,10 @@ def test_groups_are_those_of_pandas():
 def stored(folder, data, **columns):
     """A made-up study in parts."""
     result = made(data, **columns)
-    engine, store = begun(folder, Engine(result.config, backend="scan"), insist=False)
+    engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"), require_backend=False)
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):
-        labels = pd.DataFrame(engine.labels(engine.chunk(index)))
+        labels = pd.DataFrame(engine.row_labels(engine.chunk(index)))
         store.write(index, labels.merge(result.frame, on=keys, how="left", validate="1:1"))
     store.update(finished=True)
     return open_study(folder)

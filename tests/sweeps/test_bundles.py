@@ -12,12 +12,12 @@ from distributed import Client, LocalCluster
 from small_study import ALPHA, LAMBDA, parts, spaced, thirty
 
 from jaxbl import cluster
-from jaxbl.cluster import Cluster, connected
+from jaxbl.cluster import Cluster, connect
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.files import FolderInUse, lock_folder
 from jaxbl.gains.stages import stages_in
-from jaxbl.sweeps.bundles import Bundle, _size, compute
+from jaxbl.sweeps.bundles import Bundle, _bundle_size, compute_bundle
 from jaxbl.sweeps.programs import Layout
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import submit, sweep
@@ -113,10 +113,10 @@ def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client
 
 def test_bundles_take_workers_long_enough_and_are_not_too_many():
     # chunks of 0.1 s, many of them; few of them, four bundles a worker; so many that a scheduler would suffer; unknown time
-    assert _size(0.1, 100_000, 10) == 200
-    assert _size(0.1, 400, 10) == 10
-    assert _size(30.0, 1_000_000, 10) == 20
-    assert _size(0.0, 3, 10) == 1
+    assert _bundle_size(0.1, 100_000, 10) == 200
+    assert _bundle_size(0.1, 400, 10) == 10
+    assert _bundle_size(30.0, 1_000_000, 10) == 20
+    assert _bundle_size(0.0, 3, 10) == 1
 
 
 def test_bad_input(tmp_path, client, monkeypatch):
@@ -134,7 +134,7 @@ def test_bad_input(tmp_path, client, monkeypatch):
         submit(refined, tmp_path / "a", client)
     assert not (tmp_path / "a").exists()
     with pytest.raises(InputError, match=r"nowhere: is not seen by worker .*; --out should name a folder that all machines"):
-        compute(Bundle(str(tmp_path / "nowhere"), "", Layout(1, 1), "scan", False, (0,)))
+        compute_bundle(Bundle(str(tmp_path / "nowhere"), "", Layout(1, 1), "scan", False, (0,)))
 
 
 def _fails(job):
@@ -142,23 +142,23 @@ def _fails(job):
 
 
 def test_errors_of_workers_reach_who_asked(client, monkeypatch):
-    with connected(client) as workers:
+    with connect(client) as workers:
         assert isinstance(workers, Cluster) and workers.workers == 2 and not workers.local
-        assert list(workers.each(abs, [-3, -2, -1])) == [3, 2, 1]
+        assert list(workers.map_jobs(abs, [-3, -2, -1])) == [3, 2, 1]
         with pytest.raises(InputError, match="the job's line"):
-            list(workers.each(_fails, ["input"]))
+            list(workers.map_jobs(_fails, ["input"]))
         with pytest.raises(InputError, match="its workers lack a module"):
-            list(workers.each(_fails, ["module"]))
+            list(workers.map_jobs(_fails, ["module"]))
         asking = [cluster.version("jaxbl")]
         monkeypatch.setattr(cluster, "version", lambda name: asking.pop() if asking else "0.0.1")
         with pytest.raises(InputError, match=r"worker .* has jaxbl 0\.0\.1; install .* there"):
-            list(workers.each(abs, [1]))
+            list(workers.map_jobs(abs, [1]))
 
 
 def test_jobs_are_taken_as_they_are_needed(client):
     taken = []
-    with connected(client) as workers:
-        results = workers.each(abs, (taken.append(number) or number for number in itertools.count()))
+    with connect(client) as workers:
+        results = workers.map_jobs(abs, (taken.append(number) or number for number in itertools.count()))
         assert [next(results) for _ in range(40)] == list(range(40))
         # in flight, and done but not yet asked for
         assert len(taken) <= 40 + 2 * cluster._FEWEST_AHEAD
@@ -175,8 +175,8 @@ def _waits(job):
 def test_a_scheduler_that_is_lost_is_said():
     # one thread, so that the job that waits begins after the other
     own = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(**own) as there, Client(there, set_as_default=False) as connection, connected(connection) as workers:
-        results = workers.each(_waits, [False, True])
+    with LocalCluster(**own) as there, Client(there, set_as_default=False) as connection, connect(connection) as workers:
+        results = workers.map_jobs(_waits, [False, True])
         assert next(results) is False
         connection.close()
         try:

@@ -10,7 +10,7 @@ from small_study import ALPHA, LAMBDA, NOISE, small
 import jaxbl.sweeps.costs as under_test
 from jaxbl.config import read_config
 from jaxbl.fused import program_cache
-from jaxbl.sweeps.costs import Cost, Costs, Work, faster, measured, work_of
+from jaxbl.sweeps.costs import Cost, Costs, Operations, choose_backend, count_operations, measure_costs
 from jaxbl.sweeps.programs import Layout
 
 KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
@@ -19,22 +19,22 @@ KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 def test_counted_work():
     one, ten = (read_config(small({"run.substeps": n})) for n in (1, 10))
     gains, plants = [LAMBDA, ALPHA], ["transmission.dead_zone"]
-    shared, own = work_of(ten, gains), work_of(ten, plants)
+    shared, own = count_operations(ten, gains), count_operations(ten, plants)
     # one and the same step, by all lanes or by each
     assert shared.shared + shared.lane == pytest.approx(own.shared + own.lane, rel=0.1)
     assert shared.shared > 3.0 * shared.lane
     assert own.lane > own.shared
     # nine plant steps more, each of them a tanh at least
     for paths, of in ((gains, "shared"), (plants, "lane")):
-        more = getattr(work_of(ten, paths), of) - getattr(work_of(one, paths), of)
+        more = getattr(count_operations(ten, paths), of) - getattr(count_operations(one, paths), of)
         assert 9 * 30 < more < 9 * 100
     # position and velocity of both sides are among what a lane of its own carries
     assert own.carried - shared.carried >= 4 * 8
     single = read_config(small({"run.precision": "float32"}))
-    assert work_of(single, gains).carried == pytest.approx(work_of(one, gains).carried / 2, rel=0.01)
+    assert count_operations(single, gains).carried == pytest.approx(count_operations(one, gains).carried / 2, rel=0.01)
     # a run that is twice as long does not more a sample
     longer = read_config(small({"run.duration": 2.0 * one.run.duration, "run.substeps": 1}))
-    assert work_of(longer, [NOISE]).lane == pytest.approx(work_of(one, [NOISE]).lane, rel=0.02)
+    assert count_operations(longer, [NOISE]).lane == pytest.approx(count_operations(one, [NOISE]).lane, rel=0.02)
 
 
 def test_measured_costs_are_those_of_the_machine(monkeypatch):
@@ -43,37 +43,37 @@ def test_measured_costs_are_those_of_the_machine(monkeypatch):
     def times(config, devices, wanted):
         took = {}
         for backend, path, lanes in wanted:
-            work = work_of(config, [path])
+            work = count_operations(config, [path])
             took[backend, path, lanes] = KNOWN.sample(backend, work, Layout(1, lanes))
             if backend == "scan" and lanes > 10_000:
                 # the cache is too small
                 took[backend, path, lanes] *= 2.0
-        equations = work_of(config, [wanted[0][1]]).equations
+        equations = count_operations(config, [wanted[0][1]]).equations
         return took, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
 
-    monkeypatch.setattr(under_test, "_times", times)
-    found = measured(jax.devices()[:1])
+    monkeypatch.setattr(under_test, "_time_programs", times)
+    found = measure_costs(jax.devices()[:1])
     for backend in ("fused", "scan"):
         np.testing.assert_allclose(found.of(backend), KNOWN.of(backend), rtol=1e-6)
-    assert found.cache == 4096 * work_of(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
+    assert found.cache == 4096 * count_operations(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
 
 
 def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
     calls = []
-    monkeypatch.setattr(under_test, "measured", lambda devices: calls.append(devices) or KNOWN)
+    monkeypatch.setattr(under_test, "measure_costs", lambda devices: calls.append(devices) or KNOWN)
     devices = jax.devices()
-    assert under_test.costs(devices) == under_test._CPU
+    assert under_test.load_costs(devices) == under_test._CPU
     assert not calls
     monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
-    assert [under_test.costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
+    assert [under_test.load_costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
     assert calls == [devices]
 
 
 def test_the_backend_that_takes_less_time():
     def chosen(platform, layout, samples=10**7, devices=1, programs=1):
         backends = dict.fromkeys(("fused", "scan"), Layout(*layout)), dict.fromkeys(("fused", "scan"), samples)
-        works = dict.fromkeys(("fused", "scan"), Work(300.0, 100.0, 200.0, 800))
-        return faster([SimpleNamespace(platform=platform)] * devices, works, *backends, programs)
+        works = dict.fromkeys(("fused", "scan"), Operations(300.0, 100.0, 200.0, 800))
+        return choose_backend([SimpleNamespace(platform=platform)] * devices, works, *backends, programs)
 
     assert chosen("cpu", (1, 3)) == "fused"
     # seed after seed would pay for each what lanes share

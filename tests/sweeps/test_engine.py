@@ -67,7 +67,7 @@ def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference,
     engine = Engine(config, devices=jax.devices()[:devices])
     # padded: the last chunk of points is not full, or there are more seeds than are left
     assert len(engine) == 1 if chunk == 36 else len(engine) > 1
-    frame = by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.order())]))
+    frame = by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())]))
     exact = [column for column in frame if engine.layout.seeds > 1 or column not in BOUND]
     assert_equal(frame[exact], reference[exact])
     assert_equal(frame, reference, rtol=1e-15)
@@ -112,7 +112,7 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     config = read_config(study)
     assert Engine(config).backend == "fused"
     result, scanned = sweep(config), sweep(config, backend="scan").frame
-    assert result.scanned == why
+    assert result.fallback_reasons == why
     found = result.frame
     np.testing.assert_allclose(found["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
 
@@ -153,7 +153,7 @@ def test_seeds_alone_are_scanned():
     assert len(sweep(config).frame) == 4
     # not even tried
     assert [Engine(config, devices=jax.devices()[:count]).backend for count in (1, 2)] == ["scan", "scan"]
-    assert sweep(config).scanned == ()
+    assert sweep(config).fallback_reasons == ()
     with pytest.raises(InputError, match="use --backend scan"):
         sweep(config, backend="fused")
 
@@ -200,7 +200,7 @@ def test_seeds_of_one_point_share_chunks():
     config = read_config(rigid(sweep={"seeds": 10, "chunk": 4}))
     engine = Engine(config)
     assert (tuple(engine.layout), len(engine), engine.rows) == ((4, 1), 3, 10)
-    frame = pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.order())])
+    frame = pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())])
     assert list(frame["seed"]) == list(range(10))
     assert frame["motor.velocity_rmse"].nunique() == 10
 

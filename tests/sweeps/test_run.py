@@ -9,7 +9,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import lock_folder
 from jaxbl.sweeps import run
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.status import status, statuses
+from jaxbl.sweeps.status import list_statuses, status
 from jaxbl.sweeps.sweep import share, sweep
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -63,17 +63,17 @@ def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypat
 
 def test_status_of_folders(tmp_path):
     with pytest.raises(InputError, match="holds no study"):
-        statuses(tmp_path)
+        list_statuses(tmp_path)
     for name in ("verify/drive", "verify/sampled"):
         sweep(thirty(), tmp_path / name)
-    assert [one.folder.name for one in statuses(tmp_path)] == ["drive", "sampled"]
+    assert [one.folder.name for one in list_statuses(tmp_path)] == ["drive", "sampled"]
 
 
 def test_chunks_cover_the_grid_coarsely_first():
     """Whenever it is stopped, a study has points all over its map."""
     axes = [spaced(ALPHA, 5.0, 20.0, 32), spaced(LAMBDA, 0.3, 5.0, 32)]
     engine = Engine(read_config(thirty(axes=axes, sweep={"seeds": 2, "chunk": 8})))
-    order = engine.order()
+    order = engine.chunk_order()
     assert sorted(order) == list(range(len(engine))) and len(engine) == 256
     # the first seed of all points before the second
     assert {engine.chunk(index).seeds[0] for index in order[:128]} == {0}

@@ -19,7 +19,7 @@ from jaxbl.errors import InputError, NoResult
 from jaxbl.files import json_with_checksum, make_folder, read_json
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.parts import file_checksum
-from jaxbl.sweeps.store import Store, claim, identity
+from jaxbl.sweeps.store import Store, claim_folder, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study, repair, sweep
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -402,7 +402,7 @@ def test_files_of_others_are_never_removed(tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "mine.png").write_bytes(b"x")
     with pytest.raises(InputError, match="not of a study"):
-        claim(tmp_path, read_config(rigid()), overwrite=True)
+        claim_folder(tmp_path, read_config(rigid()), overwrite=True)
     assert (tmp_path / "figures" / "mine.png").exists()
 
 

@@ -20,7 +20,7 @@ from jaxbl.report.sweep import headline
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
-from jaxbl.sweeps.trial import neighbours, run
+from jaxbl.sweeps.trial import run, run_perturbed
 
 from .cloud import write_cloud
 from .folder import Source, drawable, write_page
@@ -137,7 +137,7 @@ _NEARBY = 6
 def nearby(config: Config, asked: Any) -> dict[str, Any]:
     """Metrics of runs whose numbers differ from a point's in their last digits. Arguments and errors as of
     :func:`point_of`."""
-    return {"metrics": neighbours(*point_of(config, asked), _NEARBY)}
+    return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}
 
 
 def _about(config: Config, columns: list[str]) -> dict[str, Any]:
