@@ -25,11 +25,19 @@ _PREPARED = 60.0
 def open_or_create_store(
     folder: Path, engine: Engine, *, require_backend: bool, overwrite: bool = False
 ) -> tuple[Engine, Store]:
-    """The store in a folder that is ours (:func:`jaxbl.files.lock_folder`), begun or gone on with, and the engine for it: chunks
-    stay what they were when it was begun, on whatever machine. `require_backend`: the engine's backend was asked for.
+    """Open the store of an engine's study in a locked folder (:func:`jaxbl.files.lock_folder`), or create it.
+
+    Returns an engine with the store's layout and backend as well: chunks keep the shape that they had when the store was
+    created, on any machine.
+
+    Args:
+        folder: study's folder, locked by this process.
+        engine: engine that this machine would use.
+        require_backend: refuse a store of another backend than the engine's.
+        overwrite: remove the results of other studies from the folder.
 
     Raises:
-        InputError: it holds another study, or is by another backend.
+        InputError: the folder holds another study, or a store of another backend.
     """
     config = engine.config
     claim_folder(folder, config, overwrite=overwrite)
