@@ -46,7 +46,7 @@ class SharedInputs(NamedTuple):
     handed: AddressedArrays
     last: AddressedArrays
     ends: list[np.ndarray] | None
-    compute_metrics: list[np.ndarray]
+    figures: list[np.ndarray]
 
     @property
     def size(self) -> int:
