@@ -25,12 +25,12 @@ from .store import identity
 
 
 class Trial(NamedTuple):
-    """One run.
+    """A run of one experiment.
 
     Attributes:
         config: the study (its axes are not used).
-        trace: one row a sample; `t`, `u`, `theta_e`, `theta_s` as a measured log has them, true values and estimates by
-            side, path of the identified parameters (columns and units: README).
+        trace: one row a sample: `t`, `u`, `theta_e`, `theta_s` as in a measured log, true values and estimates by side, and
+            identified parameters (columns and units: README).
         summary: metrics, identified parameters, gain conditions and remarks, as in `summary.json`.
     """
 
@@ -53,6 +53,10 @@ def run(
 
     Raises:
         InputError: wrong config, or a study that `fused` cannot run.
+
+    Example:
+        >>> trial = jaxbl.run("study.toml", seed=1)
+        >>> trial.summary["metrics"]["motor.velocity_rmse"]
     """
     config = read_config(study)
     if not 1 <= every <= config.run.steps:
@@ -60,65 +64,72 @@ def run(
     with precision(config):
         experiment = prepare(config)
         if backend == "scan":
-            figures, kept = _scanned(experiment, seed, every)
+            results, columns = _run_scan(experiment, seed, every)
         else:
-            figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
-        figures = add_gain_metrics(figures, observer_gains(experiment))
-        trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
-    last = {name: to_jsonable(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
-    metrics = {name: to_jsonable(value) for name, value in figures.items()}
-    return Trial(config, trace, _summary(config, last, metrics, seed))
+            results, columns = _run_fused(experiment, seed, every, require_backend=backend == "fused")
+        results = add_gain_metrics(results, observer_gains(experiment))
+        trace = pd.DataFrame({name: np.asarray(column, float) for name, column in columns.items()})
+    last = {name: to_jsonable(results.pop(name)) for name in list(results) if name.startswith("last.")}
+    metrics = {name: to_jsonable(metric) for name, metric in results.items()}
+    return Trial(config, trace, _summarise(config, last, metrics, seed))
 
 
 def run_perturbed(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
-    """Metrics of runs whose gains λ and motor inertia differ from a study's in their last digits: how far figures come apart
-    by rounding, which an observer may amplify under noise, and a plant with a gap."""
+    """Run a study `count` times with gains λ and motor inertia changed in their last digits, and return the metrics.
+
+    Their spread shows how far rounding changes the metrics: noise and a gap may amplify it.
+    """
     experiment = study.build()
-    numbers: dict[str, Any] = {f"observer.{side}.lambda": one.lambda_ for side, one in observer_gains(experiment).items()}
+    numbers: dict[str, Any] = {
+        f"observer.{side}.lambda": gains.lambda_ for side, gains in observer_gains(experiment).items()
+    }
     numbers["drive.motor_inertia"] = experiment.drive.inertia("motor")
-    # the last decimal that its precision has: one bit may be lost in the first product
-    last = 8.0 * float(np.finfo(study.run.precision).eps)
-    changes = ({path: float(value) * (1.0 + k * last) for path, value in numbers.items()} for k in range(1, count + 1))
-    return [run(with_values(study, one), seed=seed, backend="scan").summary["metrics"] for one in changes]
+    # eight units in the last place: the first product may lose one bit
+    step = 8.0 * float(np.finfo(study.run.precision).eps)
+    all_metrics = []
+    for k in range(1, count + 1):
+        changed = with_values(study, {path: float(number) * (1.0 + k * step) for path, number in numbers.items()})
+        all_metrics.append(run(changed, seed=seed, backend="scan").summary["metrics"])
+    return all_metrics
 
 
-def _recorded(experiment: Experiment, seed: int, every: int, *, insist: bool) -> tuple[dict[str, Any], Any]:
-    """By the fused loop; if that cannot, by XLA's own, unless one insists."""
+def _run_fused(experiment: Experiment, seed: int, stride: int, *, require_backend: bool) -> tuple[dict[str, Any], Any]:
+    """Run the fused loop; if it does not support the experiment, the scan, unless `require_backend`."""
     try:
         with raising_unsupported():
             from jaxbl.fused.single_run import record_run
 
-            return record_run(experiment, seed, _REDUCERS, partial(_row, experiment), every)
-    except Unsupported as why:
-        if insist:
-            raise InputError(f"backend: the fused loop does not support {why}; use 'scan', or leave it out") from None
-        warn_of_scan(str(why))
-        return _scanned(experiment, seed, every)
+            return record_run(experiment, seed, _REDUCERS, partial(_trace_row, experiment), stride)
+    except Unsupported as reason:
+        if require_backend:
+            raise InputError(f"backend: the fused loop does not support {reason}; use 'scan', or leave it out") from None
+        warn_of_scan(str(reason))
+        return _run_scan(experiment, seed, stride)
 
 
 @partial(jax.jit, static_argnums=2)
-def _scanned(experiment: Experiment, seed: Any, every: int) -> tuple[dict[str, Any], Any]:
-    return scan(experiment, seed, _REDUCERS, partial(_row, experiment), every)
+def _run_scan(experiment: Experiment, seed: Any, stride: int) -> tuple[dict[str, Any], Any]:
+    return scan(experiment, seed, _REDUCERS, partial(_trace_row, experiment), stride)
 
 
-def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
-    figures = {"last.largest_torque": largest}
-    for side, found in identified_parameters(experiment, state).items():
-        figures |= {f"last.{side}.{name}": value for name, value in found.items()}
-    return figures
+def _last_results(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
+    results = {"last.largest_torque": largest}
+    for side, parameters in identified_parameters(experiment, state).items():
+        results |= {f"last.{side}.{name}": parameter for name, parameter in parameters.items()}
+    return results
 
 
-# over all samples, whatever the trace keeps of them
-_LAST = Reducer(
+# a reducer sees all samples, also those that the trace leaves out
+_LAST_RESULTS = Reducer(
     lambda experiment: jnp.zeros_like(experiment.run.sample_period),
     lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
-    _last,
+    _last_results,
 )
-_REDUCERS = ALL_METRICS, _LAST
+_REDUCERS = ALL_METRICS, _LAST_RESULTS
 
 
-def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
-    """Columns of the trace at one sample."""
+def _trace_row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
+    """The trace's row of a sample, by column."""
     row = {"t": signals.time, "u": signals.input}
     row |= {POSITION_CHANNELS[side]: signals.side(side).measured for side in experiment.sides}
     if signals.twist is not None:
@@ -129,14 +140,14 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
         true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}
         estimates = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
         row |= true | {f"{side}.{name}": getattr(s, name) for name in estimates}
-    found = identified_parameters(experiment, state)
+    parameters = identified_parameters(experiment, state)
     for side in experiment.sides:
-        row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
-    # compiled programs sort the names of other dicts
+        row |= {f"{side}.{name}": parameter for name, parameter in parameters.get(side, {}).items()}
+    # a compiled program would return a plain dict with its names sorted
     return OrderedDict(row)
 
 
-def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
+def _summarise(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
     experiment = config.build()
     parameters: dict[str, Any] = {}
     if experiment.transmission is not None:
@@ -160,42 +171,43 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
 
 
 def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
-    """What a reader of the figures should know, in sentences."""
+    """Sentences about convergence, and about the gains beside the gain conditions; adds `torque_bound` to `conditions`."""
     if not metrics["finite"]:
-        return ["The run diverged: its figures are not finite. Look at units; more [run] substeps are more stable."]
+        return ["The run diverged: its metrics are not finite. Check the units; more [run] substeps make it more stable."]
     remarks = []
-    what = "the disturbance torque" if experiment.transmission is None else "the transmitted torque |C|"
+    torque_name = "disturbance torques" if experiment.transmission is None else "transmitted torques |C|"
     largest = last["last.largest_torque"]
-    for side, found in conditions.items():
+    for side, judgement in conditions.items():
+        alpha, lambda_, f_plus = judgement["alpha"], judgement["lambda"], judgement["f_plus"]
         inertia = float(experiment.drive.inertia(side))
-        limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
-        verdict = "holds" if largest < limit else "fails"
+        limit = alpha * inertia / abs(float(experiment.drive.torque_gain(side)))
+        verdict = "large enough" if largest < limit else "too small"
         remarks.append(
-            f"{side}: alpha = {found['alpha']:g} rad/s² covers {what} while it is below {limit:.3g} N m; "
-            f"the largest here is {largest:.3g} N m, so that this {verdict}. The true bound along the run, with the "
-            f"observer's own velocity error in it, is f⁺ = {found['f_plus']:.3g} rad/s²; twice the largest acceleration "
-            f"would be {metrics[f'{side}.f_plus_acceleration']:.3g} rad/s²."
+            f"{side}: alpha = {alpha:g} rad/s² is {verdict}: it allows {torque_name} up to {limit:.3g} N m, and the run "
+            f"reached {largest:.3g} N m. The true bound along the run, which includes the observer's own velocity error, is "
+            f"f⁺ = {f_plus:.3g} rad/s²; twice the largest acceleration would be "
+            f"{metrics[f'{side}.f_plus_acceleration']:.3g} rad/s²."
         )
-        if not found["alpha_exceeds_f_plus"]:
+        if not judgement["alpha_exceeds_f_plus"]:
             remarks.append(f"{side}: alpha is below the true f⁺, so that no condition on lambda can hold.")
-            # what lambda would have to be where alpha does cover the torque
+            # alpha may still exceed the bound that follows from the torque alone: the conditions on lambda at that bound
             torque_bound = largest * abs(float(experiment.drive.torque_gain(side))) / inertia
-            if found["alpha"] > torque_bound:
-                found["torque_bound"] = judge_gains(found["lambda"], found["alpha"], torque_bound)
-        for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
-            if values is None or values["least_lambda"]["exact"] is None:
+            if alpha > torque_bound:
+                judgement["torque_bound"] = judge_gains(lambda_, alpha, torque_bound)
+        for label, at_bound in (("the true f⁺", judgement), ("f⁺ = max |C| / J", judgement.get("torque_bound"))):
+            if at_bound is None or at_bound["least_lambda"]["exact"] is None:
                 continue
-            missed = [
-                f"{CONDITIONS[name].title}{_factor(least, found['lambda'])} (more than {least:.4g})"
-                for name, least in values["least_lambda"].items()
-                if found["lambda"] <= least
+            unmet = [
+                f"{CONDITIONS[name].title} needs more than {least:.4g}{_factor(least, lambda_)}"
+                for name, least in at_bound["least_lambda"].items()
+                if lambda_ <= least
             ]
-            if missed:
-                remarks.append(f"{side}: lambda = {found['lambda']:g} misses, at {label}: {'; '.join(missed)}.")
-        if metrics[f"{side}.converged"] and not found["holds"]["exact"]:
+            if unmet:
+                remarks.append(f"{side}: lambda = {lambda_:g} is too small at {label}: {'; '.join(unmet)}.")
+        if metrics[f"{side}.converged"] and not judgement["holds"]["exact"]:
             remarks.append(
-                f"{side}: the observer converged all the same: the conditions are for the worst disturbance, which this run "
-                "need not contain, and they leave out viscous friction, which can shrink the error asymptotically."
+                f"{side}: the observer converged nevertheless: the conditions assume the worst disturbance, which this run "
+                "may not contain, and neglect viscous friction, which can make the error decay."
             )
     run = experiment.run
     for side in experiment.sides:
@@ -210,5 +222,5 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
 
 
 def _factor(least: float, lambda_: float) -> str:
-    """By what factor lambda is too small; of zero there is none."""
-    return f" by a factor of {least / lambda_:.4g}" if lambda_ > 0.0 else ""
+    """The factor by which lambda is too small, in words; empty for a lambda of zero."""
+    return f", a factor of {least / lambda_:.4g}" if lambda_ > 0.0 else ""
