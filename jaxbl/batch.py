@@ -25,13 +25,13 @@ class LogJob(NamedTuple):
     overwrite: bool
 
     def absolute(self) -> "LogJob":
-        """With paths that other processes understand."""
+        """Return the job with absolute paths, for processes in other folders."""
         holdout = None if self.holdout is None else self.holdout.absolute()
         return LogJob(self.log.absolute(), self.model.absolute(), holdout, self.folder.absolute(), self.overwrite)
 
 
 def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> tuple[list[LogJob], list[str]]:
-    """The logs of a folder, each with its model and a folder for its results; names of what is no log, nor a model.
+    """List the logs of a folder, each with its model and a folder for its results, and the names of other files.
 
     `NAME.toml` beside a log is its model (`model` where there is none), `holdout/NAME.*` its hold-out log.
 
@@ -41,50 +41,50 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; --batch needs one with logs")
     logs = sorted(file for file in source.iterdir() if is_log(file))
-    known = {"holdout", *(file.name for file in logs)}
-    others = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
-    skipped = sorted({*others} - known)
+    known_names = {"holdout", *(file.name for file in logs)}
+    file_names = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
+    skipped = sorted({*file_names} - known_names)
     if not logs:
         raise InputError(f"{source}: holds no log ({', '.join(log_suffixes())}, or a folder of a ROS 2 bag)")
     stems = [file.stem for file in logs]
     for name in stems:
         if stems.count(name) > 1:
             raise InputError(f"{source}: two logs are called {name}; each needs a name of its own for its results")
-    held = {file.stem: file for file in (source / "holdout").glob("*") if is_log(file)}
+    holdouts = {file.stem: file for file in (source / "holdout").glob("*") if is_log(file)}
     jobs = []
     for file in logs:
-        own = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
-        if own is None:
+        log_model = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
+        if log_model is None:
             raise InputError(f"{file}: no model; give --model TOML, or {file.with_suffix('.toml').name} beside it")
-        jobs.append(LogJob(file, own, held.get(file.stem), out / file.stem, overwrite))
+        jobs.append(LogJob(file, log_model, holdouts.get(file.stem), out / file.stem, overwrite))
     return jobs, skipped
 
 
 def run_batch(
-    work: list[LogJob], out: Path, processes: int | None, progress: Progress, scheduler: Scheduler = None
+    jobs: list[LogJob], out: Path, processes: int | None, progress: Progress, scheduler: Scheduler = None
 ) -> list[dict[str, Any]]:
     """Diagnose logs that are not diagnosed yet, in processes here or by a cluster's workers, and write `batch.csv`.
 
     Returns its rows.
     """
     make_folder(out)
-    progress(0, len(work))
+    progress(0, len(jobs))
     rows = []
-    processes = useful_processes(len(work)) if processes is None else min(processes, len(work))
+    processes = useful_processes(len(jobs)) if processes is None else min(processes, len(jobs))
     with connect(scheduler) as cluster:
         if cluster is None:
-            found = map_jobs(_diagnosed, work, processes)
+            batch_rows = map_jobs(_diagnose_log, jobs, processes)
         else:
-            found = cluster.map_jobs(_diagnosed, [job.absolute() for job in work])
-        for row in found:
+            batch_rows = cluster.map_jobs(_diagnose_log, [job.absolute() for job in jobs])
+        for row in batch_rows:
             rows.append(row)
-            progress(len(rows), len(work))
+            progress(len(rows), len(jobs))
     pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
     return rows
 
 
-def _diagnosed(job: LogJob) -> dict[str, Any]:
-    """Row of a batch: a log's diagnosis, or why there is none."""
+def _diagnose_log(job: LogJob) -> dict[str, Any]:
+    """Diagnose a log and return its row of a batch."""
     from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
     from .report.diagnose import write_diagnosis_report
 
@@ -92,19 +92,21 @@ def _diagnosed(job: LogJob) -> dict[str, Any]:
     try:
         task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
         file = job.folder / "diagnosis.json"
-        return batch_row(job.log, run_or_read(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite))
+        return make_batch_row(
+            job.log, run_or_read(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite)
+        )
     except InputError as error:
-        return batch_row(job.log, None, str(error))
+        return make_batch_row(job.log, None, str(error))
 
 
-def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
-    """A row of `batch.csv`: a log's diagnosis, or why there is none."""
+def make_batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
+    """Make a row of `batch.csv` from a log's diagnosis, or from the reason why it was refused."""
     row: dict[str, Any] = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
     if summary is None:
         return row
     row["verdict"] = summary["verdict"]
-    row["findings"] = "; ".join(one["effect"] for one in summary["findings"])
-    row["confidence"] = min((one["confidence"] for one in summary["findings"]), default=None)
+    row["findings"] = "; ".join(finding["effect"] for finding in summary["findings"])
+    row["confidence"] = min((finding["confidence"] for finding in summary["findings"]), default=None)
     for name in summary["gap"]["holdout_rmse_before"]:
         for key, column in (("holdout_rmse_before", "before"), ("holdout_rmse_after", "after"), ("noise_floor", "floor")):
             row[f"{name}_{column}"] = summary["gap"][key][name]
@@ -114,8 +116,8 @@ def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -
 _LONGEST_VERDICT = len("no discrepancy")
 
 
-def batch_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """The rows of a batch as a table for the terminal."""
+def format_batch(rows: list[dict[str, Any]]) -> list[str]:
+    """Write the rows of a batch as a table for the terminal."""
     cells = []
     for row in rows:
         if row["refused"]:

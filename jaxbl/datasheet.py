@@ -45,7 +45,7 @@ _STEP: dict[str, Unit] = _ANGLE | {
 }
 _PERIOD: dict[str, Unit] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "Hz": lambda rate: 1.0 / rate, "kHz": lambda rate: 1e-3 / rate}
 _SPEED: dict[str, Unit] = {"rad/s": 1.0, "rpm": _RPM, "deg/s": _DEGREE}
-_WAYS = {
+_SPELLINGS = {
     "²": "2", "µ": "u", "μ": "u", "°": "deg", "′": "arcmin", "″": "arcsec", "1/min": "rpm", "min-1": "rpm", "bits": "bit",
     ":1": "",
 }  # fmt: skip
@@ -71,83 +71,83 @@ class Item(NamedTuple):
     """
 
     name: str
-    asked: str
+    question: str
     units: Mapping[str, Unit]
     example: str
     default: str = ""
     least: float = 0.0
-    above: bool = True
+    is_above: bool = True
     key: str = ""
     absent: bool = False
 
-    def read(self, text: str) -> "Given":
-        """The number in SI.
+    def read(self, text: str) -> "Answer":
+        """Read a number with its unit.
 
         Raises:
             InputError: no number, a unit that is not known here, or out of range.
         """
-        known = {_spelt(unit): (unit, factor) for unit, factor in self.units.items()}
-        likely = f"'{self.example}'" + (f", or '{NONE}'" if self.absent else "")
+        units_by_spelling = {_normalise_unit(unit): (unit, factor) for unit, factor in self.units.items()}
+        example = f"'{self.example}'" + (f", or '{NONE}'" if self.absent else "")
         if self.absent and text.strip().lower() == NONE:
-            return Given(0.0, f"given: {NONE}")
-        found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+            return Answer(0.0, f"given: {NONE}")
+        match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
         units = ", ".join(unit for unit in self.units if unit) or "none"
-        if not found or found[2].startswith(","):
+        if not match or match[2].startswith(","):
             point = ", with a decimal point" if "," in text else ""
-            raise InputError(f"{self.option} '{text}': should be a number and its unit{point}, such as {likely}")
-        number, unit = float(found[1]), _spelt(found[2])
+            raise InputError(f"{self.option} '{text}': should be a number and its unit{point}, such as {example}")
+        number, unit = float(match[1]), _normalise_unit(match[2])
         if not unit and not number:
             # zero of anything
-            unit = next(iter(known))
-        if not unit and "" not in known:
-            raise InputError(f"{self.option} '{text}': has no unit; such as {likely}; units: {units}")
-        if unit not in known:
-            raise InputError(f"{self.option} '{text}': the unit '{found[2]}' is not known here; known: {units}")
-        name, factor = known[unit]
+            unit = next(iter(units_by_spelling))
+        if not unit and "" not in units_by_spelling:
+            raise InputError(f"{self.option} '{text}': has no unit; such as {example}; units: {units}")
+        if unit not in units_by_spelling:
+            raise InputError(f"{self.option} '{text}': the unit '{match[2]}' is not known here; known: {units}")
+        name, factor = units_by_spelling[unit]
         try:
             value = factor(number) if callable(factor) else factor * number
         except (ZeroDivisionError, OverflowError):
             value = math.nan
-        if not (self.least < value < 1e30 or (value == self.least and not self.above)):
+        if not (self.least < value < 1e30 or (value == self.least and not self.is_above)):
             raise InputError(
-                f"{self.option} '{text}': should be {'more than' if self.above else 'at least'} {self.least:g} "
+                f"{self.option} '{text}': should be {'more than' if self.is_above else 'at least'} {self.least:g} "
                 f"{next(iter(self.units))}".rstrip()
                 + f", such as '{self.example}'"
             )
-        return Given(value, f"given: {found[1]} {name}".rstrip())
+        return Answer(value, f"given: {match[1]} {name}".rstrip())
 
-    def left_out(self) -> "Given":
-        """What stands for a number that is not given."""
-        return Given(self.read(self.default).value, "not given")
+    def default_answer(self) -> "Answer":
+        """Return the answer for a number that the user leaves out."""
+        return Answer(self.read(self.default).value, "not given")
 
     @property
     def option(self) -> str:
-        """Its name on the command line."""
-        return option_of(self.name)
+        """Name of the option on the command line."""
+        return option_name(self.name)
 
 
-def option_of(name: str) -> str:
-    """The option of an item's name."""
+def option_name(name: str) -> str:
+    """Return the option for an item's name."""
     return f"--{name.replace('_', '-')}"
 
 
-class Given(NamedTuple):
+class Answer(NamedTuple):
     """A number in SI, and how it was given, in words."""
 
     value: float
     text: str
 
 
-def _spelt(unit: str) -> str:
-    """A unit in one spelling."""
-    for other, ours in _WAYS.items():
+def _normalise_unit(unit: str) -> str:
+    """Return a unit in one spelling."""
+    for other, ours in _SPELLINGS.items():
         unit = unit.replace(other, ours)
     unit = re.sub(r"[\s·*^]", "", unit)
     # mega is no milli
     return unit if unit.startswith("MN") else unit.lower()
 
 
-class Kind(NamedTuple):
+class DriveKind(NamedTuple):
     """A kind of drive.
 
     Attributes:
@@ -157,7 +157,7 @@ class Kind(NamedTuple):
         law: whether there is a transmission, and a load behind it.
     """
 
-    about: str
+    description: str
     items: tuple[Item, ...]
     linear: tuple[str, ...] = ()
     law: bool = True
@@ -171,56 +171,58 @@ _END = (
     Item("sample_period", "sampling period of the drive", _PERIOD, "0.25 ms", "1 ms"),
     Item("frequency", "lowest frequency of the test input", {"Hz": 1.0}, "0.5 Hz", "0.5 Hz"),
 )
-_ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "0 rad", above=False)
-_NOISE = Item("encoder_noise", "rms noise of the motor's encoder", _ANGLE, "5 arcsec", "0 rad", above=False)
+_ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "0 rad", is_above=False)
+_NOISE = Item("encoder_noise", "rms noise of the motor's encoder", _ANGLE, "5 arcsec", "0 rad", is_above=False)
 _RATED = (
     Item("torque", "rated torque of the motor", _TORQUE, "1.3 N m"),
     Item("speed", "rated speed of the motor", _SPEED, "3000 rpm"),
 )
 
 KINDS = {
-    "geared": Kind(
+    "geared": DriveKind(
         "a motor, a gear, and a load that turns",
         (
             Item("motor_inertia", "inertia of the rotor", _INERTIA, "0.48 kg cm²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", above=False),
-            Item("motor_friction", "dry friction at the motor, with the gear's", _TORQUE, "15 mN m", "0 N m", above=False),
+            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
+            Item(
+                "motor_friction", "dry friction at the motor, with the gear's", _TORQUE, "15 mN m", "0 N m", is_above=False
+            ),
             *_RATED,
             Item("gear_ratio", "gear ratio, motor turns for one turn of the load", {"": 1.0}, "50"),
             Item("stiffness", "torsional stiffness of the gear at its output", _STIFFNESS, "12 N m/arcmin"),
-            Item("backlash", "backlash of the gear at its output, end to end", _ANGLE, "3 arcmin", above=False),
+            Item("backlash", "backlash of the gear at its output, end to end", _ANGLE, "3 arcmin", is_above=False),
             Item("load_inertia", "inertia of the load at its own shaft", _INERTIA, "0.4 kg m²"),
-            Item("load_viscous", "viscous friction at the load", _VISCOUS, "0.5 N m s/rad", "0 N m s/rad", above=False),
+            Item("load_viscous", "viscous friction at the load", _VISCOUS, "0.5 N m s/rad", "0 N m s/rad", is_above=False),
             _ENCODER,
-            Item("load_encoder", "one count of the load's encoder", _STEP, "20 bit", "0 rad", above=False, absent=True),
+            Item("load_encoder", "one count of the load's encoder", _STEP, "20 bit", "0 rad", is_above=False, absent=True),
             _NOISE,
             *_END,
         ),
     ),
-    "screw": Kind(
+    "screw": DriveKind(
         "a motor, a ball screw (or a rack, a belt), and a carriage",
         (
             Item("motor_inertia", "inertia of rotor, coupling and screw", _INERTIA, "1.2 kg cm²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", above=False),
-            Item("motor_friction", "dry friction at the motor, with the nut's", _TORQUE, "0.1 N m", "0 N m", above=False),
+            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
+            Item("motor_friction", "dry friction at the motor, with the nut's", _TORQUE, "0.1 N m", "0 N m", is_above=False),
             *_RATED,
             Item("lead", "travel of the carriage for one turn of the motor", _LEAD, "10 mm", key="gear_ratio"),
             Item("stiffness", "axial stiffness of screw, nut and bearings", _AXIAL, "120 N/um"),
-            Item("backlash", "backlash of the nut, end to end", _LENGTH, "20 um", above=False),
+            Item("backlash", "backlash of the nut, end to end", _LENGTH, "20 um", is_above=False),
             Item("mass", "mass of the carriage, with what it carries", _MASS, "60 kg", key="load_inertia"),
-            Item("load_viscous", "viscous friction of the guides", _DRAG, "200 N s/m", "0 N s/m", above=False),
+            Item("load_viscous", "viscous friction of the guides", _DRAG, "200 N s/m", "0 N s/m", is_above=False),
             _ENCODER,
-            Item("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "0 m", above=False, absent=True),
+            Item("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "0 m", is_above=False, absent=True),
             _NOISE,
             *_END,
         ),
         linear=("load",),
     ),
-    "direct": Kind(
+    "direct": DriveKind(
         "a motor that turns its load without a gear",
         (
             Item("motor_inertia", "inertia of rotor and load", _INERTIA, "0.05 kg m²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", above=False),
+            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
             Item("motor_friction", "dry friction, with what else disturbs", _TORQUE, "0.2 N m"),
             *_RATED,
             _ENCODER,
@@ -229,16 +231,16 @@ KINDS = {
         ),
         law=False,
     ),
-    "linear": Kind(
+    "linear": DriveKind(
         "a linear motor that moves its load without a gear",
         (
             Item("mass", "mass that moves", _MASS, "8 kg", key="motor_inertia"),
-            Item("motor_viscous", "viscous friction of the guides", _DRAG, "20 N s/m", "0 N s/m", above=False),
+            Item("motor_viscous", "viscous friction of the guides", _DRAG, "20 N s/m", "0 N s/m", is_above=False),
             Item("motor_friction", "dry friction, with what else disturbs", _FORCE, "6 N"),
             Item("force", "rated force of the motor", _FORCE, "200 N", key="torque"),
             Item("speed", "rated speed of the motor", _VELOCITY, "2 m/s"),
-            Item("motor_encoder", "one count of the scale", _LENGTH, "100 nm", "0 m", above=False),
-            Item("encoder_noise", "rms noise of the scale", _LENGTH, "20 nm", "0 m", above=False),
+            Item("motor_encoder", "one count of the scale", _LENGTH, "100 nm", "0 m", is_above=False),
+            Item("encoder_noise", "rms noise of the scale", _LENGTH, "20 nm", "0 m", is_above=False),
             *_END,
         ),
         linear=("motor",),
@@ -248,27 +250,27 @@ KINDS = {
 """What can be asked about, by the name of the kind; the first is what is meant where none is named."""
 
 
-def named_items() -> dict[str, list[tuple[str, Item]]]:
-    """All items by their names, each with the kinds that have it."""
-    found: dict[str, list[tuple[str, Item]]] = {}
-    for kind, about in KINDS.items():
-        for item in about.items:
-            found.setdefault(item.name, []).append((kind, item))
-    return found
+def items_by_name() -> dict[str, list[tuple[str, Item]]]:
+    """Return all items by name, each with the kinds of drives that have it."""
+    items: dict[str, list[tuple[str, Item]]] = {}
+    for kind, drive_kind in KINDS.items():
+        for item in drive_kind.items:
+            items.setdefault(item.name, []).append((kind, item))
+    return items
 
 
 _HARMONICS, _PERIODS = 6, 5
 """Of the test input: harmonics, and periods of the lowest."""
-_PART = 0.05
+_ERROR_SHARE = 0.05
 """Of the largest speed: the velocity error that an observer may have."""
 
 
-def first_study(kind: Kind, given: Mapping[str, Given], title: str) -> tuple[str, dict[str, Any]]:
-    """A study with comments that `simulate`, `sweep` and `tune` can run.
+def write_first_study(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> tuple[str, dict[str, Any]]:
+    """Write a study with comments that `simulate`, `sweep` and `tune` can run.
 
     Args:
         kind: of the drive.
-        given: the number of each of its items, by the item's name.
+        answers: the number of each of its items, by the item's name.
         title: headline of its report.
 
     Returns:
@@ -282,49 +284,49 @@ def first_study(kind: Kind, given: Mapping[str, Given], title: str) -> tuple[str
     from .gains.gain_search import usual_rule
     from .gains.pilot import Scenarios, pilot
 
-    given = by_key(kind, given)
-    text = _drive(kind, given, title)
+    answers = rename_to_geared(kind, answers)
+    text = _write_drive(kind, answers, title)
     try:
-        model, _ = read_model(_data(text))
-        found = pilot(Scenarios(model, ["nominal"], {}), TuneTable())
-        _check_motion(kind, found)
-        gains = {side: usual_rule(one["f_plus"]) for side, one in found.items()}
-        text += _observers(kind, given, found, gains, usual_rule(1.0))
-        read_config(_data(text))
+        model, _ = read_model(_parse_toml(text))
+        pilot_metrics = pilot(Scenarios(model, ["nominal"], {}), TuneTable())
+        _check_motion(kind, pilot_metrics)
+        gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
+        text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0))
+        read_config(_parse_toml(text))
     except InputError as error:
         raise InputError(
             f"these numbers make no study; look at their units: {str(error).removeprefix('config: ')}"
         ) from None
-    return text, found
+    return text, pilot_metrics
 
 
-def _check_motion(kind: Kind, found: Mapping[str, Any]) -> None:
+def _check_motion(kind: DriveKind, pilot_metrics: Mapping[str, Any]) -> None:
     """Refuse a drive that its rated torque does not move."""
     options = {item.key or item.name: item.option for item in kind.items}
-    if not found["motor"]["largest_velocity"] > 0.0:
+    if not pilot_metrics["motor"]["largest_velocity"] > 0.0:
         raise InputError(
             f"the motor does not move: {options['torque']} should be larger, or {options['motor_friction']} smaller"
         )
-    if "load" in found and not found["load"]["f_plus"] > 0.0:
+    if "load" in pilot_metrics and not pilot_metrics["load"]["f_plus"] > 0.0:
         raise InputError(f"the load does not move: {options['backlash']} should be smaller, or {options['frequency']} lower")
 
 
-def by_key(kind: Kind, given: Mapping[str, Given]) -> dict[str, Given]:
-    """Numbers of a data sheet by the names that they have on a geared drive."""
-    return {item.key or item.name: given[item.name] for item in kind.items}
+def rename_to_geared(kind: DriveKind, answers: Mapping[str, Answer]) -> dict[str, Answer]:
+    """Return the answers by the names that they have on a geared drive."""
+    return {item.key or item.name: answers[item.name] for item in kind.items}
 
 
-def _data(text: str) -> dict[str, Any]:
+def _parse_toml(text: str) -> dict[str, Any]:
     import tomllib
 
     return tomllib.loads(text)
 
 
-def _number(value: float, digits: int = 6) -> str:
+def _format_number(value: float, digits: int = 6) -> str:
     return repr(float(f"{value:.{digits}g}"))
 
 
-def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
+def _write_drive(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> str:
     """The tables of the drive, its input and its sensors; numbers are :func:`by_key`."""
     import tomli_w
 
@@ -332,30 +334,30 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
     from .records import NominalDrive
     from .records.proposal import plant_steps
 
-    value = {name: one.value for name, one in given.items()}
+    value = {name: answer.value for name, answer in answers.items()}
 
     def line(key: str, name: str, unit: str = "", factor: float = 1.0, how: str = "") -> str:
-        """A key, its SI unit, and what was given."""
-        return f"{key} = {_number(factor * value[name])} # {unit}{', ' * bool(unit)}{given[name].text}{how}"
+        """Write a key with its SI value, unit, and the answer that it follows from."""
+        return f"{key} = {_format_number(factor * value[name])} # {unit}{', ' * bool(unit)}{answers[name].text}{how}"
 
     def numbers(side: str, where: str = "") -> list[str]:
         units = (("inertia", "kg m²"), ("viscous", "N m s/rad"))
         return [line(f"{side}_{key}", f"{side}_{key}", kind.unit(side, unit) + where) for key, unit in units]
 
     angle, torque = kind.unit("motor", "rad"), kind.unit("motor", "N m")
-    amplitude = _amplitude(given, _HARMONICS)
+    amplitude = _choose_amplitude(answers, _HARMONICS)
     rated = f"the rated {'torque' if torque == 'N m' else 'force'}"
     limit = rated if amplitude == value["torque"] else "what takes its lowest wave to the rated speed"
-    limits = ", and ".join(given[name].text.removeprefix("given: ") for name in ("torque", "speed"))
+    limits = ", and ".join(answers[name].text.removeprefix("given: ") for name in ("torque", "speed"))
     lines = [
         "# Written by jaxbl init from a data sheet. All numbers are in SI units; behind each stands what was given.",
         "# All keys: docs/reference.md, and 'jaxbl schema' for editors that complete them.",
-        tomli_w.dumps({"title": title} | ({"notes": notes} if (notes := _notes(kind, given)) else {})).strip(),
+        tomli_w.dumps({"title": title} | ({"notes": notes} if (notes := _write_notes(kind, answers)) else {})).strip(),
         "",
         "[drive]",
         f'kind = "{"two_inertia" if kind.law else "rigid"}"',
         *numbers("motor"),
-        *(_transmitted(kind, given, numbers, line) if kind.law else []),
+        *(_write_transmission(kind, answers, numbers, line) if kind.law else []),
     ]
     if value["motor_friction"]:
         lines += ["", "[[effects]]", f'kind = "motor.{CoulombFriction.kind}"', line("torque", "motor_friction", torque)]
@@ -374,7 +376,7 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
         "# The input: six waves at once. Replace it by a motion of your own: kind = 'recorded' plays a file back.",
         "[excitation]",
         'kind = "multisine"',
-        f"amplitude = {_number(amplitude, 3)} # {torque}: {limit}; given: {limits}",
+        f"amplitude = {_format_number(amplitude, 3)} # {torque}: {limit}; given: {limits}",
         line("frequency", "frequency", "Hz"),
         f"count = {_HARMONICS}",
         "",
@@ -384,7 +386,7 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
         *load,
         "",
         "[run]",
-        f"duration = {_number(_PERIODS / value['frequency'])} # s: {_PERIODS} periods of the input",
+        f"duration = {_format_number(_PERIODS / value['frequency'])} # s: {_PERIODS} periods of the input",
         line("sample_period", "sample_period", "s"),
         f"substeps = {plant_steps(nominal, value['sample_period'])} # steps of the plant a sample, by the stiffness",
     ]
@@ -392,17 +394,17 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
 
 
 def _to_motor(ratio: float) -> tuple[float, float]:
-    """Factors from stiffness and backlash at the output to stiffness and half of the gap on the motor's shaft."""
+    """Return the factors that take stiffness and backlash at the output to stiffness and half gap on the motor shaft."""
     return ratio**-2, 0.5 * ratio
 
 
-def _notes(kind: Kind, given: Mapping[str, Given]) -> list[str]:
-    """What readers of the study's pages have to know of its units and sensors."""
+def _write_notes(kind: DriveKind, answers: Mapping[str, Answer]) -> list[str]:
+    """Write notes for readers of the study's pages on its units and sensors."""
     notes = []
     if kind.linear:
-        which = "The load moves along a line: its numbers are" if kind.law else "A linear axis: its numbers are"
-        notes.append(f"{which} in kg, N and m where it says kg m², N m and rad.")
-    if kind.law and given["load_encoder"].text.endswith(NONE):
+        subject = "The load moves along a line: its numbers are" if kind.law else "A linear axis: its numbers are"
+        notes.append(f"{subject} in kg, N and m where it says kg m², N m and rad.")
+    if kind.law and answers["load_encoder"].text.endswith(NONE):
         notes.append(
             "This drive has no encoder on its load: the load's observer has an ideal one here, and stands for what such an "
             "encoder would give. jaxbl identify and diagnose take logs of the motor alone."
@@ -410,36 +412,41 @@ def _notes(kind: Kind, given: Mapping[str, Given]) -> list[str]:
     return notes
 
 
-def _transmitted(
-    kind: Kind, given: Mapping[str, Given], numbers: Callable[..., list[str]], line: Callable[..., str]
+def _write_transmission(
+    kind: DriveKind,
+    answers: Mapping[str, Answer],
+    write_side_numbers: Callable[..., list[str]],
+    write_line: Callable[..., str],
 ) -> list[str]:
-    """What goes on with `[drive]`: the load, the gear and its law."""
-    ratio, gap = given["gear_ratio"].value, given["backlash"].value
+    """Write the rest of `[drive]`: load and gear; then `[transmission]`."""
+    ratio, gap = answers["gear_ratio"].value, answers["backlash"].value
     stiff, half = _to_motor(ratio)
     turning = "load" not in kind.linear
-    at_motor, where = "on the motor's shaft", "at the output" if turning else "at the carriage"
+    where_motor, where = "on the motor's shaft", "at the output" if turning else "at the carriage"
     if turning:
-        gear = line("gear_ratio", "gear_ratio")
+        gear = write_line("gear_ratio", "gear_ratio")
     else:
-        gear = line("gear_ratio", "gear_ratio", "rad of the motor for 1 m of the carriage", how=" a turn")
+        gear = write_line("gear_ratio", "gear_ratio", "rad of the motor for 1 m of the carriage", how=" a turn")
     lines = [
-        *numbers("load", ", at the load's shaft" if turning else ""),
+        *write_side_numbers("load", ", at the load's shaft" if turning else ""),
         gear,
         "",
         "[transmission]",
         'law = "dead_zone" # a hard gap' if gap else 'law = "linear_shaft" # no backlash was given',
-        line("stiffness", "stiffness", f"N m/rad {at_motor}", stiff, f" {where}, divided by {ratio:.6g}²"),
+        write_line("stiffness", "stiffness", f"N m/rad {where_motor}", stiff, f" {where}, divided by {ratio:.6g}²"),
     ]
     if gap:
         how = f" {where}, end to end; half of it times {ratio:.6g}"
-        lines.append(line("half_gap", "backlash", f"rad {at_motor}", half, how))
+        lines.append(write_line("half_gap", "backlash", f"rad {where_motor}", half, how))
     return lines
 
 
-def _amplitude(given: Mapping[str, Given], waves: int) -> float:
-    """Amplitude (N m, N) of an input of so many waves, at most the rated torque: the lowest takes the rigid drive to its
-    rated speed."""
-    value = {name: one.value for name, one in given.items()}
+def _choose_amplitude(answers: Mapping[str, Answer], waves: int) -> float:
+    """Choose the amplitude (N m, N) of an input of several waves: the lowest wave takes the rigid drive to its rated speed.
+
+    It is at most the rated torque.
+    """
+    value = {name: answer.value for name, answer in answers.items()}
     inertia = value["motor_inertia"]
     if "load_inertia" in value:
         inertia += value["load_inertia"] / value["gear_ratio"] ** 2
@@ -447,30 +454,30 @@ def _amplitude(given: Mapping[str, Given], waves: int) -> float:
     return min(value["torque"], lowest * math.sqrt(waves) + value["motor_friction"])
 
 
-def _accepted(given: Mapping[str, Given], found: Mapping[str, Any]) -> tuple[float, float]:
-    """Velocity and position error (rad/s, rad; m/s, m) that the motor's observer may have.
+def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: Mapping[str, Any]) -> tuple[float, float]:
+    """Choose the velocity and position error (rad/s, rad; m/s, m) that the motor's observer may have.
 
     A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what
     readings off by e cost a differentiator of such signals, in proportion to sqrt(f+ e).
     Reference: A. Levant, Automatica 34 (1998).
     """
-    period, noise = given["sample_period"].value, 4.0 * given["encoder_noise"].value
-    costs, offs = [], []
-    for side, one in found.items():
+    period, noise = answers["sample_period"].value, 4.0 * answers["encoder_noise"].value
+    costs, reading_errors = [], []
+    for side, metrics in pilot_metrics.items():
         # on the motor's shaft
-        ratio = given["gear_ratio"].value if side == "load" else 1.0
-        bound, off = ratio * one["f_plus"], ratio * given[f"{side}_encoder"].value + noise
-        costs.append(2.0 * bound * period + 4.0 * math.sqrt(bound * off))
-        offs.append(off)
-    velocity = _PART * found["motor"]["largest_velocity"] + max(costs)
-    return velocity, velocity * period + 4.0 * max(offs)
+        ratio = answers["gear_ratio"].value if side == "load" else 1.0
+        bound, reading_error = ratio * metrics["f_plus"], ratio * answers[f"{side}_encoder"].value + noise
+        costs.append(2.0 * bound * period + 4.0 * math.sqrt(bound * reading_error))
+        reading_errors.append(reading_error)
+    velocity = _ERROR_SHARE * pilot_metrics["motor"]["largest_velocity"] + max(costs)
+    return velocity, velocity * period + 4.0 * max(reading_errors)
 
 
-def remark(kind: Kind, given: Mapping[str, Given], found: Mapping[str, Any]) -> str:
-    """What stands in the way of good estimates, in a sentence; "" if nothing does."""
-    velocity, _ = _accepted(by_key(kind, given), found)
-    share = velocity / found["motor"]["largest_velocity"]
-    if share < 2.0 * _PART:
+def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metrics: Mapping[str, Any]) -> str:
+    """Describe in a sentence why estimates will be poor; "" if they will not."""
+    velocity, _ = _choose_tolerances(rename_to_geared(kind, answers), pilot_metrics)
+    share = velocity / pilot_metrics["motor"]["largest_velocity"]
+    if share < 2.0 * _ERROR_SHARE:
         return ""
     return (
         f"Observers may be off by {100.0 * share:.2g} % of the largest speed: the torque changes within few samples, or the "
@@ -478,39 +485,40 @@ def remark(kind: Kind, given: Mapping[str, Given], found: Mapping[str, Any]) -> 
     )
 
 
-def _observers(
-    kind: Kind,
-    given: Mapping[str, Given],
-    found: Mapping[str, Any],
+def _write_observers(
+    kind: DriveKind,
+    answers: Mapping[str, Answer],
+    pilot_metrics: Mapping[str, Any],
     gains: Mapping[str, tuple[float, float]],
     usual: tuple[float, float],
 ) -> str:
-    """What goes on with `[run]`: the errors that are accepted, then the observers, and what sweep and tune need.
+    """Write the rest of `[run]`: the accepted errors; then the observers, and the tables for sweep and tune.
 
     `usual`: the usual rule's gains where f+ is 1.
     """
-    velocity, position = _accepted(given, found)
-    bound = {side: float(one["f_plus"]) for side, one in found.items()}
-    frequency, angle = given["frequency"].value, kind.unit("motor", "rad")
+    velocity, position = _choose_tolerances(answers, pilot_metrics)
+    bound = {side: float(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
+    frequency, angle = answers["frequency"].value, kind.unit("motor", "rad")
     load = "; on the load both are divided by the gear ratio" if kind.law else ""
-    bounds = ", ".join(f"{one:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, one in bound.items())
+    bounds = ", ".join(f"{f_plus:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, f_plus in bound.items())
     rated = f"the rated {'torque' if angle == 'rad' else 'force'}"
     lines = [
-        f"# Errors of the motor observer that are accepted: {100 * _PART:g} % of the largest speed, and what period, counts",
+        f"# Errors of the motor observer that are accepted: {100 * _ERROR_SHARE:g} % of the largest speed, and what "
+        "period, counts",
         f"# and noise cost any observer{load}. Put in what you need.",
-        f"velocity_tolerance = {_number(velocity, 2)} # {angle}/s",
-        f"position_tolerance = {_number(position, 2)} # {angle}",
+        f"velocity_tolerance = {_format_number(velocity, 2)} # {angle}/s",
+        f"position_tolerance = {_format_number(position, 2)} # {angle}",
         "",
         f"# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest",
         f"# acceleration in a run of this study that observers do not know: {bounds}.",
         "# 'jaxbl tune' looks for better ones.",
-        f"# The motor's largest speed in that run: {found['motor']['largest_velocity']:.3g} {angle}/s; rated: "
-        f"{given['speed'].value:.3g}. Change excitation.amplitude if that is too fast.",
+        f"# The motor's largest speed in that run: {pilot_metrics['motor']['largest_velocity']:.3g} {angle}/s; rated: "
+        f"{answers['speed'].value:.3g}. Change excitation.amplitude if that is too fast.",
         "[observer]",
     ]
     for side, (lambda_, alpha) in gains.items():
         units = ", ".join(kind.unit(side, unit) for unit in ("√rad/s", "rad/s²"))
-        lines.append(f"{side} = {{ lambda = {_number(lambda_, 3)}, alpha = {_number(alpha, 3)} }} # {units}")
+        lines.append(f"{side} = {{ lambda = {_format_number(lambda_, 3)}, alpha = {_format_number(alpha, 3)} }} # {units}")
     lines += [
         "",
         "# jaxbl tune: gains of the least error, compared on another input",
@@ -518,11 +526,11 @@ def _observers(
         'objective = "velocity" # or "torque"',
         "[tune.holdout]",
         'kind = "chirp"',
-        f"amplitude = {_number(_amplitude(given, 1), 3)} # {kind.unit('motor', 'N m')}: {rated}, or what takes it to the "
-        "rated speed",
-        f"start_frequency = {_number(frequency)} # Hz",
-        f"stop_frequency = {_number(4.0 * frequency)}",
-        f"sweep_time = {_number(_PERIODS / frequency)} # s",
+        f"amplitude = {_format_number(_choose_amplitude(answers, 1), 3)} # {kind.unit('motor', 'N m')}: {rated}, or what "
+        "takes it to the rated speed",
+        f"start_frequency = {_format_number(frequency)} # Hz",
+        f"stop_frequency = {_format_number(4.0 * frequency)}",
+        f"sweep_time = {_format_number(_PERIODS / frequency)} # s",
         "",
         "# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.",
     ]
@@ -533,8 +541,8 @@ def _observers(
         lines += [
             "[[axes]]",
             f'path = "observer.motor.{gain}"',
-            f"start = {_number(least * scale, 3)}",
-            f"stop = {_number(largest * scale, 3)}",
+            f"start = {_format_number(least * scale, 3)}",
+            f"stop = {_format_number(largest * scale, 3)}",
             "num = 32",
             'scale = "log"',
             "",

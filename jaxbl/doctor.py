@@ -20,7 +20,7 @@ from .workers import PROGRAMS_VARIABLE, announce, count_cores
 
 
 class Finding(NamedTuple):
-    """One line: what was looked at, what was found, and whether it is in order; if not, `found` says what to do."""
+    """A line of the report: name of the check, its result, True if that is in order. If not, `found` says what to do."""
 
     name: str
     found: str
@@ -34,12 +34,12 @@ def examine() -> list[Finding]:
         Finding("jaxbl", f"{version('jaxbl')} in {Path(__file__).parent}"),
         Finding("python", f"{platform.python_version()} ({sys.executable})"),
         Finding("system", f"{platform.platform(terse=True)}, {platform.machine()}"),
-        *_packages(),
-        Finding("devices", _devices()),
-        _cache(),
-        _folder(Path()),
+        *_check_packages(),
+        Finding("devices", _describe_devices()),
+        _check_cache(),
+        _check_results_folder(Path()),
     ]
-    for name, test in (("one run", _one_run), ("two backends", _two_backends)):
+    for name, test in (("one run", _test_one_run), ("two backends", _test_two_backends)):
         announce(f"testing {name}")
         try:
             findings.append(test(name))
@@ -48,21 +48,21 @@ def examine() -> list[Finding]:
     return [*findings, Finding("time", f"{time.perf_counter() - began:.1f} s")]
 
 
-def _packages() -> list[Finding]:
-    """Versions of what the package needs, and of its extras."""
-    wanted: dict[str, dict[str, str]] = {}
+def _check_packages() -> list[Finding]:
+    """Check the packages that jaxbl needs, and those of its extras."""
+    versions_by_extra: dict[str, dict[str, str]] = {}
     for requirement in requires("jaxbl") or ():
         name = re.match(r"[\w.-]+", requirement)
         extra = re.search(r"""extra\s*==\s*['"](\w+)""", requirement)
         assert name is not None
-        wanted.setdefault(extra[1] if extra else "", {})[name[0]] = _version(name[0])
+        versions_by_extra.setdefault(extra[1] if extra else "", {})[name[0]] = _version(name[0])
     findings = []
-    for extra, versions in wanted.items():
+    for extra, versions in versions_by_extra.items():
         # of developers
         if extra == "dev":
             continue
-        missing = [name for name, found in versions.items() if not found]
-        there = ", ".join(f"{name} {found}" for name, found in versions.items() if found)
+        missing = [name for name, version_text in versions.items() if not version_text]
+        there = ", ".join(f"{name} {version_text}" for name, version_text in versions.items() if version_text)
         if not extra:
             how = f"missing: {', '.join(missing)}; pip install jaxbl" if missing else there
             findings.append(Finding("packages", how, not missing))
@@ -81,15 +81,15 @@ def _version(package: str) -> str:
         return ""
 
 
-def _devices() -> str:
+def _describe_devices() -> str:
     devices = jax.devices()
     kinds = sorted({device.device_kind for device in devices})
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return f"{len(devices)} {jax.default_backend()} ({', '.join(kinds)}); {count_cores()} cores, {memory:.0f} GiB"
 
 
-def _cache() -> Finding:
-    """The folder of compiled programs."""
+def _check_cache() -> Finding:
+    """Check the folder of compiled programs."""
     name = os.environ.get(PROGRAMS_VARIABLE)
     if not name:
         return Finding("cache", "compiled programs are not kept, so that every command compiles; set XDG_CACHE_HOME", False)
@@ -98,8 +98,8 @@ def _cache() -> Finding:
     return Finding("cache", f"{folder}, {size / 1e6:.0f} MB; it may be deleted at any time")
 
 
-def _folder(folder: Path) -> Finding:
-    """Where results go unless a command says otherwise."""
+def _check_results_folder(folder: Path) -> Finding:
+    """Check the folder for results."""
     where = folder.absolute()
     if os.access(where, os.W_OK):
         return Finding("results", f"{where / 'results'}")
@@ -111,7 +111,7 @@ _TORQUE, _FREQUENCY, _INERTIA, _VISCOUS = 0.1, 2.0, 0.05, 0.15
 """N m, Hz, kg m², N m s/rad."""
 
 
-def _study(**tables: Any) -> dict[str, Any]:
+def _make_study(**tables: Any) -> dict[str, Any]:
     return {
         "drive": {"kind": "rigid", "motor_inertia": _INERTIA, "motor_viscous": _VISCOUS},
         "excitation": {"kind": "sine", "amplitude": _TORQUE, "frequency": _FREQUENCY},
@@ -120,9 +120,9 @@ def _study(**tables: Any) -> dict[str, Any]:
     } | tables
 
 
-def _one_run(name: str) -> Finding:
-    """A motor under a held sine, against the solution in closed form."""
-    trace = run(_study()).trace
+def _test_one_run(name: str) -> Finding:
+    """Compare a motor under a held sine with the closed form."""
+    trace = run(_make_study()).trace
     period = float(trace["t"].iloc[1] - trace["t"].iloc[0])
     decay = np.exp(-_VISCOUS * period / _INERTIA)
     velocity, exact = 0.0, []
@@ -130,24 +130,24 @@ def _one_run(name: str) -> Finding:
         exact.append(velocity)
         velocity = decay * velocity + (1.0 - decay) * torque / _VISCOUS
     error = float(np.max(np.abs(trace["motor.velocity"] - exact)) / np.max(np.abs(exact)))
-    return _judged(name, f"velocity within {error:.1e} of the closed form", error < _CLOSE)
+    return _judge_test(name, f"velocity within {error:.1e} of the closed form", error < _CLOSE)
 
 
-def _two_backends(name: str) -> Finding:
-    """The motor at several gains of its observer and with noise, by the fused loop and by XLA's."""
-    study = _study(
+def _test_two_backends(name: str) -> Finding:
+    """Compare the fused loop with XLA's scan on a motor with several observer gains and noise."""
+    study = _make_study(
         encoders={"noise": 1e-5},
         sweep={"chunk": 4, "metrics": ["velocity_rmse"]},
         axes=[{"path": "observer.motor.alpha", "values": [9.0, 20.0, 40.0, 80.0]}],
     )
-    found = [sweep(study, backend=backend).frame["motor.velocity_rmse"].to_numpy() for backend in ("fused", "scan")]
-    error = float(np.max(np.abs(found[0] / found[1] - 1.0)))
-    return _judged(name, f"fused and scan within {error:.1e} of each other", error < _CLOSE)
+    errors = [sweep(study, backend=backend).frame["motor.velocity_rmse"].to_numpy() for backend in ("fused", "scan")]
+    error = float(np.max(np.abs(errors[0] / errors[1] - 1.0)))
+    return _judge_test(name, f"fused and scan within {error:.1e} of each other", error < _CLOSE)
 
 
 _CLOSE = 1e-6
 """Relative: steps of the plant and roundings are far below, anything that is wrong far above."""
 
 
-def _judged(name: str, found: str, good: bool) -> Finding:
-    return Finding(name, found if good else f"{found}: too far; report it with these lines", good)
+def _judge_test(name: str, measurement: str, is_close: bool) -> Finding:
+    return Finding(name, measurement if is_close else f"{measurement}: too far; report it with these lines", is_close)

@@ -1,4 +1,4 @@
-"""What a command does around its work: progress bar, interrupts, and names in front of messages of bad input."""
+"""The frame around a command's work: progress bar, interrupts, and names in front of messages of bad input."""
 
 import math
 import signal
@@ -30,7 +30,7 @@ _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 
 
 @contextmanager
-def naming(config: Path, folder: Path | None = None) -> Iterator[None]:
+def name_config_in_errors(config: Path, folder: Path | None = None) -> Iterator[None]:
     """Put the config's name in front of messages that know only the key, and are not about the folder of the results."""
     try:
         yield
@@ -43,11 +43,11 @@ def naming(config: Path, folder: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def running(
-    context: typer.Context, config: Path, folder: Path, *, unit: str = "runs", kept: bool = True
+def run_with_progress(
+    context: typer.Context, config: Path, folder: Path, *, unit: str = "runs", keeps_results: bool = True
 ) -> "Iterator[Progress]":
     """Around a long computation: messages name the config, progress in `unit` is shown, and an interrupt (exit 130) says how
-    to go on, and whether what is finished is `kept` in the folder.
+    to go on, and whether what is finished is `keeps_results` in the folder.
 
     Foreign code may swallow an interrupt, or turn it into another error: it is remembered, and raised at the next progress
     or error.
@@ -63,69 +63,75 @@ def running(
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with naming(config, folder), progress_bar(unit, quiet=is_quiet(context)) as shown:
+        with name_config_in_errors(config, folder), progress_bar(unit, quiet=is_quiet(context)) as show:
 
             def progress(done: int, total: int) -> None:
                 if interrupted:
                     raise KeyboardInterrupt
-                if shown is not None:
-                    shown(done, total)
+                if show is not None:
+                    show(done, total)
 
             yield progress
     except BaseException as error:
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
-        state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        again = command_line(*call_again(context, folder, kept=kept))
+        state = "what is finished is kept. Go on with" if keeps_results else "nothing was written. Start again with"
+        again = command_line(*repeat_call(context, folder, keeps_results=keeps_results))
         typer.echo(escape_unprintable(f"interrupted; {state}: {again}"), err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def until_interrupted(run: Callable[[], object]) -> None:
+def run_until_interrupted(run: Callable[[], object]) -> None:
     """Run until Ctrl+C or a request to end; a second one ends the process as it is."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        for one in _REQUESTS:
-            signal.signal(one, signal.SIG_DFL)
+        for request in _REQUESTS:
+            signal.signal(request, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    for one in _REQUESTS:
-        signal.signal(one, end)
+    for request in _REQUESTS:
+        signal.signal(request, end)
     with suppress(KeyboardInterrupt):
         run()
 
 
 @contextmanager
-def until_asked() -> Iterator[Callable[[], bool]]:
-    """Around what goes on until somebody asks it to end (Ctrl+C, or a request of the system): a function that says whether
-    somebody has. Asked a second time, the process ends as it is."""
+def watch_for_end_request() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns True once the user or the system has asked the process to end.
+
+    A second request ends the process at once.
+    """
     asked = False
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        for one in _REQUESTS:
-            signal.signal(one, signal.SIG_DFL)
+        for request in _REQUESTS:
+            signal.signal(request, signal.SIG_DFL)
 
-    before = {one: signal.signal(one, ask) for one in _REQUESTS}
+    before = {request: signal.signal(request, ask) for request in _REQUESTS}
     try:
         yield lambda: asked
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for request, handler in before.items():
+            signal.signal(request, handler)
 
 
-def call_again(context: typer.Context, folder: Path, *, kept: bool = True) -> list[str]:
-    """The words of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
+def repeat_call(context: typer.Context, folder: Path, *, keeps_results: bool = True) -> list[str]:
+    """The words of this call, with the folder of its results; what is `keeps_results` there is not to be overwritten."""
     words = [str(context.info_name)]
-    for one in context.command.params:
-        source, value = context.get_parameter_source(str(one.name)), context.params.get(str(one.name))
-        if one.name in ("out", "overwrite" if kept else "out") or source is None or source.name != "COMMANDLINE":
+    for parameter in context.command.params:
+        source, value = context.get_parameter_source(str(parameter.name)), context.params.get(str(parameter.name))
+        if (
+            parameter.name in ("out", "overwrite" if keeps_results else "out")
+            or source is None
+            or source.name != "COMMANDLINE"
+        ):
             continue
-        if one.param_type_name == "option":
-            words.append(one.opts[0])
+        if parameter.param_type_name == "option":
+            words.append(parameter.opts[0])
         if value is not True:
             words += map(str, value if isinstance(value, list | tuple) else [value])
     return [*words, "--out", str(folder)]
@@ -133,8 +139,8 @@ def call_again(context: typer.Context, folder: Path, *, kept: bool = True) -> li
 
 @contextmanager
 def progress_bar(unit: str, *, quiet: bool = False, first: str = "compiling") -> "Iterator[Progress | None]":
-    """What is being done, how much of it in `unit`, and the remaining time: a bar on a terminal, in a pipe a line now and
-    then. Without a unit nothing is counted."""
+    """Show the present task, its progress in `unit`, and the remaining time: a bar on a terminal, lines now and then in a
+    pipe. Without a unit nothing is counted."""
     if quiet:
         yield None
     elif sys.stderr.isatty():
@@ -146,14 +152,14 @@ def progress_bar(unit: str, *, quiet: bool = False, first: str = "compiling") ->
 
 
 @contextmanager
-def working(context: typer.Context, what: str) -> Iterator[None]:
-    """Around work of which no part can be counted: it is said what is being done."""
-    with progress_bar("", quiet=is_quiet(context), first=what):
+def show_task(context: typer.Context, task: str) -> Iterator[None]:
+    """Show what is being done around work that has no parts to count."""
+    with progress_bar("", quiet=is_quiet(context), first=task):
         yield
 
 
 def is_quiet(context: typer.Context) -> bool:
-    """Whether a command was asked for errors alone."""
+    """Return True if the command should print errors alone."""
     return bool(context.params.get("quiet"))
 
 
@@ -171,26 +177,26 @@ def _bar(unit: str, first: str) -> "Iterator[Progress]":
         def update(done: int, total: int) -> None:
             bar.update(task, description=None if heard else "running", completed=done, total=total)
 
-        def hear(what: str) -> None:
+        def hear(description: str) -> None:
             nonlocal heard
             heard = True
-            bar.update(task, description=what)
+            bar.update(task, description=description)
 
         with subscribe(hear):
             yield update
 
 
-class Lines:
-    """Progress as lines of text, from what is heard of it: what is being done, the share, the remaining time.
+class ProgressLines:
+    """Lines of text about progress: the present task, the share that is done, the remaining time.
 
     Args:
         unit: of what is counted.
-        what: is being done at first.
+        task: is being done at first.
         now: time of the beginning, s.
     """
 
-    def __init__(self, unit: str, what: str, now: float):
-        self._unit, self._what, self._began, self._said = unit, what, now, now
+    def __init__(self, unit: str, task: str, now: float):
+        self._unit, self._what, self._began, self._said = unit, task, now, now
         self._heard, self._done, self._total = False, 0, 0
         self._seen = deque([(now, 0)], maxlen=round(_WINDOW / _LOOK))
 
@@ -200,30 +206,30 @@ class Lines:
         if not self._heard:
             self._what = "running"
 
-    def hear(self, what: str) -> None:
+    def hear(self, task: str) -> None:
         """Hear what is being done."""
-        self._heard, self._what = True, what
+        self._heard, self._what = True, task
 
     def look(self, now: float) -> str | None:
-        """A line, if it is time for one."""
+        """Return a line if it is time for one."""
         self._seen.append((now, self._done))
         if now - self._said < _EVERY:
             return None
         self._said = now
         if not self._total:
-            return f"jaxbl: {self._what}, for {duration(now - self._began)} so far"
+            return f"jaxbl: {self._what}, for {format_duration(now - self._began)} so far"
         share = f"{self._done} of {self._total} {self._unit} ({math.floor(100 * self._done / self._total)} %)"
         since, before = self._seen[0]
         left = ""
         # parts of an earlier call are counted within a moment: what happened lately says how fast it goes
         if before < self._done < self._total:
-            left = f", about {duration((self._total - self._done) * (now - since) / (self._done - before))} left"
+            left = f", about {format_duration((self._total - self._done) * (now - since) / (self._done - before))} left"
         return f"jaxbl: {self._what}, {share}{left}"
 
 
 @contextmanager
 def _lines(unit: str, first: str) -> "Iterator[Progress]":
-    lines, ended = Lines(unit, first, time.monotonic()), threading.Event()
+    lines, ended = ProgressLines(unit, first, time.monotonic()), threading.Event()
 
     def speak() -> None:
         while not ended.wait(_LOOK):
@@ -240,13 +246,13 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
         speaker.join()
 
 
-def answers() -> bool:
-    """Whether somebody can be asked."""
+def can_ask_user() -> bool:
+    """Return True if a user can be asked on a terminal."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
-def duration(seconds: float) -> str:
-    """A time for the reader, in s, min or h."""
+def format_duration(seconds: float) -> str:
+    """Write a duration in s, min or h."""
     if seconds < 100.0:
         return f"{seconds:.1f} s"
     if seconds < 6000.0:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 
 from jaxbl import batch
-from jaxbl.batch import batch_lines, batch_row, read_batch, run_batch
+from jaxbl.batch import format_batch, make_batch_row, read_batch, run_batch
 
 DIAGNOSIS = {
     "verdict": "explained",
@@ -20,8 +20,11 @@ DIAGNOSIS = {
 
 
 def test_a_batch_is_a_table(tmp_path):
-    rows = [batch_row(tmp_path / "a.csv", DIAGNOSIS), batch_row(tmp_path / "long.csv", None, "long.csv: holds nothing")]
-    lines = batch_lines(rows)
+    rows = [
+        make_batch_row(tmp_path / "a.csv", DIAGNOSIS),
+        make_batch_row(tmp_path / "long.csv", None, "long.csv: holds nothing"),
+    ]
+    lines = format_batch(rows)
     assert lines[:2] == [
         "a.csv     explained       load.coulomb_friction (0.93)  theta_e 0.1 -> 0.0011",
         "                          (0.001)",
@@ -36,14 +39,14 @@ def test_its_table_fits_a_terminal_with_long_names(tmp_path):
     names = [f"transmission.friction_of_{'another_' * i}package" for i in range(1, 5)]
     many = DIAGNOSIS | {"findings": [{"effect": name, "confidence": 0.5} for name in names]}
     rows = [
-        batch_row(tmp_path / name, found, refused)
+        make_batch_row(tmp_path / name, found, refused)
         for name in ("a.csv", f"{'machine_' * 6}7.csv")
         for found, refused in ((many, ""), (DIAGNOSIS, ""), (None, f"a.csv: {'columns should have other names; ' * 9}"))
     ]
-    lines = batch_lines(rows)
+    lines = format_batch(rows)
     assert all(len(line) <= 80 for line in lines) and all(name in " ".join(lines) for name in names)
     # without the longest name of a file a row begins on one line with what was found
-    assert batch_lines(rows[:3])[0].startswith("a.csv  explained       transmission.friction_of_another_package;")
+    assert format_batch(rows[:3])[0].startswith("a.csv  explained       transmission.friction_of_another_package;")
 
 
 def test_every_kind_of_log_is_found_and_what_is_none_is_told(tmp_path):
@@ -69,7 +72,7 @@ def test_every_kind_of_log_is_found_and_what_is_none_is_told(tmp_path):
 
 def _found(job):
     assert all(path.is_absolute() for path in (job.log, job.model, job.folder))
-    return batch_row(job.log, DIAGNOSIS)
+    return make_batch_row(job.log, DIAGNOSIS)
 
 
 def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):

@@ -511,7 +511,7 @@ def test_progress_in_a_pipe_is_a_line_now_and_then(monkeypatch, capsys):
 
 
 def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
-    lines = terminal.Lines("runs", "compiling", 0.0)
+    lines = terminal.ProgressLines("runs", "compiling", 0.0)
     assert [lines.look(t) for t in (1.0, 9.0, 10.0, 11.0)] == [None, None, "jaxbl: compiling, for 10.0 s so far", None]
     # what an earlier call has left is counted at once, and says nothing of the speed
     lines.update(500, 1000)
@@ -527,7 +527,7 @@ def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])
 def test_durations(seconds, text):
-    assert terminal.duration(seconds) == text
+    assert terminal.format_duration(seconds) == text
 
 
 def test_default_folder():
@@ -950,7 +950,7 @@ def test_completion_knows_the_commands(tmp_path):
 
 
 def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
-    shown = setup._shipped("gain_map.toml")
+    shown = setup._find_shipped_study("gain_map.toml")
     assert shown.is_file() and shown.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]

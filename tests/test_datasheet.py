@@ -9,7 +9,7 @@ import pytest
 
 from jaxbl import read_config
 from jaxbl.cli import setup
-from jaxbl.datasheet import KINDS, Given, first_study, named_items
+from jaxbl.datasheet import KINDS, Answer, items_by_name, write_first_study
 from jaxbl.errors import InputError
 from jaxbl.gains.gain_search import usual_rule
 
@@ -60,11 +60,11 @@ def test_numbers_of_linear_axes_become_si(kind, name, text, value):
 
 
 def test_examples_and_defaults_can_be_read():
-    items = [item for _, item in chain.from_iterable(named_items().values())]
+    items = [item for _, item in chain.from_iterable(items_by_name().values())]
     assert len(items) == sum(len(about.items) for about in KINDS.values())
     for item in items:
         assert item.read(item.example).value > 0.0
-        assert not item.default or item.left_out().text == "not given"
+        assert not item.default or item.default_answer().text == "not given"
 
 
 @pytest.mark.parametrize(
@@ -135,8 +135,8 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
         return next(answers) or default
 
     monkeypatch.setattr("typer.prompt", prompt)
-    assert setup._asked_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
-    assert setup._asked_number(BY_NAME["sample_period"]).text == "not given"
+    assert setup._ask_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
+    assert setup._ask_number(BY_NAME["sample_period"]).text == "not given"
     assert asked[0] == asked[1] and asked[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
@@ -166,7 +166,9 @@ def words(kind, numbers):
 
 
 def given(kind, numbers):
-    return {name: item.read(numbers[name]) if name in numbers else item.left_out() for name, item in ITEMS[kind].items()}
+    return {
+        name: item.read(numbers[name]) if name in numbers else item.default_answer() for name, item in ITEMS[kind].items()
+    }
 
 
 def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
@@ -177,9 +179,9 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
         "load_viscous": 200.0 / ratio**2, "load_encoder": 0.0,
     }  # fmt: skip
     turning = {name: screw[name] for name in ITEMS["geared"] if name in screw}
-    turning |= {name: Given(value, "given: by hand") for name, value in at_motor.items()}
-    text, found = first_study(KINDS["screw"], screw, "")
-    _, other = first_study(KINDS["geared"], turning, "")
+    turning |= {name: Answer(value, "given: by hand") for name, value in at_motor.items()}
+    text, found = write_first_study(KINDS["screw"], screw, "")
+    _, other = write_first_study(KINDS["geared"], turning, "")
     # numbers are written with six digits, of which impacts in the gap make more
     assert found["motor"]["f_plus"] == pytest.approx(other["motor"]["f_plus"], rel=1e-2)
     assert found["load"]["f_plus"] * ratio == pytest.approx(other["load"]["f_plus"], rel=1e-2)
@@ -235,7 +237,7 @@ def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_p
 
 
 def test_the_usual_rule_in_a_study_is_that_of_tune():
-    text, _ = first_study(KINDS["linear"], given("linear", LINEAR | SHORT), "")
+    text, _ = write_first_study(KINDS["linear"], given("linear", LINEAR | SHORT), "")
     lambda_, alpha = usual_rule(1.0)
     assert f"usual rule, lambda = {lambda_:g} sqrt(f+) and alpha = {alpha:g} f+;" in text
 
@@ -246,13 +248,13 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
         (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; jaxbl init"),
         (
             [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
-            "--gear-ratio, --mass: not asked of --kind direct, which has: --motor-inertia, --motor-viscous, ",
+            "--gear-ratio, --mass: --kind direct has no such option; it has: --motor-inertia, --motor-viscous, ",
         ),
         (words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}), f"{NO_STUDY}: the motor does not move: --torque "),
         (words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}), f"{NO_STUDY}: the motor does not move: --force "),
         (words("screw", SCREW | SHORT | {"backlash": "1 m"}), f"{NO_STUDY}: the load does not move: --backlash should be"),
         (words("screw", SCREW | {"lead": "1e-7 mm"}), f"{NO_STUDY}: drive.gear_ratio: should be less than or equal to 1"),
-        (["--lead", "10 mm"], "--lead: not asked of --kind geared, which has: --motor-inertia, "),
+        (["--lead", "10 mm"], "--lead: --kind geared has no such option; it has: --motor-inertia, "),
         (
             words("linear", LINEAR | {"motor_friction": "0 N"}),
             "--motor-friction '0 N': should be more than 0 N, such as '6 N'",
@@ -277,7 +279,7 @@ def test_what_no_such_drive_has_is_said_and_nothing_written(arguments, message, 
 
 def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "answers", lambda: True)
-    examples = {item.asked: item.example for item in KINDS["linear"].items}
+    examples = {item.question: item.example for item in KINDS["linear"].items}
     asked = []
     said = iter(["gearless", "Linear", "8 kg"])
 
@@ -290,7 +292,7 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     assert code == 0 and lines[0].startswith("axis.toml: a study")
     assert asked[0] == asked[1] and asked[0] == "kind of this drive"
     assert [text.partition(",")[0] for text in asked[2:]] == [
-        item.asked.partition(",")[0] for item in KINDS["linear"].items[:-1]
+        item.question.partition(",")[0] for item in KINDS["linear"].items[:-1]
     ]
     assert errors[0] == "Kinds of drives:" and all(len(line) <= 80 for line in (*errors[:5], *asked))
     assert errors[5].startswith("  --kind 'gearless': should be one of geared")

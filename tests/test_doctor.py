@@ -28,8 +28,8 @@ def test_it_names_versions_devices_and_folders_and_tests_itself(whole, call, mon
 
 
 def test_a_wrong_answer_is_found(monkeypatch):
-    trial = run(doctor._study())
+    trial = run(doctor._make_study())
     trace = trial.trace.assign(**{"motor.velocity": 1.00001 * trial.trace["motor.velocity"]})
     monkeypatch.setattr(doctor, "run", lambda study: trial._replace(trace=trace))
-    found = doctor._one_run("one run")
+    found = doctor._test_one_run("one run")
     assert not found.good and found.found.endswith("too far; report it with these lines")

@@ -11,7 +11,7 @@ from jaxbl.errors import InputError, NoResult
 from jaxbl.terminal import INTERRUPTED
 
 from . import exporting, logs, setup, studies
-from .outcome import told
+from .outcome import print_outcome
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -44,7 +44,7 @@ for _command in (
     *(logs.inspect, logs.identify, logs.diagnose, logs.watch),
     *(studies.plot, studies.explore, studies.compare, studies.repair, setup.bench, setup.doctor),
 ):
-    app.command()(told(_command))
+    app.command()(print_outcome(_command))
 # what it prints is JSON in any case
 app.command()(setup.schema)
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from jaxbl import workers
-from jaxbl.terminal import working
+from jaxbl.terminal import show_task
 
 from .options import ConfigArgument, folder_of
 from .outcome import Outcome
@@ -46,6 +46,6 @@ def export(
     from jaxbl.exports import export as run_export
 
     folder = folder_of(config.with_name(f"{config.stem}_{target}.toml"), out)
-    with working(context, "exporting"):
-        made = run_export(config, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
-    return Outcome(made.lines, made.folder, "", "export.json")
+    with show_task(context, "exporting"):
+        result = run_export(config, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
+    return Outcome(result.lines, result.folder, "", "export.json")

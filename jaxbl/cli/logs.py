@@ -10,7 +10,7 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError
 from jaxbl.lines import NextStep
-from jaxbl.terminal import call_again, is_quiet, running, until_asked
+from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
 from .options import (
@@ -129,17 +129,17 @@ def identify(
 
         check_gap_sought(task)
     folder = folder_of(log[0], out)
-    given = LogCall(log, model, holdout, next_experiment)
+    log_call = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: Mapping[str, Any]) -> list[NextStep]:
-        return after_identification(task, summary, call_again(context, folder), folder, given)
+        return after_identification(task, summary, repeat_call(context, folder), folder, log_call)
 
-    with running(context, model, folder, unit="steps", kept=False) as progress:
+    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "identification.json",
             lambda task: run_identification(task, progress),
-            lambda found, folder: write_identification_report(found, folder, steps(found.summary)),
+            lambda result, folder: write_identification_report(result, folder, steps(result.summary)),
             overwrite=overwrite,
         )
     lines = identification_lines(summary)
@@ -211,17 +211,17 @@ def diagnose(
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], out)
-    given = LogCall(log, model, holdout, next_experiment)
+    log_call = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: Mapping[str, Any]) -> list[NextStep]:
-        return after_diagnosis(task, summary, call_again(context, folder), folder, given)
+        return after_diagnosis(task, summary, repeat_call(context, folder), folder, log_call)
 
-    with running(context, model, folder, unit="steps", kept=False) as progress:
+    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "diagnosis.json",
             lambda task: run_diagnosis(task, progress),
-            lambda found, folder: write_diagnosis_report(found, folder, steps(found.summary)),
+            lambda result, folder: write_diagnosis_report(result, folder, steps(result.summary)),
             overwrite=overwrite,
         )
     lines = diagnosis_lines(summary)
@@ -251,14 +251,14 @@ def _diagnose_batch(
     overwrite: bool,
     scheduler: str | None,
 ) -> Outcome:
-    from jaxbl.batch import batch_lines, read_batch, run_batch
+    from jaxbl.batch import format_batch, read_batch, run_batch
 
     work, skipped = read_batch(source, model, out, overwrite=overwrite)
-    with running(context, model or source, out, unit="logs") as progress:
+    with run_with_progress(context, model or source, out, unit="logs") as progress:
         rows = run_batch(work, out, jobs, progress, scheduler)
     lines = [f"Skipped, by their names no logs: {', '.join(skipped)}"] if skipped else []
     code = 2 if all(row["refused"] for row in rows) else 0
-    return Outcome([*lines, *batch_lines(rows)], out, "batch.csv", {"logs": rows, "skipped": skipped}, code)
+    return Outcome([*lines, *format_batch(rows)], out, "batch.csv", {"logs": rows, "skipped": skipped}, code)
 
 
 def watch(
@@ -295,16 +295,16 @@ def watch(
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, every=every, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), None)
     if folder is None:
-        found = _watched(context, task, None)
-        code = ALARM if found.summary["alarm"] else 0
-        return Outcome(watch_lines(found.summary), summary=found.summary, code=code, compact=True)
+        result = _watch_and_print(context, task, None)
+        code = ALARM if result.summary["alarm"] else 0
+        return Outcome(watch_lines(result.summary), summary=result.summary, code=code, compact=True)
     with remove_if_empty_on_error(folder), lock_folder(folder):
         _claim_watch(folder, task, overwrite)
-        found = _watched(context, task, folder)
-        steps = after_watch(task, found.summary, model)
-        lines = write_watch_report(found, folder, steps)
-    code = ALARM if found.summary["alarm"] else 0
-    return Outcome(lines, folder, summary=found.summary, code=code, steps=steps, compact=True)
+        result = _watch_and_print(context, task, folder)
+        steps = after_watch(task, result.summary, model)
+        lines = write_watch_report(result, folder, steps)
+    code = ALARM if result.summary["alarm"] else 0
+    return Outcome(lines, folder, summary=result.summary, code=code, steps=steps, compact=True)
 
 
 def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:
@@ -316,14 +316,14 @@ def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:
     claim_log_folder(folder, Path(task.name), overwrite=overwrite)
 
 
-def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> "Watch":
+def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | None) -> "Watch":
     """Print values as they come; those of a stream are in the folder at once, as nobody can give them again."""
     import json
     from contextlib import ExitStack
 
     from jaxbl.errors import escape_unprintable
     from jaxbl.files import to_jsonable
-    from jaxbl.monitoring.watch import run_watch, value_line
+    from jaxbl.monitoring.watch import format_values, run_watch
     from jaxbl.report.watch import values_file
 
     quiet, as_json = is_quiet(context), bool(context.params.get("json"))
@@ -336,7 +336,7 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
         keep = None
         if folder is not None and task.record is None:
             keep = stack.enter_context(values_file(folder, task))
-        ended = None if task.record is not None else stack.enter_context(until_asked())
+        ended = None if task.record is not None else stack.enter_context(watch_for_end_request())
 
         def show(values: dict[str, Any]) -> None:
             if keep is not None:
@@ -344,6 +344,6 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
             if as_json:
                 typer.echo(json.dumps(to_jsonable(values), ensure_ascii=False))
             elif not quiet:
-                typer.echo(value_line(values, task))
+                typer.echo(format_values(values, task))
 
         return run_watch(task, on_values=show, on_remark=remark, ended=ended)

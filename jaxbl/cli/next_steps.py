@@ -1,4 +1,4 @@
-"""What to try after a command, for its page and for the terminal: only what is open by what it found."""
+"""Commands to try after a command, for its page and the terminal: only those that its result leaves open."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def after_init(file: Path) -> list[NextStep]:
-    """What a first study from a data sheet can be given to."""
+    """Propose commands for a first study from a data sheet."""
     name = Path("results") / file.stem
     return [
         NextStep(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
@@ -26,17 +26,17 @@ def after_init(file: Path) -> list[NextStep]:
 
 
 def after_demo(result: "StudyResult", folder: Path) -> list[NextStep]:
-    """As :func:`after_sweep`, and a study of one's own."""
-    steps, own = after_sweep(result, folder), Path("drive.toml")
-    if not own.exists():
+    """Propose commands after a sweep, and a study of the user's own drive."""
+    steps, own_study = after_sweep(result, folder), Path("drive.toml")
+    if not own_study.exists():
         steps.append(
-            NextStep(command_line("init", own), "And my own drive? A study of it, from the numbers of its data sheet.")
+            NextStep(command_line("init", own_study), "And my own drive? A study of it, from the numbers of its data sheet.")
         )
     return steps
 
 
 def after_sweep(result: "StudyResult", folder: Path) -> list[NextStep]:
-    """What can be asked of a sweep, and of its study, which its folder has, too."""
+    """Propose commands for a sweep's folder, and for the study in it."""
     study = folder / "study.toml"
     steps = [NextStep(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
     if is_remote(study):
@@ -50,73 +50,73 @@ def after_sweep(result: "StudyResult", folder: Path) -> list[NextStep]:
 
 
 def _all_converge_somewhere(result: "StudyResult") -> bool:
-    """Whether each observer converged in some run."""
-    wanted = {f"{side}.converged" for side in result.config.build().sides}
-    if not wanted <= set(result.columns):
+    """Return True if each observer converged in at least one run."""
+    metrics_left = {f"{side}.converged" for side in result.config.build().sides}
+    if not metrics_left <= set(result.columns):
         return False
-    for frame in result.batches(sorted(wanted)):
-        wanted -= {name for name in wanted if bool(frame[name].to_numpy().any())}
-        if not wanted:
+    for frame in result.batches(sorted(metrics_left)):
+        metrics_left -= {name for name in metrics_left if bool(frame[name].to_numpy().any())}
+        if not metrics_left:
             return True
     return False
 
 
 def after_proposal(log: Path, model: Path) -> list[NextStep]:
-    """What a proposed model is for."""
+    """Propose the command that takes a proposed model."""
     answers = "Which numbers does the machine have, and how sure are they?"
     return [NextStep(command_line("identify", log, "--model", model), answers)]
 
 
 def after_identification(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: "LogCall"
 ) -> list[NextStep]:
-    """What is open after an identification.
+    """Propose commands after an identification.
 
     Args:
-        task: what was done.
+        task: the log and its model.
         summary: its `identification.json`.
         again: the words of this call, with the folder of its results.
         folder: of the results.
-        given: what the call was about.
+        log_call: logs, model and hold-out log of the call.
     """
     from jaxbl.diagnosis.diagnosis_task import can_hold_out
     from jaxbl.identification.search import is_noise
 
     steps = []
     if not all(map(is_noise, summary["residual"].values())):
-        if given.holdout is not None or can_hold_out(task.record):
-            words = ("diagnose", *given.words(), "--out", f"{folder}_diagnosed")
+        if log_call.holdout is not None or can_hold_out(task.record):
+            words = ("diagnose", *log_call.words(), "--out", f"{folder}_diagnosed")
             steps.append(NextStep(command_line(*words), "What does the model lack? Its errors are larger than noise."))
-    elif _runs(task):
+    elif _has_input(task):
         words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
         steps.append(
             NextStep(command_line(*words), "How does the drive move with these numbers, and what do observers see?")
         )
-    return [*steps, *_gap_experiment(summary, again, folder, given), _along_the_log(folder)]
+    return [*steps, *_propose_gap_experiment(summary, again, folder, log_call), _explore_log(folder)]
 
 
 def after_diagnosis(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: "LogCall"
 ) -> list[NextStep]:
-    """What is open after a diagnosis; arguments as of :func:`after_identification`."""
+    """Propose commands after a diagnosis. Arguments as for :func:`after_identification`."""
     from jaxbl.diagnosis.diagnosis_summary import tied
 
-    steps, model = _gap_experiment(summary, again, folder, given), folder / "model.toml"
-    pair = None if "backlash" in summary or given.next_experiment else tied(summary)
+    steps, model = _propose_gap_experiment(summary, again, folder, log_call), folder / "model.toml"
+    pair = None if "backlash" in summary or log_call.next_experiment else tied(summary)
     if pair is not None:
         words = (*again, "--next-experiment", f"{folder}_next.csv")
         steps.append(NextStep(command_line(*words), f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
     if summary["verdict"] == "no_discrepancy":
-        words = ("identify", *given.words(), "--out", f"{folder}_identified")
+        words = ("identify", *log_call.words(), "--out", f"{folder}_identified")
         steps.append(NextStep(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
-    if summary["findings"] and _runs(task):
+    if summary["findings"] and _has_input(task):
         words = ("simulate", model, "--out", f"{folder}_run")
         steps.append(NextStep(command_line(*words), "How does the drive move with what was found? The extended study, run."))
-    return [*steps, _along_the_log(folder)]
+    return [*steps, _explore_log(folder)]
 
 
 def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> list[NextStep]:
-    """What is open after a watch of a log, which can be read again."""
+    """Propose commands after a log was watched; a stream cannot be read again."""
     if task.record is None:
         return []
     if summary["contradictions"]:
@@ -129,7 +129,7 @@ def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> l
 
 
 class LogCall(NamedTuple):
-    """What a command on logs was about: logs, model, log held out, and a file for the next experiment."""
+    """Logs, model, hold-out log, and file for the next experiment of a call."""
 
     logs: Sequence[Path]
     model: Path
@@ -141,19 +141,21 @@ class LogCall(NamedTuple):
         return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
 
 
-def _along_the_log(folder: Path) -> NextStep:
+def _explore_log(folder: Path) -> NextStep:
     return NextStep(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
 
 
-def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[NextStep]:
+def _propose_gap_experiment(
+    summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: LogCall
+) -> list[NextStep]:
     """The move that would show a gap to the motor's encoder alone, where the log does not."""
-    said = summary.get("backlash")
-    if said is None or said["shown"] or given.next_experiment is not None:
+    backlash = summary.get("backlash")
+    if backlash is None or backlash["shown"] or log_call.next_experiment is not None:
         return []
     words = (*again, "--next-experiment", f"{folder}_next.csv")
     return [NextStep(command_line(*words), "Is there a gap? A move that shows it to the motor's encoder.")]
 
 
-def _runs(task: "LogTask") -> bool:
-    """Whether the model that is written has an input: its own, or that of a log without gaps."""
+def _has_input(task: "LogTask") -> bool:
+    """Return True if the written model has an input: its own, or that of a log without gaps."""
     return "excitation" not in task.missing or len(task.record.segments) == 1

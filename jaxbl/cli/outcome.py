@@ -1,4 +1,4 @@
-"""What a command found, and how it is told: as text, as one JSON object, or not at all."""
+"""The outcome of a command, printed as text, as one JSON object, or not at all."""
 
 import functools
 import inspect
@@ -19,16 +19,16 @@ JsonOption = Annotated[bool, typer.Option("--json", help="print what was found a
 
 
 class Outcome(NamedTuple):
-    """What a command found.
+    """The outcome of a command.
 
     Attributes:
-        lines: as text.
+        lines: for the terminal.
         folder: of the results, if there are any.
-        page: what is to be opened, in the folder; "" for nothing.
-        summary: the same as data, or the file in the folder that has it.
+        page: file in the folder to open; "" for none.
+        summary: the outcome as data, or the name of the file in the folder that holds it.
         code: exit code.
-        steps: what to try next.
-        compact: whether its JSON is one line, as lines of JSON came before it.
+        steps: commands to try next.
+        compact: True if the JSON object is one line, since lines of JSON came before it.
     """
 
     lines: list[str]
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     compact: bool = False
 
     def text(self) -> list[str]:
-        """The lines, what to try next, and what is to be opened."""
+        """Return the lines, the commands to try next, and the file to open."""
         opened = [str(self.folder / self.page)] if self.folder is not None and self.page else []
         return [
             escape_unprintable(part)
@@ -49,51 +49,51 @@ class Outcome(NamedTuple):
         ]
 
     def data(self) -> dict[str, Any]:
-        """The same as plain data, and the files in the folder; of a sweep's parts there may be millions."""
-        found: dict[str, Any] = {"exit": self.code, "found": [line for line in self.lines if line]}
+        """Return the outcome as plain data, with the files in the folder but for a sweep's parts (there may be millions)."""
+        fields: dict[str, Any] = {"exit": self.code, "found": [line for line in self.lines if line]}
         if self.folder is not None:
             files = [file for pattern in ("*.*", "figures/*.*") for file in list_paths(self.folder, pattern)]
-            found["folder"] = str(self.folder)
-            found["open"] = str(self.folder / self.page) if self.page else None
-            found["files"] = [str(file) for file in files if not file.name.startswith(".")]
+            fields["folder"] = str(self.folder)
+            fields["open"] = str(self.folder / self.page) if self.page else None
+            fields["files"] = [str(file) for file in files if not file.name.startswith(".")]
         if self.steps:
-            found["next"] = [one._asdict() for one in self.steps]
+            fields["next"] = [step._asdict() for step in self.steps]
         if self.summary is not None:
             folder = self.folder or Path()
-            found["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary
-        return found
+            fields["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary
+        return fields
 
 
-def told(command: Callable[..., Outcome]) -> Callable[..., None]:
-    """A command with the options --quiet and --json, which prints its outcome and ends with its exit code."""
+def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
+    """Give a command the options --quiet and --json; it then prints its outcome and ends with its exit code."""
 
     @functools.wraps(command)
-    def run(*, quiet: bool, json: bool, **given: Any) -> None:
-        said: dict[str, Any] = {}
+    def run(*, quiet: bool, json: bool, **arguments: Any) -> None:
+        report: dict[str, Any] = {}
         indent: int | None = 1
         try:
-            outcome = command(**given)
+            outcome = command(**arguments)
         except (InputError, NoResult) as error:
-            said = {"exit": 2 if isinstance(error, InputError) else 1, "error": str(error)}
+            report = {"exit": 2 if isinstance(error, InputError) else 1, "error": str(error)}
             raise
         except typer.Exit as end:
-            said = {"exit": end.exit_code, "error": "interrupted"}
+            report = {"exit": end.exit_code, "error": "interrupted"}
             raise
         except KeyboardInterrupt:
-            said = {"exit": INTERRUPTED, "error": "interrupted"}
+            report = {"exit": INTERRUPTED, "error": "interrupted"}
             raise
         else:
             if json:
-                said, indent = outcome.data(), None if outcome.compact else 1
+                report, indent = outcome.data(), None if outcome.compact else 1
             elif not quiet:
                 for line in outcome.text():
                     typer.echo(line)
         finally:
-            if json and said:
+            if json and report:
                 from jaxbl.files import to_jsonable
 
                 typer.echo(
-                    json_format.dumps(to_jsonable({"command": command.__name__} | said), indent=indent, ensure_ascii=False)
+                    json_format.dumps(to_jsonable({"command": command.__name__} | report), indent=indent, ensure_ascii=False)
                 )
         if outcome.code:
             raise typer.Exit(outcome.code)
@@ -104,13 +104,15 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
 def with_options(
     run: Callable[..., Any], command: Callable[..., Any], options: Mapping[str, Any], default: Any
 ) -> Callable[..., Any]:
-    """A function with the arguments of a command, and with further options of one default."""
-    own = inspect.signature(command)
+    """Give a function the arguments of a command, and further options that have one default."""
+    signature = inspect.signature(command)
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
         for name, kind in options.items()
     ]
-    own_ones = [one for one in own.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
-    run.__signature__ = own.replace(parameters=[*own_ones, *added])  # type: ignore[attr-defined]
+    parameters = [
+        parameter for parameter in signature.parameters.values() if parameter.kind is not inspect.Parameter.VAR_KEYWORD
+    ]
+    run.__signature__ = signature.replace(parameters=[*parameters, *added])  # type: ignore[attr-defined]
     run.__annotations__ = {**command.__annotations__, **options}
     return run

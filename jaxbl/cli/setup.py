@@ -7,11 +7,11 @@ from typing import Annotated, TypeVar
 import typer
 
 from jaxbl import workers
-from jaxbl.datasheet import KINDS, NONE, Given, Item, first_study, named_items, option_of, remark
+from jaxbl.datasheet import KINDS, NONE, Answer, Item, describe_obstacle, items_by_name, option_name, write_first_study
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
 from jaxbl.lines import format_descriptions
-from jaxbl.terminal import answers, running, working
+from jaxbl.terminal import can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
 from .options import BackendOption, OutOption, check_new
@@ -21,13 +21,13 @@ from .studies import compute, read_study
 T = TypeVar("T")
 NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
 
-_KINDS_SAID = "; ".join(f"{name}: {kind.about}" for name, kind in KINDS.items()) + " [default: asked for, or geared]"
+_KINDS_HELP = "; ".join(f"{name}: {kind.description}" for name, kind in KINDS.items()) + " [default: asked for, or geared]"
 
 
 def init(
     context: typer.Context,
     file: NewArgument = Path("drive.toml"),
-    kind: Annotated[str | None, typer.Option(metavar="KIND", help=_KINDS_SAID, show_default=False)] = None,
+    kind: Annotated[str | None, typer.Option(metavar="KIND", help=_KINDS_HELP, show_default=False)] = None,
     title: Annotated[str, typer.Option(metavar="TEXT", help="headline of its report")] = "",
     **given: str | None,
 ) -> Outcome:
@@ -36,69 +36,75 @@ def init(
     Numbers have units, as in the examples. A unit that is not known here is answered with those that are.
     """
     check_new(file, "init")
-    asking, said = answers(), {name: text for name, text in given.items() if text is not None}
-    name = (_asked_kind() if asking else next(iter(KINDS))) if kind is None else _kind(kind)
+    asking, answered = can_ask_user(), {name: text for name, text in given.items() if text is not None}
+    name = (_ask_kind() if asking else next(iter(KINDS))) if kind is None else _check_kind(kind)
     items = KINDS[name].items
-    if others := [option_of(one) for one in said if one not in {item.name for item in items}]:
-        has, rest = ", ".join(item.option for item in items), ", ".join(kind for kind in KINDS if kind != name)
-        raise InputError(f"{', '.join(others)}: not asked of --kind {name}, which has: {has}; other kinds: {rest}")
-    values = {one.name: one.read(said[one.name]) for one in items if one.name in said}
+    unknown = set(answered) - {item.name for item in items}
+    if unknown:
+        unknown_options = [option_name(name) for name in answered if name in unknown]
+        known_options = ", ".join(item.option for item in items)
+        other_kinds = ", ".join(kind for kind in KINDS if kind != name)
+        raise InputError(
+            f"{', '.join(unknown_options)}: --kind {name} has no such option; it has: {known_options}; "
+            f"other kinds: {other_kinds}"
+        )
+    values = {item.name: item.read(answered[item.name]) for item in items if item.name in answered}
     if asking:
         if len(values) < len(items):
             typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
-        values = {one.name: values.get(one.name) or _asked_number(one) for one in items}
-    elif missing := [one for one in items if one.name not in values and not one.default]:
-        wanted = ", ".join(f"{one.option} '{one.example}'" for one in missing)
+        values = {item.name: values.get(item.name) or _ask_number(item) for item in items}
+    elif missing := [item for item in items if item.name not in values and not item.default]:
+        missing_options = ", ".join(f"{item.option} '{item.example}'" for item in missing)
         other = "" if kind else f"; another kind of drive: --kind {', '.join(list(KINDS)[1:])}"
         raise InputError(
-            f"init: these numbers are missing, here with examples: {wanted}; on a terminal they are asked for{other}"
+            f"init: numbers are missing, here with examples: {missing_options}; on a terminal init asks for them{other}"
         )
-    values = {one.name: values.get(one.name) or one.left_out() for one in items}
+    values = {item.name: values.get(item.name) or item.default_answer() for item in items}
     workers.start_jax()
-    with working(context, "running a pilot for the gains"):
-        text, found = first_study(KINDS[name], values, title or file.stem)
+    with show_task(context, "running a pilot for the gains"):
+        text, pilot_metrics = write_first_study(KINDS[name], values, title or file.stem)
     check_new(file, "init")
     write_atomic(file, text)
-    bounds = {side: one["f_plus"] for side, one in found.items()}
+    bounds = {side: item["f_plus"] for side, item in pilot_metrics.items()}
     largest = ", ".join(f"{bound:.3g} {KINDS[name].unit(side, 'rad/s²')} ({side})" for side, bound in bounds.items())
     lines = [
         f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
-        *([rest] if (rest := remark(KINDS[name], values, found)) else []),
+        *([other_kinds] if (other_kinds := describe_obstacle(KINDS[name], values, pilot_metrics)) else []),
     ]
     data = {
         "file": str(file),
         "kind": name,
-        "given": {name: one._asdict() for name, one in values.items()},
+        "given": {name: item._asdict() for name, item in values.items()},
         "f_plus": bounds,
     }
     return Outcome(lines, summary=data, steps=after_init(file))
 
 
-def _kind(text: str) -> str:
-    """The name of a kind of drive."""
+def _check_kind(text: str) -> str:
+    """Return the name of a kind of drive. Raises `InputError` where there is no such kind."""
     name = text.strip().lower()
     if name not in KINDS:
-        raise InputError(f"--kind '{text}': should be one of {', '.join(KINDS)}; jaxbl init --help says what they are")
+        raise InputError(f"--kind '{text}': should be one of {', '.join(KINDS)}; see jaxbl init --help")
     return name
 
 
-def _asked_kind() -> str:
-    """The kind of drive that the user names; asked again where there is no such kind."""
+def _ask_kind() -> str:
+    """Ask the user for a kind of drive, until there is such a kind."""
     typer.echo("Kinds of drives:", err=True)
-    for line in format_descriptions((f"  {name}", kind.about) for name, kind in KINDS.items()):
+    for line in format_descriptions((f"  {name}", kind.description) for name, kind in KINDS.items()):
         typer.echo(line, err=True)
-    return _asked("kind of this drive", next(iter(KINDS)), _kind)
+    return _ask("kind of this drive", next(iter(KINDS)), _check_kind)
 
 
-def _asked_number(item: Item) -> Given:
-    """The number that the user says."""
+def _ask_number(item: Item) -> Answer:
+    """Ask the user for a number of the data sheet."""
     other = f", or {NONE}" * item.absent
-    question = f"{item.asked}, such as {item.example}{other}"
-    return _asked(question, item.default, lambda text: item.left_out() if text == item.default else item.read(text))
+    question = f"{item.question}, such as {item.example}{other}"
+    return _ask(question, item.default, lambda text: item.default_answer() if text == item.default else item.read(text))
 
 
-def _asked(question: str, default: str, read: Callable[[str], T]) -> T:
-    """What the user answers; asked again where it cannot be read."""
+def _ask(question: str, default: str, read: Callable[[str], T]) -> T:
+    """Ask the user a question, until the answer can be read."""
     while True:
         try:
             return read(typer.prompt(question, default=default or None, err=True))
@@ -106,19 +112,19 @@ def _asked(question: str, default: str, read: Callable[[str], T]) -> T:
             typer.echo(f"  {error}", err=True)
 
 
-def _option(items: list[tuple[str, Item]]) -> object:
-    """The option of items of one name: what each kind of drive understands by it."""
-    said: dict[str, list[str]] = {}
+def _make_option(items: list[tuple[str, Item]]) -> object:
+    """Make the option of all items with one name; its help says what each kind of drive means by it."""
+    kinds_by_text: dict[str, list[str]] = {}
     for kind, item in items:
         default = f" [default: {item.default}]" if item.default else ""
         other = f" or '{NONE}'" * item.absent
-        said.setdefault(f"{item.asked}, such as '{item.example}'{other}{default}", []).append(kind)
-    every = len(said) == 1 and len(items) == len(KINDS)
-    about = ". ".join(text if every else f"{', '.join(kinds)}: {text}" for text, kinds in said.items())
-    return Annotated[str | None, typer.Option(items[0][1].option, metavar="VALUE", help=about, show_default=False)]
+        kinds_by_text.setdefault(f"{item.question}, such as '{item.example}'{other}{default}", []).append(kind)
+    is_common = len(kinds_by_text) == 1 and len(items) == len(KINDS)
+    help_text = ". ".join(text if is_common else f"{', '.join(kinds)}: {text}" for text, kinds in kinds_by_text.items())
+    return Annotated[str | None, typer.Option(items[0][1].option, metavar="VALUE", help=help_text, show_default=False)]
 
 
-with_options(init, init, {name: _option(items) for name, items in named_items().items()}, None)
+with_options(init, init, {name: _make_option(items) for name, items in items_by_name().items()}, None)
 
 
 def schema(
@@ -141,14 +147,16 @@ def schema(
 def doctor(context: typer.Context) -> Outcome:
     """Say what is installed here and where it keeps things, and test that it computes, in some seconds."""
     workers.start_jax()
-    with working(context, "looking at versions and devices"):
+    with show_task(context, "looking at versions and devices"):
         from jaxbl.doctor import examine
 
         findings = examine()
-    bad = [one.name for one in findings if not one.good]
-    lines = format_descriptions((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
-    lines.append(f"Not in order: {', '.join(bad)}." if bad else "All in order.")
-    return Outcome(lines, summary={"findings": [one._asdict() for one in findings]}, code=1 if bad else 0)
+    failures = [finding.name for finding in findings if not finding.good]
+    lines = format_descriptions(
+        (finding.name, finding.found if finding.good else f"FAILED: {finding.found}") for finding in findings
+    )
+    lines.append(f"Not in order: {', '.join(failures)}." if failures else "All in order.")
+    return Outcome(lines, summary={"findings": [finding._asdict() for finding in findings]}, code=1 if failures else 0)
 
 
 def demo(
@@ -157,15 +165,15 @@ def demo(
     backend: BackendOption = None,
 ) -> Outcome:
     """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute."""
-    config = _shipped("gain_map.toml")
+    config = _find_shipped_study("gain_map.toml")
     study, chosen = read_study(config, backend)
     from jaxbl.sweeps.sweep import sweep
 
     return compute(context, config, study, out, False, chosen, sweep, "sweep", after_demo)
 
 
-def _shipped(name: str) -> Path:
-    """A study that comes with the package; in a clone it is beside it."""
+def _find_shipped_study(name: str) -> Path:
+    """Find a study that comes with the package; in a clone it lies beside the package."""
     package = Path(__file__).parents[1]
     places = package / "studies" / name, package.parent / "sweeps" / name
     for file in places:
@@ -194,6 +202,6 @@ def bench(
     make_folder(out)
     if any(out.iterdir()) and not (out / "bench.json").exists():
         raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
-    with remove_if_empty_on_error(out), running(context, out, out, unit="parts", kept=False) as progress:
+    with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit="parts", keeps_results=False) as progress:
         result = run_bench(quick=quick, progress=progress)
     return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)

@@ -16,7 +16,14 @@ from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.files import FolderInUse, has_file, to_path
 from jaxbl.lines import NextStep, format_descriptions
-from jaxbl.terminal import duration, is_quiet, naming, running, until_interrupted, working
+from jaxbl.terminal import (
+    format_duration,
+    is_quiet,
+    name_config_in_errors,
+    run_until_interrupted,
+    run_with_progress,
+    show_task,
+)
 
 from .next_steps import after_sweep
 from .options import (
@@ -55,7 +62,7 @@ def simulate(
 
     study = _read(config)
     folder = folder_of(config, out)
-    with remove_if_empty_on_error(folder), lock_folder(folder), working(context, "simulating"):
+    with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
         claim_folder(folder, study, "simulate", overwrite=overwrite)
         trial = run(study, seed=seed, every=every)
         lines = write_trial_report(trial, folder)
@@ -80,7 +87,9 @@ def sweep(
     ] = None,
 ) -> Outcome:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
-    which = _share(share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None})
+    share_numbers = _parse_share(
+        share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None}
+    )
     if detach and scheduler is None:
         raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
     if detach and (overwrite or verify_store):
@@ -92,39 +101,39 @@ def sweep(
 
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
-    with naming(config):
+    with name_config_in_errors(config):
         check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
-            return _expected_cost(study, chosen)
+            return _estimate_cost(study, chosen)
     run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
     collect = functools.partial(compute, context, config, study, out, overwrite, chosen, run, "sweep", after_sweep)
-    if detach or which is not None:
+    if detach or share_numbers is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
 
         folder = folder_of(config, out)
-        with running(context, config, folder) as progress:
-            if which is None:
-                found = submit(study, folder, scheduler, backend=chosen)
+        with run_with_progress(context, config, folder) as progress:
+            if share_numbers is None:
+                status_now = submit(study, folder, scheduler, backend=chosen)
             else:
-                found = run_share(study, folder, which, progress=progress, backend=chosen)
-        if not found.complete:
-            left = f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report."
-            return _state([found], left)
+                status_now = run_share(study, folder, share_numbers, progress=progress, backend=chosen)
+        if not status_now.complete:
+            remark = f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report."
+            return _describe_studies([status_now], remark)
         # who is last collects them
         try:
             return collect()
         except FolderInUse:
-            return _state([found])
+            return _describe_studies([status_now])
     return collect()
 
 
-def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
-    """Number of a share, and of all; `others` are options that do not go with it."""
+def _parse_share(text: str | None, other_options: dict[str, bool]) -> tuple[int, int] | None:
+    """Parse I/N into the number of a share and of all shares. `other_options`: set options that exclude --share."""
     if text is None:
         return None
-    for name, given in others.items():
-        if given:
+    for name, is_set in other_options.items():
+        if is_set:
             raise InputError(
                 f"--share: does not go with {name}: other processes may be at work in the folder; leave one of them out"
             )
@@ -138,35 +147,35 @@ def status(folder: FolderArgument) -> Outcome:
     """Say how far a study is, by the parts that exist."""
     from jaxbl.sweeps.status import list_statuses
 
-    return _state(list_statuses(folder))
+    return _describe_studies(list_statuses(folder))
 
 
-def _state(found: "list[Status]", *more: str) -> Outcome:
-    """How far studies are."""
-    data = {"studies": [vars(one) | {"folder": str(one.folder)} for one in found]}
-    return Outcome([*(line for one in found for line in _state_lines(one)), *more], summary=data)
+def _describe_studies(studies: "list[Status]", *more: str) -> Outcome:
+    """Say how far studies are."""
+    data = {"studies": [vars(study) | {"folder": str(study.folder)} for study in studies]}
+    return Outcome([*(line for study in studies for line in _describe_study(study)), *more], summary=data)
 
 
-def _state_lines(found: "Status") -> list[str]:
-    share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
-    lines = [f"{found.folder}: '{escape_unprintable(found.title)}', {share} of {found.runs} runs"]
-    if found.damaged:
-        lines.append(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
-    if found.finished and found.complete:
+def _describe_study(study: "Status") -> list[str]:
+    share = f"{study.parts} of {study.parts_in_all} parts ({math.floor(1000 * study.parts / study.parts_in_all) / 10:g} %)"
+    lines = [f"{study.folder}: '{escape_unprintable(study.title)}', {share} of {study.runs} runs"]
+    if study.damaged:
+        lines.append(f"  {study.damaged} damaged files are kept in {study.folder / 'damaged'}")
+    if study.finished and study.complete:
         return [*lines, "  finished"]
-    rate, left = found.parts_per_second, found.remaining
+    rate, left = study.parts_per_second, study.remaining
     speed = f", {60.0 * rate:.3g} parts a minute" if rate else ""
-    if found.complete:
+    if study.complete:
         lines.append("  all parts are there; 'jaxbl sweep' on it reads them and writes the report")
-    elif found.held_by:
-        lines.append(f"  {found.held_by} is at work{speed}{'' if left is None else f', {duration(left)} left'}")
+    elif study.held_by:
+        lines.append(f"  {study.held_by} is at work{speed}{'' if left is None else f', {format_duration(left)} left'}")
     else:
         lines.append(f"  no process is at work in it{speed and f' (it went at{speed[1:]})'}; 'jaxbl sweep' goes on")
     return lines
 
 
-def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
-    """What a sweep will take."""
+def _estimate_cost(study: "Config", backend: "Backend | None") -> Outcome:
+    """Estimate what a sweep will take."""
     from jaxbl.sweeps.sweep import dry_run
 
     cost = dry_run(study, backend=backend)
@@ -179,8 +188,8 @@ def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
     rows += [
         ("chunks", f"{cost.chunks} of {cost.lanes_a_chunk} lanes"),
         ("memory", f"{cost.megabytes:.1f} MB a chunk"),
-        ("compilation", f"about {duration(cost.compile_seconds)}"),
-        ("run", f"about {duration(cost.run_seconds)} ({rate})"),
+        ("compilation", f"about {format_duration(cost.compile_seconds)}"),
+        ("run", f"about {format_duration(cost.run_seconds)} ({rate})"),
     ]
     lines = format_descriptions(rows)
     return Outcome(lines, summary=vars(cost))
@@ -219,7 +228,7 @@ def verify(
 
 
 def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
-    """A study, and the backend that is asked for."""
+    """Read a study and the backend option."""
     workers.start_jax()
     from jaxbl.sweeps.programs import check_backend
 
@@ -228,7 +237,7 @@ def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | 
 
 
 def _read(config: Path) -> "Config":
-    """A study; what is valid in it and perhaps not meant is said first."""
+    """Read a study; print remarks on settings that are valid and perhaps not meant."""
     from jaxbl.config import read_config
 
     study = read_config(config)
@@ -238,11 +247,11 @@ def _read(config: Path) -> "Config":
 
 
 _SUMMARIES = {"tune": "tuning.json", "verify": "verdict.json"}
-"""Files that say what a command found."""
+"""Files with the result of a command."""
 
 
-def _extent(result: "StudyResult") -> dict[str, Any]:
-    """How large a study is, as data."""
+def _study_size(result: "StudyResult") -> dict[str, Any]:
+    """Return the size of a study as data."""
     return {"title": result.config.title, "runs": result.runs, "finished": result.is_finished(result.runs)}
 
 
@@ -262,23 +271,23 @@ def compute(
     `steps` says what to try next, of the result and the folder.
     """
     folder = folder_of(config, out)
-    with running(context, config, folder) as progress:
+    with run_with_progress(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
     from jaxbl.fused import SCAN_MESSAGE
 
-    with working(context, "drawing"):
+    with show_task(context, "drawing"):
         # what draws is loaded when there is something to be drawn
         from jaxbl.report.results import writer
 
-        following = [] if steps is None else steps(result, folder)
-        lines = writer(result)(result, folder, *([following] if following else []))
+        next_steps = [] if steps is None else steps(result, folder)
+        lines = writer(result)(result, folder, *([next_steps] if next_steps else []))
     cost = getattr(result, "cost", None)
     if cost and cost["lanes"]:
-        compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
+        compiling, computing = format_duration(cost["compile_seconds"]), format_duration(cost["run_seconds"])
         lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    lines += (SCAN_MESSAGE % what for what in result.fallback_reasons)
-    lines += (f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))
-    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result), steps=following)
+    lines += (SCAN_MESSAGE % reason for reason in result.fallback_reasons)
+    lines += (f"Damaged, and computed anew: {reason}" for reason in getattr(result, "damaged", ()))
+    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _study_size(result), steps=next_steps)
 
 
 def plot(
@@ -303,9 +312,9 @@ def plot(
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
-    with working(context, "drawing"):
+    with show_task(context, "drawing"):
         steps = after_sweep(result, where)
-        return Outcome(write_sweep_report(result, where, steps), where, summary=_extent(result), steps=steps)
+        return Outcome(write_sweep_report(result, where, steps), where, summary=_study_size(result), steps=steps)
 
 
 def explore(
@@ -331,11 +340,11 @@ def explore(
 
     source = log_source(folder)
     if source is None and not has_file(to_path(folder), "manifest.json"):
-        what = "is missing" if not to_path(folder).exists() else "holds no sweep, identification or diagnosis"
-        raise InputError(f"{folder}: {what}; give a folder that 'jaxbl sweep', 'identify' or 'diagnose' wrote")
+        fault = "is missing" if not to_path(folder).exists() else "holds no sweep, identification or diagnosis"
+        raise InputError(f"{folder}: {fault}; give a folder that 'jaxbl sweep', 'identify' or 'diagnose' wrote")
     source = source or study_source(folder)
     if static is not None:
-        with working(context, "writing the page"):
+        with show_task(context, "writing the page"):
             page = write_static(source, static)
         return Outcome([*source.lead], static, page.name)
     from jaxbl.report.explorer.server import served
@@ -347,7 +356,7 @@ def explore(
         if browser if browser is not None else sys.stdout.isatty():
             # a browser in the terminal ends when it is left
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
-        until_interrupted(server.serve_forever)
+        run_until_interrupted(server.serve_forever)
     return Outcome([])
 
 
@@ -371,7 +380,7 @@ def compare(
     make_folder(folder)
     if not is_empty(folder) and not (folder / "comparison.json").exists():
         raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
-    with remove_if_empty_on_error(folder), working(context, "comparing"):
+    with remove_if_empty_on_error(folder), show_task(context, "comparing"):
         lines = write_comparison(run_compare(*studies), studies[0].config, folder)
     return Outcome(lines, folder, "comparison.json", "comparison.json")
 
@@ -381,9 +390,9 @@ def repair(folder: FolderArgument) -> Outcome:
     workers.start_jax()
     from jaxbl.sweeps.sweep import repair as run_repair
 
-    whole, store = run_repair(folder)
+    whole_parts, store = run_repair(folder)
     parts = store.manifest["parts"]
-    lines = [*(f"Damaged: {what}" for what in store.damaged), f"{whole} of {parts} parts are whole."]
-    if whole < parts:
+    lines = [*(f"Damaged: {damaged_part}" for damaged_part in store.damaged), f"{whole_parts} of {parts} parts are whole."]
+    if whole_parts < parts:
         lines.append(f"'jaxbl sweep STUDY.toml --out {folder}' with the same study computes the others.")
-    return Outcome(lines, to_path(folder), "", {"parts": parts, "whole": whole, "damaged": store.damaged})
+    return Outcome(lines, to_path(folder), "", {"parts": parts, "whole": whole_parts, "damaged": store.damaged})

@@ -15,13 +15,13 @@ BLOCKS = (256, 2048, 16_384)
 
 
 @jit
-def _observed(
+def _run_block(
     experiment: Experiment, state: State, torque: jax.Array, measured: dict[str, jax.Array], count: jax.Array
 ) -> tuple[State, dict[str, jax.Array]]:
-    """The state after `count` samples of a block, and what each sample gives."""
+    """Take `count` samples of a padded block. Returns the state after them, and signals of each sample."""
 
-    def sample(state: State, given: tuple[Any, ...]) -> tuple[State, dict[str, jax.Array]]:
-        index, torque, measured = given
+    def sample(state: State, inputs: tuple[Any, ...]) -> tuple[State, dict[str, jax.Array]]:
+        index, torque, measured = inputs
         # time matters to excitation and identifier alone
         new, signals = step(experiment, state, Sample(jnp.zeros_like(torque), input=torque, measured=measured))
         row = {"twist": jnp.asarray(signals.twist)}
@@ -42,41 +42,41 @@ class LiveChain:
         self._experiment = dataclasses.replace(experiment, identifier=None)
         self._state: State | None = None
 
-    def take(self, torque: np.ndarray, measured: dict[str, np.ndarray], anew: bool) -> dict[str, np.ndarray]:
+    def take(self, torque: np.ndarray, measured: dict[str, np.ndarray], restarts: bool) -> dict[str, np.ndarray]:
         """Take in samples.
 
         Args:
             torque: input, N m, shape (samples,).
             measured: positions of both sides, rad, shape (samples,).
-            anew: whether they do not continue those before.
+            restarts: True if they do not continue the samples before.
 
         Returns:
             `twist` (rad); by side `SIDE.position` (rad), as measured, and `SIDE.torque`, the observer's transmitted torque
             (N m).
         """
-        if self._state is None or anew:
+        if self._state is None or restarts:
             first = {side: jnp.asarray(values[0]) for side, values in measured.items()}
             self._state = initial_state(self._experiment, first)
-        found: list[dict[str, np.ndarray]] = []
+        blocks: list[dict[str, np.ndarray]] = []
         done = 0
         while done < len(torque):
-            left = len(torque) - done
-            size = next((one for one in BLOCKS if left <= one), BLOCKS[-1])
-            part, count = slice(done, done + size), min(left, size)
+            remaining = len(torque) - done
+            size = next((block for block in BLOCKS if remaining <= block), BLOCKS[-1])
+            part, count = slice(done, done + size), min(remaining, size)
 
-            def padded(values: np.ndarray, part: slice = part, room: int = size - count) -> jax.Array:
-                return jnp.asarray(np.pad(values[part], (0, room)))
+            def pad_block(values: np.ndarray, part: slice = part, padding: int = size - count) -> jax.Array:
+                return jnp.asarray(np.pad(values[part], (0, padding)))
 
-            given = padded(torque), {side: padded(values) for side, values in measured.items()}
-            self._state, rows = _observed(self._experiment, self._state, *given, jnp.asarray(count))
-            found.append({name: np.asarray(values)[:count] for name, values in rows.items()})
+            block_inputs = pad_block(torque), {side: pad_block(values) for side, values in measured.items()}
+            self._state, rows = _run_block(self._experiment, self._state, *block_inputs, jnp.asarray(count))
+            blocks.append({name: np.asarray(values)[:count] for name, values in rows.items()})
             done += count
         positions = {f"{side}.position": values for side, values in measured.items()}
-        return {name: np.concatenate([one[name] for one in found]) for name in found[0]} | positions
+        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]} | positions
 
     def compile(self) -> None:
         """Compile what rows will need, before any come."""
         sides = self._experiment.sides
         for size in BLOCKS[:-1]:
-            self.take(np.zeros(size), {side: np.zeros(size) for side in sides}, anew=True)
+            self.take(np.zeros(size), {side: np.zeros(size) for side in sides}, restarts=True)
         self._state = None

@@ -34,13 +34,13 @@ from jaxbl.units import on_a_line
 from jaxbl.workers import limit_blas_threads
 
 from .live_chain import LiveChain
-from .window import PARTS, SETTLING, Found, Number, Window
+from .window import BLOCKS, SETTLING, Number, SideNumbers, Window
 
 SURE = 0.999
 """Probability at which the gap has to be beyond the limit."""
-_BOUND = float(stdtrit(PARTS - 1, SURE))
+_BOUND = float(stdtrit(BLOCKS - 1, SURE))
 """Standard errors of a jackknife between a value and its one-sided bound."""
-INTERVAL = float(stdtrit(PARTS - 1, 0.975))
+INTERVAL = float(stdtrit(BLOCKS - 1, 0.975))
 """Standard errors between a value and each end of its 95 % interval."""
 _WIDEST = 0.25
 """Half width of the 95 % interval of a gap that counts as determined, over the gap or, where that is larger, the model's."""
@@ -82,7 +82,7 @@ class WatchTask:
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """What was seen of a drive.
+    """The result of a watch.
 
     Attributes:
         task: the study and what was watched.
@@ -147,11 +147,12 @@ def read_watch_task(
     of = str(model) if isinstance(model, str | Path) else "config"
     if config.drive.kind != "two_inertia":
         raise InputError(f"{of}: drive.kind {config.drive.kind} has no gap to watch; it should be two_inertia")
-    if lacking := [one for one in ("observer.motor", "observer.load") if one in missing]:
-        raise InputError(
-            f"{of}: [{lacking[0]}] has no gains; jaxbl tune chooses some, and the model.toml of jaxbl identify has those "
-            "that it chose on its log"
-        )
+    for side in ("observer.motor", "observer.load"):
+        if side in missing:
+            raise InputError(
+                f"{of}: [{side}] has no gains; jaxbl tune chooses some, and the model.toml of jaxbl identify has those that "
+                "it chose on its log"
+            )
     if config.build().identifier is None:
         raise InputError(f"{of}: the study has no identifier, which finds the gap; give it a [transmission]")
     address = str(source)
@@ -175,30 +176,33 @@ def read_watch_task(
     assert law is not None
     if alarm_gap is not None and "half_gap" not in law.truth():
         raise InputError(f"{of}: transmission.law {law.name} has no gap for --alarm-gap; dead_zone has one")
-    least = 5.0 * SETTLING * max(float(experiment.equivalent_control.time_constant), period)
-    if window < least:
+    shortest_window = 5.0 * SETTLING * max(float(experiment.equivalent_control.time_constant), period)
+    if window < shortest_window:
         raise InputError(
             f"window is {window:g} s; with this low-pass ([equivalent_control] time_constant) and sampling period it should "
-            f"be at least {least:g} s"
+            f"be at least {shortest_window:g} s"
         )
     if every < period:
         raise InputError(f"every is {every:g} s; it should be at least the sampling period, {period:g} s")
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
-    return WatchTask(config, address, record, experiment, alarm_gap, window, every, _units(config, record))
+    return WatchTask(config, address, record, experiment, alarm_gap, window, every, _find_units(config, record))
 
 
-def _units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
+def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
     units = {"half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad"}
-    found = {}
+    units_by_side = {}
     for side, channel in POSITION_CHANNELS.items():
         if record is not None:
-            found[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
+            units_by_side[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
         else:
-            line = config.log.position(channel)[1].si_unit == "m"
-            found[side] = {name: on_a_line(unit) if line else unit for name, unit in units.items()}
+            is_linear = config.log.position(channel)[1].si_unit == "m"
+            units_by_side[side] = {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
     # gap and stiffness are those of the motor's side
-    return {side: own | {name: found["motor"][name] for name in ("half_gap", "stiffness")} for side, own in found.items()}
+    return {
+        side: side_units | {name: units_by_side["motor"][name] for name in ("half_gap", "stiffness")}
+        for side, side_units in units_by_side.items()
+    }
 
 
 def run_watch(
@@ -218,75 +222,75 @@ def run_watch(
         watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
         if task.record is not None:
-            for rows in _of_record(task.record):
+            for rows in _rows_of_record(task.record):
                 watcher.take(rows)
             notes = [*task.record.warnings, *task.record.notes]
         else:
             watcher.chain.compile()
-            stream, notes = _stream(task), []
+            stream, notes = _open_stream(task), []
             remark = on_remark or (lambda text: None)
             try:
                 remark(f"watching {task.name}; Ctrl+C ends it")
-                for rows in _of_stream(stream, ended or (lambda: False), remark):
+                for rows in _rows_of_stream(stream, ended or (lambda: False), remark):
                     watcher.take(rows)
             finally:
                 stream.source.close()
             counts = stream.counts
     values = pd.DataFrame(watcher.values, columns=watcher.columns)
-    return Watch(task, to_jsonable(_summary(task, watcher, counts, notes)), values)
+    return Watch(task, to_jsonable(_summarise(task, watcher, counts, notes)), values)
 
 
-def _of_record(record: Record) -> Iterator[Rows]:
+def _rows_of_record(record: Record) -> Iterator[Rows]:
     assert record.torque is not None
     for part in record.segments:
         positions = {side: values[part] for side, values in record.positions.items()}
         yield Rows(float(record.time[part.start]), record.torque[part], positions, True)
 
 
-def _stream(task: WatchTask) -> Stream:
+def _open_stream(task: WatchTask) -> Stream:
     source: Source = (
         Datagrams(task.name, stream_columns(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
     )
     return Stream(source, task.config.log, float(task.experiment.run.sample_period))
 
 
-def _of_stream(stream: Stream, ended: Callable[[], bool], remark: Callable[[str], None]) -> Iterator[Rows]:
-    heard = said = time.monotonic()
-    before: dict[str, int] = {}
-    while not ended():
-        found = stream.poll(_POLL)
+def _rows_of_stream(stream: Stream, has_ended: Callable[[], bool], remark: Callable[[str], None]) -> Iterator[Rows]:
+    last_rows = last_remark = time.monotonic()
+    counts_before: dict[str, int] = {}
+    while not has_ended():
+        rows = stream.poll(_POLL)
         now = time.monotonic()
-        if found:
-            heard = now
-        if now - said >= _QUIET:
-            if now - heard >= _QUIET:
-                remark(f"{stream.source.name}: nothing that can be read has come for {now - heard:.0f} s")
-                said = now
-            if stream.counts != before:
-                remark(f"{stream.source.name}: {counted(stream.counts)}{stream.source.fault}")
-                said, before = now, dict(stream.counts)
-        yield from found
+        if rows:
+            last_rows = now
+        if now - last_remark >= _QUIET:
+            if now - last_rows >= _QUIET:
+                remark(f"{stream.source.name}: nothing that can be read has come for {now - last_rows:.0f} s")
+                last_remark = now
+            if stream.counts != counts_before:
+                remark(f"{stream.source.name}: {describe_counts(stream.counts)}{stream.source.fault}")
+                last_remark, counts_before = now, dict(stream.counts)
+        yield from rows
 
 
-def counted(counts: Mapping[str, int]) -> str:
-    """What was left out of a stream, in words."""
-    return ", ".join(f"{number} {what}" for what, number in counts.items())
+def describe_counts(counts: Mapping[str, int]) -> str:
+    """Say in words what was left out of a stream."""
+    return ", ".join(f"{number} {kind}" for kind, number in counts.items())
 
 
-def _names(experiment: Experiment) -> tuple[list[str], list[str]]:
-    """Numbers of each side, and those of them that the side which determines them best gives."""
+def _number_names(experiment: Experiment) -> tuple[list[str], list[str]]:
+    """Return the numbers of each side, and those of the law, which are taken from the side that determines them best."""
     assert experiment.transmission is not None
     law = [name for name in ("half_gap", "stiffness") if name in experiment.transmission.truth()]
     return [*law, "coulomb", "viscous"], law
 
 
-def columns_of(task: WatchTask) -> list[str]:
-    """Names of the values of a watch: the columns of `watch.csv`."""
-    names, law = _names(task.experiment)
-    found = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
-    found += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction"]
+def watch_columns(task: WatchTask) -> list[str]:
+    """Return the columns of `watch.csv`."""
+    names, law = _number_names(task.experiment)
+    columns = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
+    columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction"]
     by_side = itertools.product(task.experiment.sides, names, ("", "_error"))
-    return [*found, *(f"{side}.{name}{end}" for side, name, end in by_side)]
+    return [*columns, *(f"{side}.{name}{end}" for side, name, end in by_side)]
 
 
 class Watcher:
@@ -308,8 +312,8 @@ class Watcher:
         experiment = task.experiment
         self._period = float(experiment.run.sample_period)
         self.chain, self._window = LiveChain(experiment), Window(experiment, task.window)
-        self._names, self._chosen = _names(experiment)
-        self.columns = columns_of(task)
+        self._names, self._chosen = _number_names(experiment)
+        self.columns = watch_columns(task)
         self.values: list[Values] = []
         self.samples = 0
         self.start: float | None = None
@@ -319,74 +323,78 @@ class Watcher:
         """Take in rows, and make the values that are due within them."""
         if self.start is None:
             self.start = rows.time
-        first, anew, count = rows.time - self.start, rows.anew, len(rows.torque)
+        first, restarts, count = rows.time - self.start, rows.anew, len(rows.torque)
         done = 0
         while done < count:
             # the row at which values are due, those of a gap in time once; half a period of slack: times are rounded
-            left = math.ceil((self._due - first) / self._period - 0.5) + 1
-            end = min(max(left, done + 1), count)
+            rows_until_due = math.ceil((self._due - first) / self._period - 0.5) + 1
+            end = min(max(rows_until_due, done + 1), count)
             part = slice(done, end)
-            given = self.chain.take(rows.torque[part], {side: x[part] for side, x in rows.positions.items()}, anew)
-            self._window.add(given, anew)
+            estimates = self.chain.take(rows.torque[part], {side: x[part] for side, x in rows.positions.items()}, restarts)
+            self._window.add(estimates, restarts)
             self.samples += end - done
-            done, anew = end, False
+            done, restarts = end, False
             now = first + (end - 1) * self._period
             if now >= self._due - 0.5 * self._period:
                 every = self._task.every
                 self._due = every * (math.floor((now + 0.5 * self._period) / every) + 1)
-                if self._window.full:
-                    self._say(now)
+                if self._window.is_full:
+                    self._add_values(now)
 
-    def _say(self, now: float) -> None:
+    def _add_values(self, now: float) -> None:
         values = dict.fromkeys(self.columns, math.nan) | {"t": now, "side": "", "alarm": False, "contradiction": False}
-        found = self._window.estimate()
-        for side, one in found.items():
+        windows = self._window.estimate()
+        for side, window in windows.items():
             for name in self._names:
-                number = one.numbers[name]
+                number = window.numbers[name]
                 values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.error}
-        values |= self._judged(found)
+        values |= self._judge_gap(windows)
         self.values.append(values)
         self._on_values(values)
 
-    def _judged(self, found: dict[str, Found]) -> Values:
-        """The side that determines gap or stiffness best, its numbers, and whether the gap is beyond the limit."""
+    def _judge_gap(self, windows: dict[str, SideNumbers]) -> Values:
+        """Choose the side that determines gap or stiffness best, and decide on the alarm."""
         task, name = self._task, self._chosen[0]
         law = task.experiment.transmission
         assert law is not None
         nominal = float(law.half_gap if name == "half_gap" else law.stiffness)
-        known = {
-            side: one.numbers
-            for side, one in found.items()
-            if INTERVAL * one.numbers[name].error <= _WIDEST * max(one.numbers[name].value, nominal)
+        numbers_by_side = {
+            side: window.numbers
+            for side, window in windows.items()
+            if INTERVAL * window.numbers[name].error <= _WIDEST * max(window.numbers[name].value, nominal)
         }
-        if not known:
+        if not numbers_by_side:
             return {}
-        side = min(known, key=lambda side: known[side][name].error)
+        side = min(numbers_by_side, key=lambda side: numbers_by_side[side][name].error)
         values: Values = {"side": side}
         for key in self._chosen:
-            number = known[side][key]
+            number = numbers_by_side[side][key]
             ends = (number.value + sign * INTERVAL * number.error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
-        bounds = {side: numbers[name].value - _BOUND * numbers[name].error for side, numbers in known.items()}
-        apart = [key for key in self._chosen if len(known) == 2 and _apart(*(numbers[key] for numbers in known.values()))]
-        values["contradiction"] = bool(apart)
+        bounds = {side: numbers[name].value - _BOUND * numbers[name].error for side, numbers in numbers_by_side.items()}
+        differing = [
+            key
+            for key in self._chosen
+            if len(numbers_by_side) == 2 and _surely_differ(*(numbers[key] for numbers in numbers_by_side.values()))
+        ]
+        values["contradiction"] = bool(differing)
         # where the gaps differ one of them is wrong: the smaller one counts
-        bound = min(bounds.values()) if name in apart else bounds[side]
+        bound = min(bounds.values()) if name in differing else bounds[side]
         if name == "half_gap":
             values |= {"half_gap_least": bound, "alarm": task.alarm_gap is not None and bound > task.alarm_gap}
         return values
 
 
-def _apart(one: Number, other: Number) -> bool:
-    """Whether two numbers surely differ."""
-    return abs(one.value - other.value) > _BOUND * math.hypot(one.error, other.error)
+def _surely_differ(first: Number, second: Number) -> bool:
+    """Return True if two numbers differ by more than their errors explain."""
+    return abs(first.value - second.value) > _BOUND * math.hypot(first.error, second.error)
 
 
-def _summary(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
-    known = [one for one in watcher.values if one["side"]]
-    raised = [one for one in known if one["alarm"]]
+def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
+    determined = [values for values in watcher.values if values["side"]]
+    alarms = [values for values in determined if values["alarm"]]
 
-    def said(values: Values) -> Values:
+    def drop_nan(values: Values) -> Values:
         return {name: value for name, value in values.items() if not (isinstance(value, float) and math.isnan(value))}
 
     return {
@@ -398,21 +406,21 @@ def _summary(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes
         "window": task.window,
         "every": task.every,
         "alarm_gap": task.alarm_gap,
-        "alarm": said(raised[0]) if raised else None,
-        "alarms": len(raised),
+        "alarm": drop_nan(alarms[0]) if alarms else None,
+        "alarms": len(alarms),
         "values": len(watcher.values),
-        "determined": len(known),
-        "contradictions": sum(one["contradiction"] for one in known),
-        "first": said(known[0]) if known else None,
-        "last": said(known[-1]) if known else None,
+        "determined": len(determined),
+        "contradictions": sum(values["contradiction"] for values in determined),
+        "first": drop_nan(determined[0]) if determined else None,
+        "last": drop_nan(determined[-1]) if determined else None,
         "units": task.units,
         "left_out": dict(counts),
         "notes": notes,
     }
 
 
-def value_line(values: Values, task: WatchTask) -> str:
-    """Values as a line for the terminal."""
+def format_values(values: Values, task: WatchTask) -> str:
+    """Format values as a line for the terminal."""
     line = f"{values['t']:8.1f} s  "
     side, units = values["side"], task.units["motor"]
     if not side:
@@ -422,8 +430,8 @@ def value_line(values: Values, task: WatchTask) -> str:
         if name in values:
             half = values[f"{name}_to"] - values[name]
             parts.append(f"{label} {values[name]:.4g}±{half:.1g} {units[name]}")
-    sides = [one for one in task.experiment.sides if f"{one}.coulomb" in values]
+    sides = [side_name for side_name in task.experiment.sides if f"{side_name}.coulomb" in values]
     # a side that moves along a line has its friction in N
-    friction = "/".join(f"{values[f'{one}.coulomb']:.2g}" for one in sides)
-    parts.append(f"friction {friction} {'/'.join(dict.fromkeys(task.units[one]['coulomb'] for one in sides))}")
+    friction = "/".join(f"{values[f'{side_name}.coulomb']:.2g}" for side_name in sides)
+    parts.append(f"friction {friction} {'/'.join(dict.fromkeys(task.units[side_name]['coulomb'] for side_name in sides))}")
     return line + "  ".join(parts) + ("  ALARM" if values["alarm"] else "")

@@ -30,17 +30,17 @@ from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.records.linear_filters import savitzky_golay_slopes
 from jaxbl.simulate import Experiment
 
-PARTS = 10
+BLOCKS = 10
 """Blocks of a window, of which the jackknife leaves out one at a time."""
 SETTLING = 10.0
 """Time constants of the low-pass after which a filter has forgotten how it began."""
 _SLOPE = 2.0
 """Time constants of the low-pass to each side over which a velocity is the slope of a cubic."""
-_TURNS = 0.9
+_LEAST_DIRECTION = 0.9
 """Mean of sign(v) under the low-pass below which a side stands still or turns: its friction has no direction there."""
 _ITERATIONS, _CONVERGED = 20, 0.05
 """Of the law at its own numbers: at most, and the last change of the half gap in its standard errors."""
-_HELD = 1e-4
+_CONSTANT_TORQUE_WEIGHT = 1e-4
 """Share of its own sum of squares by which the constant torque is held at zero: where the twist never leaves contact, only
 the sum of it and the zero of the twist is known."""
 _SINGULAR = 1e-9
@@ -54,7 +54,7 @@ class Number(NamedTuple):
     error: float
 
 
-class Found(NamedTuple):
+class SideNumbers(NamedTuple):
     """Numbers of one side from a window: of the law by its own names, `coulomb` (N m) and `viscous` (N m s/rad) friction."""
 
     numbers: dict[str, Number]
@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
 
 @jit
-def _sums(
+def _sum_blocks(
     law: AbstractTransmission,
     low_pass: EquivalentControl,
     period: jax.Array,
@@ -72,31 +72,34 @@ def _sums(
     zero: jax.Array,
     rows: dict[str, jax.Array],
 ) -> tuple[jax.Array, jax.Array]:
-    """Normal equations of each block of the window, (blocks, p, p) and (blocks, p)."""
+    """Sum the normal equations of each block of the window: `(blocks, p, p)` and `(blocks, p)`."""
     twist, velocity = rows["twist"] - zero, rows["velocity"]
     slope = jax.vmap(jax.grad(lambda z: law.torque(law.deflection(z))))(twist)
-    one = jnp.ones_like(twist)
-    columns = [*law.regressors(twist), *(-x / gain for x in (jnp.sign(velocity), velocity, one)), -slope]
+    ones_column = jnp.ones_like(twist)
+    friction = [-column / gain for column in (jnp.sign(velocity), velocity, ones_column)]
+    columns = [*law.regressors(twist), *friction, -slope]
     raw = jnp.stack(columns, axis=1)
 
     def advance(filtered: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
         # what acted up to a sample, as in the identifier: the value before it
         return low_pass.filter(filtered, row, period), filtered
 
-    x = jax.lax.scan(advance, jnp.zeros_like(raw[0]), raw)[1] if matched else raw
-    moving = jnp.abs(x[:, -4] * gain) > _TURNS
-    weighted = x * (rows["counts"] * moving)[:, None]
-    weighted, x, torque = (a.reshape(PARTS, -1, *a.shape[1:]) for a in (weighted, x, rows["torque"]))
-    return jnp.einsum("bnp,bnq->bpq", weighted, x), jnp.einsum("bnp,bn->bp", weighted, torque)
+    filtered_columns = jax.lax.scan(advance, jnp.zeros_like(raw[0]), raw)[1] if matched else raw
+    moving = jnp.abs(filtered_columns[:, -4] * gain) > _LEAST_DIRECTION
+    weighted = filtered_columns * (rows["counts"] * moving)[:, None]
+    weighted, filtered_columns, torque = (
+        a.reshape(BLOCKS, -1, *a.shape[1:]) for a in (weighted, filtered_columns, rows["torque"])
+    )
+    return jnp.einsum("bnp,bnq->bpq", weighted, filtered_columns), jnp.einsum("bnp,bn->bp", weighted, torque)
 
 
-def _solved(information: np.ndarray, right: np.ndarray) -> np.ndarray | None:
-    """Coefficients of normal equations; None where they are not determined."""
+def _solve(information: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    """Solve normal equations; None where they are not determined."""
     size = np.sqrt(np.diag(information))
     if not (np.isfinite(size).all() and (size > 0.0).all()):
         return None
     scaled = information / np.outer(size, size)
-    scaled[-2, -2] += _HELD
+    scaled[-2, -2] += _CONSTANT_TORQUE_WEIGHT
     if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
         return None
     return np.linalg.solve(scaled, right / size) / size
@@ -114,108 +117,109 @@ class Window:
         assert experiment.transmission is not None and experiment.identifier is not None
         self._experiment = experiment
         self._period = float(experiment.run.sample_period)
-        self.samples = PARTS * max(math.ceil(seconds / self._period / PARTS), 1)
+        self.samples = BLOCKS * max(math.ceil(seconds / self._period / BLOCKS), 1)
         self._constant = constant = float(experiment.equivalent_control.time_constant)
         self._settling = math.ceil(max(SETTLING * constant, float(experiment.identifier.start)) / self._period)
         self._half = max(math.ceil(_SLOPE * constant / self._period), 2)
         self._rows: dict[str, np.ndarray] = {}
-        self._unsettled = 0
-        self._last: dict[str, Found] = {}
+        self._rows_until_settled = 0
+        self._last_estimates: dict[str, SideNumbers] = {}
 
     @property
-    def full(self) -> bool:
-        """Whether there are rows of the whole time, with those that are not counted."""
+    def is_full(self) -> bool:
+        """True if there are rows for the whole length, counted or not."""
         return bool(self._rows) and len(self._rows["twist"]) == self.samples
 
-    def add(self, rows: dict[str, np.ndarray], anew: bool) -> None:
-        """Add what :meth:`.live_chain.LiveChain.take` gave.
+    def add(self, rows: dict[str, np.ndarray], restarts: bool) -> None:
+        """Add rows from :meth:`.live_chain.LiveChain.take`.
 
         Where it began anew, samples do not count until the observers have settled, and neither do those before whose
         velocity would reach over the break.
         """
-        if anew:
-            self._unsettled = self._settling
+        if restarts:
+            self._rows_until_settled = self._settling
             if self._rows:
                 self._rows["counts"][-self._half :] = 0.0
         count = len(rows["twist"])
-        counts = (np.arange(count) >= self._unsettled).astype(float)
-        self._unsettled = max(self._unsettled - count, 0)
-        new = rows | {"counts": counts}
+        counts = (np.arange(count) >= self._rows_until_settled).astype(float)
+        self._rows_until_settled = max(self._rows_until_settled - count, 0)
+        new_rows = rows | {"counts": counts}
         if not self._rows:
-            self._rows = {name: values[:0] for name, values in new.items()}
-        self._rows = {name: np.concatenate([old, new[name]])[-self.samples :] for name, old in self._rows.items()}
+            self._rows = {name: values[:0] for name, values in new_rows.items()}
+        self._rows = {name: np.concatenate([old, new_rows[name]])[-self.samples :] for name, old in self._rows.items()}
 
-    def estimate(self) -> dict[str, Found]:
+    def estimate(self) -> dict[str, SideNumbers]:
         """Numbers of each side whose window determines them; none before the window is full."""
-        if not self.full:
+        if not self.is_full:
             return {}
         counts = self._rows["counts"].copy()
         # the filter of the regressors begins with the window; velocities at its end lack the readings after it
         counts[: max(math.ceil(SETTLING * self._constant / self._period), self._half)] = 0.0
         counts[-self._half :] = 0.0
-        found = {}
+        estimates = {}
         for side in self._experiment.sides:
             velocity = savitzky_golay_slopes(self._rows[f"{side}.position"], self._half) / self._period
             rows = {"twist": self._rows["twist"], "torque": self._rows[f"{side}.torque"], "velocity": velocity}
-            one = self._of_side(side, rows | {"counts": counts})
-            if one is not None:
-                found[side] = one
-                self._last[side] = one
-        return found
+            side_numbers = self._estimate_side(side, rows | {"counts": counts})
+            if side_numbers is not None:
+                estimates[side] = side_numbers
+                self._last_estimates[side] = side_numbers
+        return estimates
 
-    def _of_side(self, side: str, rows: dict[str, np.ndarray]) -> Found | None:
+    def _estimate_side(self, side: str, rows: dict[str, np.ndarray]) -> SideNumbers | None:
         experiment = self._experiment
         matched = experiment.identifier is not None and experiment.identifier.regressor_filter == "matched"
-        before = self._last.get(side)
-        law, zero = (experiment.transmission, 0.0) if before is None else (before.law, before.zero)
+        last = self._last_estimates.get(side)
+        law, zero = (experiment.transmission, 0.0) if last is None else (last.law, last.zero)
         assert law is not None
-        given = {name: jnp.asarray(values) for name, values in rows.items()}
-        period, gain = (jnp.asarray(one, float) for one in (self._period, experiment.drive.torque_gain(side)))
+        columns = {name: jnp.asarray(values) for name, values in rows.items()}
+        period, gain = (jnp.asarray(number, float) for number in (self._period, experiment.drive.torque_gain(side)))
         for _ in range(_ITERATIONS):
-            sums = _sums(law, experiment.equivalent_control, period, matched, gain, jnp.asarray(zero), given)
-            numbers = self._numbers(side, law, *map(np.asarray, sums))
+            sums = _sum_blocks(law, experiment.equivalent_control, period, matched, gain, jnp.asarray(zero), columns)
+            numbers = self._solve_with_errors(side, law, *map(np.asarray, sums))
             if numbers is None:
                 return None
             shift = numbers.pop("zero")
             gap = numbers.get("half_gap")
             change = max(abs(shift.value), 0.0 if gap is None else abs(gap.value - float(law.half_gap)))
-            law, zero = _at(law, numbers), zero + shift.value
+            law, zero = _place_numbers(law, numbers), zero + shift.value
             if change <= _CONVERGED * (shift.error if gap is None else max(gap.error, shift.error)):
-                return Found(numbers, law, zero)
+                return SideNumbers(numbers, law, zero)
         return None
 
-    def _numbers(
+    def _solve_with_errors(
         self, side: str, law: AbstractTransmission, information: np.ndarray, right: np.ndarray
     ) -> dict[str, Number] | None:
-        """Numbers with standard errors, and the shift of the twist's zero; None where they are not determined."""
-        whole = _solved(information.sum(axis=0), right.sum(axis=0))
-        if whole is None:
+        """Solve for the numbers with standard errors, and the shift of the twist's zero; None where not determined."""
+        all_coefficients = _solve(information.sum(axis=0), right.sum(axis=0))
+        if all_coefficients is None:
             return None
-        parts = []
-        for i in range(PARTS):
-            one = _solved(information.sum(axis=0) - information[i], right.sum(axis=0) - right[i])
-            if one is None:
+        jackknife = []
+        for i in range(BLOCKS):
+            coefficients = _solve(information.sum(axis=0) - information[i], right.sum(axis=0) - right[i])
+            if coefficients is None:
                 return None
-            parts.append(self._named(side, law, one))
-        value = self._named(side, law, whole)
-        found = {}
-        for name, own in value.items():
-            left = np.array([part[name] for part in parts])
-            error = math.sqrt((PARTS - 1) / PARTS * float(((left - left.mean()) ** 2).sum()))
-            if not (math.isfinite(own) and math.isfinite(error)):
+            jackknife.append(self._name_coefficients(side, law, coefficients))
+        values = self._name_coefficients(side, law, all_coefficients)
+        numbers = {}
+        for name, number in values.items():
+            jackknife_values = np.array([part[name] for part in jackknife])
+            error = math.sqrt((BLOCKS - 1) / BLOCKS * float(((jackknife_values - jackknife_values.mean()) ** 2).sum()))
+            if not (math.isfinite(number) and math.isfinite(error)):
                 return None
-            found[name] = Number(own, error)
-        return found if found["stiffness"].value > 0.0 else None
+            numbers[name] = Number(number, error)
+        return numbers if numbers["stiffness"].value > 0.0 else None
 
-    def _named(self, side: str, law: AbstractTransmission, theta: np.ndarray) -> dict[str, float]:
-        *own, coulomb, viscous, _, zero = (float(one) for one in theta)
-        found = {name: float(value) for name, value in law.from_theta(tuple(map(np.float64, own))).items()}  # type: ignore[arg-type]
+    def _name_coefficients(self, side: str, law: AbstractTransmission, theta: np.ndarray) -> dict[str, float]:
+        *law_coefficients, coulomb, viscous, _, zero = (float(coefficient) for coefficient in theta)
+        law_theta = tuple(map(np.float64, law_coefficients))
+        law_numbers = {name: float(value) for name, value in law.from_theta(law_theta).items()}  # type: ignore[arg-type]
         nominal = float(self._experiment.drive.viscous(side))  # type: ignore[attr-defined]
-        return found | {"coulomb": coulomb, "viscous": nominal + viscous, "zero": zero}
+        return law_numbers | {"coulomb": coulomb, "viscous": nominal + viscous, "zero": zero}
 
 
-def _at(law: AbstractTransmission, numbers: dict[str, Number]) -> AbstractTransmission:
-    """The law with numbers that were found; a negative gap is none."""
+def _place_numbers(law: AbstractTransmission, numbers: dict[str, Number]) -> AbstractTransmission:
+    """Place estimated numbers into the law; a negative gap becomes zero."""
     fields = {field.name for field in dataclasses.fields(law)}
-    values = {name: one.value for name, one in numbers.items() if name in fields}
+    values = {name: number.value for name, number in numbers.items() if name in fields}
     return dataclasses.replace(law, **{name: jnp.asarray(max(value, 0.0)) for name, value in values.items()})

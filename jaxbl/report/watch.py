@@ -11,7 +11,7 @@ import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
 from jaxbl.lines import NextStep
-from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, columns_of, counted
+from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
 
 from .figures import COLOURS, SIDE_COLOURS, SIDES, Drawn, legend, limits, outline, stacked, style
 from .page import PageTable, write_report
@@ -62,7 +62,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[Mapping[str
             with catch_write_errors(folder):
                 if out is None:
                     file = stack.enter_context((folder / VALUES).open("w", newline="", encoding="utf-8"))
-                    out = csv.DictWriter(file, columns_of(task))
+                    out = csv.DictWriter(file, watch_columns(task))
                     out.writeheader()
                 out.writerow(dict(values) | nothing)
                 file.flush()
@@ -109,7 +109,7 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _left_out(summary: Mapping[str, Any]) -> list[str]:
-    return [f"Of the stream: {counted(summary['left_out'])}."] if summary["left_out"] else []
+    return [f"Of the stream: {describe_counts(summary['left_out'])}."] if summary["left_out"] else []
 
 
 @style()

@@ -25,7 +25,7 @@ import jaxbl
 from jaxbl.cli import app, main
 from jaxbl.errors import InputError
 from jaxbl.files import read_json
-from jaxbl.monitoring.watch import Watcher, columns_of, read_watch_task, run_watch
+from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch, watch_columns
 from jaxbl.monitoring.window import Number
 
 LIMIT = 1.25 * HALF_GAP
@@ -78,7 +78,7 @@ def command(*words):
 def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
     found, heard = grown
     values = found.values
-    assert list(values.columns) == columns_of(found.task)
+    assert list(values.columns) == watch_columns(found.task)
     assert [one["t"] for one in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
     before, after = values[values["t"] <= 5.0], values[values["t"] >= 13.5]
     for part, size in ((before, HALF_GAP), (after, 2.0 * HALF_GAP)):

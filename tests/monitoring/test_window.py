@@ -57,7 +57,7 @@ def rows_of(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
 
 def window_of(rows, data=None, seconds=10.0):
     window = Window(prepared(data or axis()), seconds)
-    window.add(rows, anew=True)
+    window.add(rows, restarts=True)
     return window
 
 
@@ -117,7 +117,7 @@ def test_what_determines_nothing_gives_nothing():
     flank["motor.torque"] = late(hinge(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
     found = window_of(flank).estimate().get("motor")
     assert found is None or found.numbers["half_gap"].error > HALF_GAP
-    infinite = rows | {"motor.torque": np.full(10_000, np.inf)}
+    infinite = rows | {"motor.torque": np.is_full(10_000, np.inf)}
     assert "motor" not in window_of(infinite).estimate()
 
 
@@ -128,8 +128,8 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
         spoilt[f"{side}.torque"][12_000:12_090] += 100.0
     assert abs(window_of(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
     again = Window(prepared(axis()), 10.0)
-    again.add({name: values[:12_000] for name, values in spoilt.items()}, anew=True)
-    again.add({name: values[12_000:] for name, values in spoilt.items()}, anew=True)
+    again.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
+    again.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
     assert again.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
 
 
@@ -151,7 +151,7 @@ def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
     chain, found = LiveChain(experiment), []
     for first, end in zip([0, *ends], [*ends, count], strict=True):
         part = slice(first, end)
-        found.append(chain.take(torque[part], {side: x[part] for side, x in given.items()}, anew=first == 0))
+        found.append(chain.take(torque[part], {side: x[part] for side, x in given.items()}, restarts=first == 0))
     for name, values in whole.items():
         pieces = np.concatenate([one[name] for one in found])
         rms = float(np.sqrt(np.mean(np.asarray(values) ** 2)))
