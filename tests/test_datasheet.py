@@ -119,14 +119,14 @@ def test_without_a_terminal_what_is_missing_is_said_in_one_line(call, tmp_path):
     with pytest.raises(InputError) as error:
         call("init", "axis.toml", *WORDS[2:-4])
     assert str(error.value) == (
-        "init: these numbers are missing, here with examples: --motor-inertia '0.48 kg cm²', --backlash '3 arcmin', "
-        "--load-inertia '0.4 kg m²'; on a terminal they are asked for; another kind of drive: --kind screw, direct, linear"
+        "init: numbers are missing, here with examples: --motor-inertia '0.48 kg cm²', --backlash '3 arcmin', "
+        "--load-inertia '0.4 kg m²'; on a terminal init asks for them; another kind of drive: --kind screw, direct, linear"
     )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypatch, capsys):
-    monkeypatch.setattr(setup, "answers", lambda: True)
+    monkeypatch.setattr(setup, "can_ask_user", lambda: True)
     asked = []
     answers = iter(["light", "0.5 kg cm²", ""])
 
@@ -245,7 +245,7 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; jaxbl init"),
+        (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; see jaxbl init"),
         (
             [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
             "--gear-ratio, --mass: --kind direct has no such option; it has: --motor-inertia, --motor-viscous, ",
@@ -278,7 +278,7 @@ def test_what_no_such_drive_has_is_said_and_nothing_written(arguments, message, 
 
 
 def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
-    monkeypatch.setattr(setup, "answers", lambda: True)
+    monkeypatch.setattr(setup, "can_ask_user", lambda: True)
     examples = {item.question: item.example for item in KINDS["linear"].items}
     asked = []
     said = iter(["gearless", "Linear", "8 kg"])

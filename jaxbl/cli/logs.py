@@ -61,15 +61,15 @@ def inspect(
     guesses: list[str] = []
     steps = [] if write is None else after_proposal(log, write)
     if write is None:
-        found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
+        inspection = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
         from jaxbl.records.proposal import propose_study
 
-        given = None if table is None else table.model_dump(exclude_unset=True)
-        study, guesses, found = propose_study(log, given, gear_ratio=gear_ratio, nominal=nominal)
+        log_keys = None if table is None else table.model_dump(exclude_unset=True)
+        study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    lines = write_inspection_report(found, folder, steps)
+    lines = write_inspection_report(inspection, folder, steps)
     if write is not None:
         import tomli_w
 
@@ -274,7 +274,7 @@ def watch(
         typer.Option(metavar="RAD", help="half gap beyond which there is an alarm: rad at the motor (m on a linear axis)"),
     ] = None,
     window: Annotated[float, typer.Option(metavar="S", help="seconds that each value is from")] = 10.0,
-    every: Annotated[float, typer.Option(metavar="S", help="seconds between values")] = 1.0,
+    interval: Annotated[float, typer.Option("--every", metavar="S", help="seconds between values")] = 1.0,
     follow: Annotated[
         bool, typer.Option("--follow", help="wait for more rows at the end of a text file, until Ctrl+C")
     ] = False,
@@ -292,7 +292,7 @@ def watch(
     from jaxbl.monitoring.watch import read_watch_task
     from jaxbl.report.watch import watch_lines, write_watch_report
 
-    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, every=every, follow=follow)
+    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), None)
     if folder is None:
         result = _watch_and_print(context, task, None)

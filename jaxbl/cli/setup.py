@@ -29,14 +29,14 @@ def init(
     file: NewArgument = Path("drive.toml"),
     kind: Annotated[str | None, typer.Option(metavar="KIND", help=_KINDS_HELP, show_default=False)] = None,
     title: Annotated[str, typer.Option(metavar="TEXT", help="headline of its report")] = "",
-    **given: str | None,
+    **options: str | None,
 ) -> Outcome:
     """Write a first study from a drive's data sheet: what no option says is asked for.
 
     Numbers have units, as in the examples. A unit that is not known here is answered with those that are.
     """
     check_new(file, "init")
-    asking, answered = can_ask_user(), {name: text for name, text in given.items() if text is not None}
+    asking, answered = can_ask_user(), {name: text for name, text in options.items() if text is not None}
     name = (_ask_kind() if asking else next(iter(KINDS))) if kind is None else _check_kind(kind)
     items = KINDS[name].items
     unknown = set(answered) - {item.name for item in items}

@@ -76,7 +76,7 @@ class WatchTask:
     experiment: Experiment
     alarm_gap: float | None
     window: float
-    every: float
+    interval: float
     units: dict[str, dict[str, str]]
 
 
@@ -101,7 +101,7 @@ def watch(
     *,
     alarm_gap: float | None = None,
     window: float = 10.0,
-    every: float = 1.0,
+    interval: float = 1.0,
     follow: bool = False,
     on_values: Callable[[Values], None] | None = None,
     ended: Callable[[], bool] | None = None,
@@ -114,7 +114,7 @@ def watch(
         alarm_gap: half gap (`transmission.half_gap`, rad on the motor side; m on a linear axis) beyond which there is an
             alarm.
         window: seconds that each value is from.
-        every: seconds between values.
+        interval: seconds between values.
         follow: whether to wait for more rows at the end of a text file.
         on_values: called with each row of values as it comes.
         ended: called several times a second; a stream that is followed ends when it returns True.
@@ -122,7 +122,7 @@ def watch(
     Raises:
         InputError: unfit study, log or option, or rows that come at another period than the model's.
     """
-    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, every=every, follow=follow)
+    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
     return run_watch(task, on_values=on_values, ended=ended)
 
 
@@ -132,7 +132,7 @@ def read_watch_task(
     *,
     alarm_gap: float | None = None,
     window: float = 10.0,
-    every: float = 1.0,
+    interval: float = 1.0,
     follow: bool = False,
 ) -> WatchTask:
     """Read study and log; arguments as of :func:`watch`.
@@ -140,7 +140,7 @@ def read_watch_task(
     Raises:
         InputError: as :func:`watch`.
     """
-    for name, number in (("alarm_gap", alarm_gap), ("window", window), ("every", every)):
+    for name, number in (("alarm_gap", alarm_gap), ("window", window), ("every", interval)):
         if number is not None and not 0.0 < number < math.inf:
             raise InputError(f"{name.replace('_', '-')} is {number:g}; it should be positive")
     config, missing = read_model(model)
@@ -182,11 +182,11 @@ def read_watch_task(
             f"window is {window:g} s; with this low-pass ([equivalent_control] time_constant) and sampling period it should "
             f"be at least {shortest_window:g} s"
         )
-    if every < period:
-        raise InputError(f"every is {every:g} s; it should be at least the sampling period, {period:g} s")
+    if interval < period:
+        raise InputError(f"every is {interval:g} s; it should be at least the sampling period, {period:g} s")
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
-    return WatchTask(config, address, record, experiment, alarm_gap, window, every, _find_units(config, record))
+    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, _find_units(config, record))
 
 
 def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
@@ -317,7 +317,7 @@ class Watcher:
         self.values: list[Values] = []
         self.samples = 0
         self.start: float | None = None
-        self._due = task.every
+        self._due = task.interval
 
     def take(self, rows: Rows) -> None:
         """Take in rows, and make the values that are due within them."""
@@ -336,8 +336,8 @@ class Watcher:
             done, restarts = end, False
             now = first + (end - 1) * self._period
             if now >= self._due - 0.5 * self._period:
-                every = self._task.every
-                self._due = every * (math.floor((now + 0.5 * self._period) / every) + 1)
+                interval = self._task.interval
+                self._due = interval * (math.floor((now + 0.5 * self._period) / interval) + 1)
                 if self._window.is_full:
                     self._add_values(now)
 
@@ -404,7 +404,7 @@ def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], not
         "sample_period": float(task.experiment.run.sample_period),
         "start": (0.0 if watcher.start is None else watcher.start) + (0.0 if task.record is None else task.record.start),
         "window": task.window,
-        "every": task.every,
+        "every": task.interval,
         "alarm_gap": task.alarm_gap,
         "alarm": drop_nan(alarms[0]) if alarms else None,
         "alarms": len(alarms),

@@ -138,10 +138,10 @@ def draw_watch(found: Watch) -> list[Drawn]:
         beyond = task.alarm_gap if name == "half_gap" else None
         if beyond is not None:
             ax.axhline(beyond, color="black", ls="--", lw=1.2, label="limit")
-            _mark_alarms(ax, time, values["alarm"].to_numpy(bool), task.every)
+            _mark_alarms(ax, time, values["alarm"].to_numpy(bool), task.interval)
         # the first values of a stream may be wide
         ax.set_ylim(limits(*inner, *ends, share=0.02, shown=() if beyond is None else (beyond,)))
-    axes[0].set_xlim(time[0] - 0.5 * task.every, time[-1] + 0.5 * task.every)
+    axes[0].set_xlim(time[0] - 0.5 * task.interval, time[-1] + 0.5 * task.interval)
     legend(axes[0], 4)
     caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
     if task.alarm_gap is not None:

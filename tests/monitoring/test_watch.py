@@ -136,7 +136,7 @@ def test_friction_beyond_the_model_is_found(tmp_path):
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
     model = axis(10.0)
     model["drive"]["motor_viscous"] = 0.1
-    found = jaxbl.watch(tmp_path / "log.csv", model, window=8.0, every=2.0)
+    found = jaxbl.watch(tmp_path / "log.csv", model, window=8.0, interval=2.0)
     last = found.summary["last"]
     assert last["load.coulomb"] == pytest.approx(3.0, rel=0.05)
     assert last["motor.viscous"] == pytest.approx(0.15, rel=0.05)
@@ -381,7 +381,7 @@ def test_a_drive_by_another_simulator(tmp_path):
     log.write(tmp_path / "log.csv")
     data = axis(4.0, transmission=GAP | {"half_gap": 0.06, "stiffness": 50.0})
     data["run"]["sample_period"] = 2e-3
-    found = jaxbl.watch(tmp_path / "log.csv", data, window=3.0, every=0.5)
+    found = jaxbl.watch(tmp_path / "log.csv", data, window=3.0, interval=0.5)
     assert found.summary["determined"] == found.summary["values"] == 2
     last = found.summary["last"]
     assert last["half_gap"] == pytest.approx(GAP["half_gap"], rel=0.01)
