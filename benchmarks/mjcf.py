@@ -298,7 +298,7 @@ def main(count: int) -> None:
         model, _, said = mjcf(config)
         inputs, expected = simulated(config)
         apart = difference(played(model, inputs, config.run.sample_period), expected)
-        print(f"{name:32} {said.get(f'effects.{name}', said['transmission']).how:12} {apart:.1e}", flush=True)
+        print(f"{name:32} {said.get(f'effects.{name}', said['transmission']).fidelity:12} {apart:.1e}", flush=True)
 
 
 if __name__ == "__main__":

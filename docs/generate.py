@@ -7,9 +7,10 @@ from pydantic import BaseModel
 
 from jaxbl import config
 from jaxbl.drive.effects import EFFECTS, make_effect
-from jaxbl.drive.mujoco_parts import MujocoParts, SideParts
 from jaxbl.drive.parameters import parameters
 from jaxbl.drive.transmission import TRANSMISSIONS
+from jaxbl.exports.mujoco_parts import MujocoParts, SideParts
+from jaxbl.exports.to_mujoco import to_mujoco
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 PAGE = Path(__file__).with_name("reference.md")
@@ -56,7 +57,7 @@ def section(title: str, table: type[BaseModel]) -> str:
 
 def in_mujoco(part: Any, *side: str) -> str:
     """What a MuJoCo model has of a law or an effect."""
-    how, text = part.to_mujoco(MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4), *side)
+    how, text = to_mujoco(part, MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4), *side)
     # beyond the colon are figures, which are those of a study
     text = text if how == "not said" else text.partition(":")[0]
     return f"{how} | {text.replace('|', chr(92) + '|')}"

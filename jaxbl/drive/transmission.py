@@ -13,12 +13,10 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.registry import Registry, check_module
 
-from .mujoco_parts import MujocoParts, Said, exactly, nearly, unsaid
 from .parameters import Scalar, parameter
 
 
@@ -56,13 +54,6 @@ class AbstractTransmission(eqx.Module):
     @abc.abstractmethod
     def truth(self) -> dict[str, Scalar]:
         """Parameters of this law by name, and further numbers that are identified."""
-
-    def to_mujoco(self, parts: MujocoParts) -> Said:
-        """Add the law to the parts of a MuJoCo model, as springs between the sides, and say how well that has it.
-
-        The numbers are Python floats. A law that MuJoCo cannot say leaves no model.
-        """
-        return unsaid("its class does not say how")
 
 
 TRANSMISSIONS = Registry("jaxbl.transmissions", partial(check_module, base=AbstractTransmission))
@@ -102,29 +93,6 @@ class SigmoidBacklash(AbstractTransmission):
     def truth(self):
         return {"stiffness": self.stiffness, "dead_zone": self.dead_zone, "half_gap": self.half_gap}
 
-    def to_mujoco(self, parts):
-        # springs in parallel, each slack up to its corner: tanh by chords
-        corners, slopes, error = _chords()
-        softening = 2.0 * self.slope * self.dead_zone * self.stiffness
-        parts.spring(self.stiffness - softening * slopes[0])
-        for corner, before, after in zip(corners[1:], slopes, [*slopes[1:], 0.0], strict=True):
-            parts.spring(softening * (before - after), slack=2.0 / self.slope * corner)
-        return nearly(
-            f"{len(corners)} springs in parallel, with dead bands: the torque is at most "
-            f"{4.0 * self.dead_zone * self.stiffness * error:.2g} N m off, {error:.1g} of 4 j_0 K"
-        )
-
-
-def _chords() -> tuple[list[float], list[float], float]:
-    """tanh over x > 0 by chords: their corners and slopes, and the largest error. The last one ends at 1."""
-    fine = np.linspace(0.0, 4.0, 4001)
-    # the error of a chord goes with the second derivative and the square of its length
-    share = np.cumsum(np.sqrt(np.tanh(fine)) / np.cosh(fine))
-    corners = np.interp(np.linspace(0.0, 1.0, 25), share / share[-1], fine)
-    heights = np.append(np.tanh(corners[:-1]), 1.0)
-    error = np.max(np.abs(np.interp(fine, corners, heights) - np.tanh(fine)))
-    return corners.tolist(), (np.diff(heights) / np.diff(corners)).tolist(), float(error)
-
 
 @TRANSMISSIONS.add
 class LinearShaft(AbstractTransmission):
@@ -146,10 +114,6 @@ class LinearShaft(AbstractTransmission):
 
     def truth(self):
         return {"stiffness": self.stiffness}
-
-    def to_mujoco(self, parts):
-        parts.spring(self.stiffness)
-        return exactly("spring of a tendon between the joints")
 
 
 @TRANSMISSIONS.add
@@ -181,8 +145,3 @@ class DeadZone(AbstractTransmission):
 
     def truth(self):
         return {"stiffness": self.stiffness, "half_gap": self.half_gap}
-
-    def to_mujoco(self, parts):
-        parts.half_gap += self.half_gap
-        parts.spring(self.stiffness)
-        return exactly("spring of a tendon between the joints, slack within the gap (springlength)")

@@ -1,7 +1,7 @@
 """A MuJoCo model (MJCF) of a study's drive, with its gap and its effects, and what of the study it does not have.
 
 Two joints without a parent between them, coupled by tendons of length z = theta_e - N_0 theta_s: a tendon's spring with a
-dead band is the gear with its gap. What an effect or a law is in MuJoCo says its own class (`to_mujoco`).
+dead band is the gear with its gap. :mod:`.to_mujoco` says what an effect or a law is in MuJoCo.
 """
 
 import math
@@ -10,11 +10,13 @@ from collections.abc import Iterable
 from typing import Any
 
 from jaxbl.config import Config
-from jaxbl.drive.mujoco_parts import IMPEDANCE, RESOLVED, MujocoParts, Said, SideParts, Spring, exactly, unsaid
 from jaxbl.drive.parameters import parameters
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
+
+from .mujoco_parts import IMPEDANCE, RESOLUTION, Answer, MujocoParts, SideParts, Spring, exactly, unsaid
+from .to_mujoco import to_mujoco
 
 MUJOCO = "4.0"
 """The version for which models are written."""
@@ -26,13 +28,13 @@ _ARM = 0.06
 _COLOURS = {"motor": "0.35 0.45 0.60 1", "load": "0.75 0.55 0.30 1"}
 
 
-def by_answer(said: dict[str, Said]) -> dict[str, dict[str, str]]:
+def by_answer(said: dict[str, Answer]) -> dict[str, dict[str, str]]:
     """What the model has `exactly`, `approximated` or `not said`, by config path."""
     answers = ("exactly", "approximated", "not said")
-    return {how: {path: one.text for path, one in said.items() if one.how == how} for how in answers}
+    return {how: {path: one.text for path, one in said.items() if one.fidelity == how} for how in answers}
 
 
-def mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, float, dict[str, Said]]:
+def mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, float, dict[str, Answer]]:
     """A study's model as text, its time step in s, and how well it has each part, by config path.
 
     Args:
@@ -48,7 +50,7 @@ def mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, float, dic
             raise InputError(f"linear: the drive has no side '{side}'; it should be among {', '.join(experiment.sides)}")
     parts, said, notes = _collected(experiment, slides)
     period = float(experiment.run.sample_period)
-    steps = _whole(period / min(parts.step, parts.longest))
+    steps = _whole(period / min(parts.step, parts.longest_step))
     title = config.title or "A drive"
     return _text(title, experiment, parts, said, notes, steps), period / steps, said
 
@@ -58,27 +60,29 @@ def _whole(steps: float) -> int:
     return math.ceil(steps * (1.0 - 1e-9))
 
 
-def _collected(experiment: Experiment, slides: tuple[str, ...]) -> tuple[MujocoParts, dict[str, Said], dict[str, list[str]]]:
+def _collected(
+    experiment: Experiment, slides: tuple[str, ...]
+) -> tuple[MujocoParts, dict[str, Answer], dict[str, list[str]]]:
     """All parts of the model, how well it has each part of the study, and comments by place."""
     plant, run, drive, law = experiment.plant, experiment.run, experiment.drive, experiment.transmission
     sides = {side: SideParts(float(plant.inertia(side)), side in slides, float(drive.viscous(side))) for side in drive.sides}
     parts = MujocoParts(sides, None if law is None else float(drive.ratio("load")), float(run.sample_period))
     fastest = 0.0 if law is None else math.sqrt(float(law.stiffness) * parts.mobility)
-    parts.step /= max(run.substeps, _LEAST_STEPS, _whole(float(run.sample_period) * fastest / RESOLVED))
+    parts.step /= max(run.substeps, _LEAST_STEPS, _whole(float(run.sample_period) * fastest / RESOLUTION))
     said = {"drive": exactly("bodies, and their joints with damping")}
     notes: dict[str, list[str]] = {}
     if law is not None:
-        said["transmission"] = one = law.to_mujoco(parts)
-        if one.how == "not said":
-            raise InputError(f"transmission.law: MuJoCo cannot say '{law.name}': {one.text}; another law is needed")
-        notes["transmission"] = [_note("transmission", law, one)]
+        said["transmission"] = answer = to_mujoco(law, parts)
+        if answer.fidelity == "not said":
+            raise InputError(f"transmission.law: MuJoCo cannot say '{law.name}': {answer.text}; another law is needed")
+        notes["transmission"] = [_note("transmission", law, answer)]
     names = [effect.name for effect in experiment.effects]
     # first those that make the gap: what others are depends on it
     for i, effect in sorted(enumerate(experiment.effects), key=lambda one: float(one[1].free_play()) == 0.0):
         path, place = f"effects.{effect.name if names.count(effect.name) == 1 else i}", drive.resolve_place(effect.place)
-        said[path] = one = effect.to_mujoco(parts, place if place in sides else "motor")
-        if one.how != "not said":
-            notes.setdefault(place, []).append(_note(path, effect, one, place in slides))
+        said[path] = answer = to_mujoco(effect, parts, place if place in sides else "motor")
+        if answer.fidelity != "not said":
+            notes.setdefault(place, []).append(_note(path, effect, answer, place in slides))
     said["initial"] = exactly("the keyframe 'initial'")
     said["excitation"] = unsaid("the model has an input: set data.ctrl[0] at each sample and hold it until the next")
     if any(getattr(experiment.encoders, field.name) for field, _ in parameters(experiment.encoders)):
@@ -87,7 +91,7 @@ def _collected(experiment: Experiment, slides: tuple[str, ...]) -> tuple[MujocoP
     return parts, said, notes
 
 
-def _note(path: str, part: Any, said: Said, slides: bool = False) -> str:
+def _note(path: str, part: Any, said: Answer, slides: bool = False) -> str:
     """A comment: a part's config path, its numbers and units, and what it is in the model."""
     numbers = []
     for field, about in parameters(part):
@@ -107,7 +111,7 @@ def _text(
     title: str,
     experiment: Experiment,
     parts: MujocoParts,
-    said: dict[str, Said],
+    said: dict[str, Answer],
     notes: dict[str, list[str]],
     steps: int,
 ) -> str:
@@ -118,7 +122,7 @@ def _text(
     _comment(root, f"Units: {'; '.join(units)}; times in s. Shapes and masses of what turns are for the eye alone")
     for how, heading in (("approximated", "Approximated"), ("not said", "Not in this model")):
         for path, one in said.items():
-            if one.how == how:
+            if one.fidelity == how:
                 _comment(root, f"{heading}: {path}: {one.text}")
     ET.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     _comment(root, f"run.sample_period = {_n(experiment.run.sample_period)} s: {steps} steps")
@@ -171,11 +175,11 @@ def _side(world: ET.Element, side: str, one: SideParts, at: float, step: float) 
             eccentric, "inertial", pos="0 0 0", mass=_n(mass.torque / _GRAVITY / arm), diaginertia=_three(round_off)
         )
         ET.SubElement(eccentric, "geom", look | {"type": "sphere", "size": "0.02"})
-    for i, behind in enumerate(one.behind):
+    for i, flexible in enumerate(one.flexible_inertias):
         further = ET.SubElement(body, "body", name=_behind(side, i))
-        _inertial(further, one, behind.inertia)
+        _inertial(further, one, flexible.inertia)
         about = {"name": _behind(side, i), "type": joint["type"], "axis": joint["axis"]}
-        ET.SubElement(further, "joint", about | {"stiffness": _n(behind.stiffness), "damping": _n(behind.damping)})
+        ET.SubElement(further, "joint", about | {"stiffness": _n(flexible.stiffness), "damping": _n(flexible.damping)})
 
 
 def _inertial(body: ET.Element, one: SideParts, inertia: float) -> None:
@@ -267,8 +271,8 @@ def _keyframe(experiment: Experiment, parts: MujocoParts) -> ET.Element:
         for numbers, value in zip((positions, velocities), start, strict=True):
             numbers.append(_n(value))
         # what is behind a spring stands still: its joint's velocity is that against the side
-        positions += ["0"] * len(one.behind)
-        velocities += [_n(-getattr(experiment.initial, f"{side}_velocity"))] * len(one.behind)
+        positions += ["0"] * len(one.flexible_inertias)
+        velocities += [_n(-getattr(experiment.initial, f"{side}_velocity"))] * len(one.flexible_inertias)
     _comment(found, "initial.*: the state at t = 0")
     ET.SubElement(found, "key", name="initial", qpos=" ".join(positions), qvel=" ".join(velocities))
     return found

@@ -27,7 +27,7 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`summarise_runs`) for each of the gains
+    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`.gain_search.summarise_runs`) for each of the gains
     compared and each side, on the study's own runs (`named`) and on the held-out ones."""
 
     def __init__(self, search: GainSearch, named: list[dict[str, Any]], held_out: list[dict[str, Any]]):

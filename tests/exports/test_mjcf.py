@@ -14,11 +14,12 @@ from small_study import rigid, small
 import jaxbl
 from jaxbl.config import read_config
 from jaxbl.drive import as_arrays
-from jaxbl.drive.effects import SideEffect
-from jaxbl.drive.mujoco_parts import ActuatorParts, MujocoParts, SideParts
+from jaxbl.drive.effects import CoulombFriction, SideEffect
 from jaxbl.drive.transmission import LinearShaft, SigmoidBacklash
 from jaxbl.errors import InputError
 from jaxbl.exports.mjcf import mjcf
+from jaxbl.exports.mujoco_parts import ActuatorParts, MujocoParts, SideParts, exactly, unsaid
+from jaxbl.exports.to_mujoco import to_mujoco
 
 SHAFT = {"law": "linear_shaft", "stiffness": 1.0}
 GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
@@ -99,7 +100,7 @@ def test_accelerations_are_those_of_the_plant(case):
         off.append(np.abs((np.array(found) - expected) / (1.0 + np.abs(expected))))
     if how != "not said":
         # weak constraints take 1e-4 of what acts beside them
-        assert np.max(off) < (1e-9 if how == said["transmission"].how == "exactly" else 2e-3)
+        assert np.max(off) < (1e-9 if how == said["transmission"].fidelity == "exactly" else 2e-3)
 
 
 @pytest.mark.parametrize("kind", bench.KINDS)
@@ -112,7 +113,7 @@ def test_free_runs_over_ten_seconds(kind):
 def test_smooth_gap_by_chords_is_as_near_as_said():
     law = SigmoidBacklash(2.0, 0.03, 40.0)
     parts = MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4)
-    _, text = law.to_mujoco(parts)
+    _, text = to_mujoco(law, parts)
     z = np.linspace(-1.0, 1.0, 4001)
     springs = sum(one.linear * (z - np.clip(z, one.low, one.high)) for one in parts.springs)
     off = np.max(np.abs(springs - law.torque(jnp.asarray(z))))
@@ -202,17 +203,30 @@ def test_steps_resolve_gear_and_effects():
     assert step == 1e-3 / np.ceil(max(10.0, 1e-3 * fastest / 0.1))
     quick = {"kind": "actuator.lag", "time_constant": 5e-5}
     assert mjcf(study(quick, transmission=SHAFT))[1] == pytest.approx(5e-6)
-    assert mjcf(study(quick, quick, transmission=SHAFT))[2]["effects.1"].how == "not said"
+    assert mjcf(study(quick, quick, transmission=SHAFT))[2]["effects.1"].fidelity == "not said"
 
 
-def test_what_its_class_does_not_say(monkeypatch):
-    class Own(SideEffect):
-        """Of a package that knows nothing of MuJoCo."""
+class UnknownToMujoco(SideEffect):
+    """Of a package that knows nothing of MuJoCo."""
 
-        kind = "own"
+    kind = "unknown_to_mujoco"
 
-    assert Own(side="motor").to_mujoco(MujocoParts({}, None, 1e-4), "motor").how == "not said"
-    base = LinearShaft.__mro__[1].to_mujoco
-    monkeypatch.setattr(LinearShaft, "to_mujoco", base)
-    with pytest.raises(InputError, match=r"^transmission\.law: MuJoCo cannot say 'linear_shaft': .*; another law"):
+
+class OwnFriction(CoulombFriction):
+    """Of another package, with an answer of its own."""
+
+    kind = "own_friction"
+
+    def to_mujoco(self, parts, side):
+        parts.sides[side].dry += 2.0 * self.torque
+        return exactly(f"friction of the {side}")
+
+
+def test_classes_of_other_packages_are_asked(monkeypatch):
+    parts = MujocoParts({"motor": SideParts(1.0)}, None, 1e-4)
+    assert to_mujoco(UnknownToMujoco(side="motor"), parts, "motor").fidelity == "not said"
+    assert to_mujoco(OwnFriction(side="motor", torque=0.5), parts, "motor") == ("exactly", "friction of the motor")
+    assert parts.sides["motor"].dry == 1.0
+    monkeypatch.setattr(LinearShaft, "to_mujoco", lambda law, parts: unsaid("a secret"), raising=False)
+    with pytest.raises(InputError, match=r"^transmission\.law: MuJoCo cannot say 'linear_shaft': a secret; another law"):
         mjcf(study(transmission=SHAFT))

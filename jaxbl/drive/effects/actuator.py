@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..mujoco_parts import exactly, nearly, unsaid
 from ..parameters import Scalar, parameter
 from .base import EFFECTS, ActuatorEffect, shape, size
 
@@ -46,10 +45,6 @@ class Delay(ActuatorEffect):
         )
         return commanded[:-1], first, then, (samples - full_samples) * period
 
-    def to_mujoco(self, parts, side):
-        parts.actuator.delay += self.delay
-        return nearly(f"delay of the actuator: exact to one time step, at most {parts.step:.2g} s")
-
     @classmethod
     def find_fault(cls, numbers, period):
         limit = DELAY_SAMPLES * period
@@ -69,10 +64,6 @@ class GainError(ActuatorEffect):
     def actuate(self, state, torque, step):
         return state, (1.0 + self.relative) * torque
 
-    def to_mujoco(self, parts, side):
-        parts.actuator.scale(1.0 + self.relative)
-        return exactly("gain of the actuator")
-
 
 @EFFECTS.add
 class Saturation(ActuatorEffect):
@@ -86,10 +77,6 @@ class Saturation(ActuatorEffect):
 
     def actuate(self, state, torque, step):
         return state, jnp.clip(torque, -self.limit, self.limit)
-
-    def to_mujoco(self, parts, side):
-        parts.actuator.clip(self.limit)
-        return exactly("ctrlrange or forcerange of the actuator")
 
 
 @EFFECTS.add
@@ -116,13 +103,6 @@ class Lag(ActuatorEffect):
         # the mean over the step has the impulse of the lagged torque
         return (new,), torque + (lagged - torque) * -jnp.expm1(-ratio) / ratio
 
-    def to_mujoco(self, parts, side):
-        if parts.actuator.lag is not None:
-            return unsaid("an actuator has one lag, and there is one already")
-        parts.actuator.lag = self.time_constant
-        parts.resolve(1.0 / self.time_constant)
-        return exactly("filter of the actuator (dyntype)")
-
 
 @EFFECTS.add
 class BackEmf(ActuatorEffect):
@@ -142,8 +122,3 @@ class BackEmf(ActuatorEffect):
 
     def resist(self, state, motion):
         return self.torque_constant**2 / self.resistance * motion.velocity
-
-    def to_mujoco(self, parts, side):
-        parts.actuator.scale(self.torque_constant / self.resistance)
-        parts.sides[side].viscous += self.torque_constant**2 / self.resistance
-        return exactly("gain of the actuator, whose input is a voltage, and damping of the joint")

@@ -19,7 +19,6 @@ import numpy as np
 
 from jaxbl.registry import Registry, check_text
 
-from ..mujoco_parts import MujocoParts, Said, unsaid
 from ..parameters import Parameter, parameter, parameters
 
 Number = Any  # a float or an array: hooks are duck-typed, and neutral ones return the Python number 0.0
@@ -256,13 +255,6 @@ class AbstractEffect(eqx.Module):
         """Inertia (kg m^2) that is added to the nominal one. It is constant: one that varies needs a torque as well."""
         return 0.0
 
-    def to_mujoco(self, parts: MujocoParts, side: str) -> Said:
-        """Add to the parts of a MuJoCo model what it has of the effect, and say how well it has it.
-
-        The numbers are Python floats. `side` is where the effect acts; of one in the gear or the actuator, the motor.
-        """
-        return unsaid("its class does not say how")
-
     # class methods for a diagnosis
 
     @classmethod
@@ -354,9 +346,6 @@ class EncoderEffect(AbstractEffect):
     places: ClassVar[tuple[str, ...]] = ("encoder",)
     encoder: ClassVar[str] = "load"
     in_log: ClassVar[str] = "its readings have it already"
-
-    def to_mujoco(self, parts, side):
-        return unsaid("the sensors of a model read true positions; it changes no motion")
 
 
 class _Effects(Registry):

@@ -5,13 +5,8 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..mujoco_parts import IMPEDANCE, Bristles, exactly, nearly, unsaid
 from ..parameters import Scalar
 from .base import EFFECTS, SideEffect, held, shape, size
-
-_BRISTLES, _BEND, _SHORTER = 0.06, 0.15, 4.0
-"""Of contacts that stand for dry friction: the rate at which they swing times the time step, at most, and how far they bend
-over the way of a step at the Stribeck speed, at least; stiffer ones lag behind at high speed. Steps are so much shorter."""
 
 
 @EFFECTS.add
@@ -24,15 +19,6 @@ class CoulombFriction(SideEffect):
 
     def dry_friction(self, state, motion):
         return self.torque
-
-    def to_mujoco(self, parts, side):
-        one = parts.sides[side]
-        one.dry += self.torque
-        # within MuJoCo's law of a friction row at rest: (1 - d) of the free acceleration, against the damping 1 / step
-        creep = (1.0 - IMPEDANCE) * parts.step * self.torque / one.inertia
-        return nearly(
-            f"frictionloss of the joint: exact while it slides; where it should stick it creeps by up to {creep:.2g} rad/s"
-        )
 
 
 @EFFECTS.add
@@ -65,16 +51,6 @@ class StribeckFriction(SideEffect):
     @classmethod
     def possible(cls, numbers: Mapping[str, float]) -> bool:
         return super().possible(numbers) and numbers["breakaway_torque"] > numbers["torque"]
-
-    def to_mujoco(self, parts, side):
-        if self.torque <= 0.0:
-            return unsaid("the friction of the dcmotor (LuGre) needs a sliding torque above 0")
-        # contacts as stiff as steps allow; damped ones would need much shorter steps at high speed
-        step, level = parts.shorten(_SHORTER), self.torque
-        stiffness = min(parts.sides[side].inertia * (_BRISTLES / step) ** 2, level / (_BEND * step * self.stribeck_velocity))
-        parts.friction(side, Bristles(stiffness, 0.0, level, self.breakaway_torque, self.stribeck_velocity))
-        bend = max(self.torque, self.breakaway_torque) / stiffness
-        return nearly(f"LuGre friction of a passive dcmotor: contacts bend by up to {bend:.2g} rad before they slide")
 
 
 _LENGTHS = 0.001, 0.003, 0.01, 0.03, 0.1
@@ -137,13 +113,6 @@ class PreslidingFriction(SideEffect):
         """Friction s at a steady velocity, over F_c."""
         return 1.0 + (self.breakaway_ratio - 1.0) * jnp.exp(-((velocity / self.stribeck_velocity) ** 2))
 
-    def to_mujoco(self, parts, side):
-        if self.torque <= 0.0:
-            return unsaid("the friction of the dcmotor (LuGre) needs a sliding torque above 0")
-        stiffness, breakaway = self.torque / self.length, self.torque * self.breakaway_ratio
-        parts.friction(side, Bristles(stiffness, self.damping, self.torque, breakaway, self.stribeck_velocity))
-        return exactly("LuGre friction of a passive dcmotor, while it moves by less than the length within a time step")
-
 
 @EFFECTS.add
 class DriftingFriction(SideEffect):
@@ -177,9 +146,6 @@ class DriftingFriction(SideEffect):
         # steady friction alone, and the excess at the start
         return [{"torque": 1.0, "initial_torque": 1.0}, {"initial_torque": 1.0}]
 
-    def to_mujoco(self, parts, side):
-        return unsaid("no friction of MuJoCo changes with time; set dof_frictionloss while it runs")
-
 
 @EFFECTS.add
 class ViscousFriction(SideEffect):
@@ -192,10 +158,6 @@ class ViscousFriction(SideEffect):
 
     def resist(self, state, motion):
         return self.viscous * motion.velocity
-
-    def to_mujoco(self, parts, side):
-        parts.sides[side].viscous += self.viscous
-        return exactly("damping of the joint")
 
 
 @EFFECTS.add
@@ -215,12 +177,6 @@ class AsymmetricFriction(SideEffect):
     def resist(self, state, motion):
         return 0.5 * (self.torque_difference + self.viscous_difference * jnp.abs(motion.velocity))
 
-    def to_mujoco(self, parts, side):
-        if self.viscous_difference:
-            return unsaid("the damping of a joint is odd in the velocity; no element has a torque in proportion to |v|")
-        parts.constant(side, 0.5 * self.torque_difference)
-        return exactly("constant torque of a passive dcmotor")
-
 
 @EFFECTS.add
 class QuadraticDrag(SideEffect):
@@ -232,7 +188,3 @@ class QuadraticDrag(SideEffect):
 
     def resist(self, state, motion):
         return self.drag * motion.velocity * jnp.abs(motion.velocity)
-
-    def to_mujoco(self, parts, side):
-        parts.sides[side].drag += self.drag
-        return exactly("damping of the joint, its second coefficient")

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..mujoco_parts import exactly, nearly, unsaid
 from ..parameters import Scalar
 from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, shape, size
 
@@ -38,10 +37,6 @@ class Backlash(TransmissionEffect):
     def free_play(self):
         return self.half_gap
 
-    def to_mujoco(self, parts, side):
-        parts.half_gap += self.half_gap
-        return exactly("the springs of the gear are slack within the gap (springlength)")
-
     @classmethod
     def suits(cls, transmission):
         # the gap of a law and this one cannot be told apart
@@ -58,10 +53,6 @@ class Hardening(TransmissionEffect):
     def transmit(self, state, deflection, rate):
         return self.cubic_stiffness * deflection**3
 
-    def to_mujoco(self, parts, side):
-        parts.spring(0.0, self.cubic_stiffness)
-        return exactly("cubic stiffness of a tendon")
-
 
 @EFFECTS.add
 class Damping(TransmissionEffect):
@@ -73,14 +64,6 @@ class Damping(TransmissionEffect):
 
     def transmit(self, state, deflection, rate):
         return self.damping * rate
-
-    def to_mujoco(self, parts, side):
-        parts.damping += self.damping
-        if parts.half_gap == 0.0:
-            return exactly("damping of the tendon; with a gap its limits, which is only near")
-        return nearly(
-            "limits of the tendon that act as spring and damper: as the law, but the flanks do not pull as they part"
-        )
 
 
 @EFFECTS.add
@@ -112,11 +95,6 @@ class Hysteresis(TransmissionEffect):
     def transmit(self, state, deflection, rate):
         return self.torque * state[0]
 
-    def to_mujoco(self, parts, side):
-        return unsaid(
-            "a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off"
-        )
-
 
 @EFFECTS.add
 class Eccentricity(TransmissionEffect):
@@ -131,9 +109,6 @@ class Eccentricity(TransmissionEffect):
 
     def transmission_error(self, state, load_position):
         return self.amplitude * jnp.sin(self.harmonic * load_position + self.phase)
-
-    def to_mujoco(self, parts, side):
-        return unsaid("tendons between joints are linear in the positions")
 
 
 @EFFECTS.add
@@ -152,6 +127,3 @@ class LoadFriction(TransmissionEffect):
 
     def gear_friction(self, state, torque):
         return self.coefficient * jnp.abs(torque)
-
-    def to_mujoco(self, parts, side):
-        return unsaid("the friction of a joint does not depend on what its tendon carries")

@@ -6,7 +6,6 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ..mujoco_parts import Behind, Pendulum, exactly, unsaid
 from ..parameters import Scalar
 from .base import EFFECTS, Numbers, Scales, SideEffect, angle, frequency, harmonic, shape, size
 
@@ -21,7 +20,7 @@ _POLE_PAIRS = 1, 2, 3, 4, 5, 7
 and commutation or windings that are not sinusoidal make six."""
 
 
-_MOST_DAMPING = 0.95
+MAX_DAMPING_RATIO = 0.95
 """Damping ratio from which on an inertia behind a spring hardly swings, and its frequency says nothing."""
 
 
@@ -46,10 +45,6 @@ class ConstantTorque(SideEffect):
     def resist(self, state, motion):
         return self.torque
 
-    def to_mujoco(self, parts, side):
-        parts.constant(side, self.torque)
-        return exactly("constant torque of a passive dcmotor")
-
 
 @EFFECTS.add
 class Inertia(SideEffect):
@@ -61,9 +56,6 @@ class Inertia(SideEffect):
 
     def added_inertia(self):
         return self.inertia
-
-    def to_mujoco(self, parts, side):
-        return exactly("inertia of the body")
 
 
 @EFFECTS.add
@@ -79,17 +71,6 @@ class Gravity(SideEffect):
 
     def resist(self, state, motion):
         return self.torque * jnp.sin(motion.position - self.phase)
-
-    def to_mujoco(self, parts, side):
-        if parts.sides[side].slides:
-            parts.wave(side, self.torque, 1.0, -self.phase)
-            return exactly("cogging of a passive dcmotor, one wave")
-        one = parts.sides[side]
-        hangs = self.phase if self.torque >= 0.0 else self.phase + math.pi
-        if self.torque:
-            one.pendulums.append(Pendulum(abs(self.torque), hangs))
-            parts.resolve(math.sqrt(abs(self.torque) / one.inertia))
-        return exactly("an eccentric mass that gravity pulls down")
 
 
 @EFFECTS.add
@@ -108,9 +89,6 @@ class PeriodicDisturbance(SideEffect):
     def resist(self, state, motion):
         return self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * motion.time + self.phase)
 
-    def to_mujoco(self, parts, side):
-        return unsaid("a model has no torque of time alone; add it to data.qfrc_applied while it runs")
-
 
 @EFFECTS.add
 class Cogging(SideEffect):
@@ -124,10 +102,6 @@ class Cogging(SideEffect):
 
     def resist(self, state, motion):
         return self.amplitude * jnp.sin(self.harmonic * motion.position + self.phase)
-
-    def to_mujoco(self, parts, side):
-        parts.wave(side, self.amplitude, self.harmonic, self.phase)
-        return exactly("cogging of a passive dcmotor")
 
 
 def _multiples(log: Scales) -> list[float]:
@@ -170,12 +144,6 @@ class CoggingHarmonics(SideEffect):
             + self.cosine_3 * jnp.cos(3.0 * turn)
         )
 
-    def to_mujoco(self, parts, side):
-        waves = (self.sine, self.cosine), (self.sine_2, self.cosine_2), (self.sine_3, self.cosine_3)
-        for k, (sine, cosine) in enumerate(waves, 1):
-            parts.wave(side, math.hypot(sine, cosine), k * self.harmonic, math.atan2(cosine, sine))
-        return exactly("cogging of passive dcmotors, one a wave")
-
 
 @EFFECTS.add
 class TorqueRipple(SideEffect):
@@ -189,9 +157,6 @@ class TorqueRipple(SideEffect):
 
     def resist(self, state, motion):
         return -motion.torque * self.amplitude * jnp.sin(self.harmonic * motion.position + self.phase)
-
-    def to_mujoco(self, parts, side):
-        return unsaid("the gain of an actuator is at most affine in the position")
 
 
 @EFFECTS.add
@@ -209,14 +174,14 @@ class Flexibility(SideEffect):
     frequency: Scalar = frequency("frequency f at which it swings while the side stands still")
     # from a welded frame to a belt
     damping_ratio: Scalar = shape(
-        "", "damping ratio D", lambda log: [0.02, 0.1], default=0.02, above=0.0, maximum=_MOST_DAMPING
+        "", "damping ratio D", lambda log: [0.02, 0.1], default=0.02, above=0.0, maximum=MAX_DAMPING_RATIO
     )
 
     @property
     def _rates(self):
         """w, and D w."""
         rate = 2.0 * jnp.pi * self.frequency
-        return rate, jnp.minimum(self.damping_ratio, _MOST_DAMPING) * rate
+        return rate, jnp.minimum(self.damping_ratio, MAX_DAMPING_RATIO) * rate
 
     def init(self):
         # twist of the spring, rad, and velocity of the inertia, rad/s
@@ -245,12 +210,3 @@ class Flexibility(SideEffect):
         twist, velocity = state
         rate, decay = self._rates
         return -self.inertia * (rate**2 * twist + 2.0 * decay * (velocity - motion.velocity))
-
-    def to_mujoco(self, parts, side):
-        rate, decay = float(2.0 * np.pi * self.frequency), float(min(self.damping_ratio, _MOST_DAMPING))
-        if self.inertia:
-            swing = rate * math.sqrt(1.0 + self.inertia / parts.sides[side].inertia)
-            stiffness, damping = self.inertia * rate**2, 2.0 * decay * rate * self.inertia
-            parts.sides[side].behind.append(Behind(self.inertia, stiffness, damping))
-            parts.resolve(swing)
-        return exactly("a further body on the side, its joint with stiffness and damping")

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from ..mujoco_parts import exactly, unsaid
 from ..parameters import Scalar, option
 from .base import EFFECTS, Number, SideEffect, table
 
@@ -30,15 +29,6 @@ class Tabulated(SideEffect):
             position = position - 2.0 * jnp.pi * jnp.floor(position / (2.0 * jnp.pi))
         position_torque = _interpolate(position, self.positions, self.position_torques)
         return position_torque + _interpolate(motion.velocity, self.speeds, self.speed_torques)
-
-    def to_mujoco(self, parts, side):
-        if self.speeds:
-            return unsaid("the damping of a joint is a cubic in the velocity, no table")
-        if self.positions and self.turn:
-            return unsaid("springs know no turns: a table within a turn does not repeat")
-        if self.positions:
-            parts.piecewise(side, self.positions, self.position_torques)
-        return exactly("springs of the joint, slack up to the points of a table over position; one over speed is not said")
 
     @classmethod
     def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
