@@ -27,8 +27,13 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`.gain_search.summarise_runs`) for each of the gains
-    compared and each side, on the study's own runs (`named`) and on the held-out ones."""
+    """Plain data of a finished search, as in `tuning.json`.
+
+    Args:
+        search: the finished search.
+        named: comparison of the named gains on the study's own runs: rows of :func:`.gain_search.summarise_runs`.
+        held_out: the same on the held-out runs.
+    """
 
     def __init__(self, search: GainSearch, named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
