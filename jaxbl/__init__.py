@@ -1,4 +1,4 @@
-"""Drives with backlash, thousands at once: observation, gain maps, identification.
+"""Motor drives with gear backlash, simulated by the thousand: observers, gain maps, identification, diagnosis.
 
 The public names are loaded on first use, so that `import jaxbl` and the command line's help do not wait for JAX.
 """

@@ -45,8 +45,8 @@ class SweepTable(Table):
     )
     refine_metric: str | None = Field(
         default=None,
-        description="metric in which neighbours are compared; left out: converged, of observers whose gains are refined, "
-        "else of all",
+        description="metric that decides where to refine; left out: converged, of the observer whose gains vary, otherwise "
+        "of both",
     )
     refine_tolerance: float | None = Field(
         default=None,
