@@ -88,6 +88,8 @@ def run(script: str, *arguments: str, folder: Path, path: Sequence[Path], cache:
         # one device and one thread a process: as many processes as cores
         "XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_multi_thread_eigen=false",
         "COLUMNS": "80",
+        # messages name the command as a shell finds it
+        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
     }
     with folder.with_name(f"{folder.name}.log").open("w") as log:
         command = [sys.executable, "-P", str(SCRIPTS / script), *arguments]

@@ -100,7 +100,7 @@ def compare_values(base: Any, tree: Any, tolerance: float, path: str = "") -> It
             if key not in tree:
                 yield _Place(inner, "key is gone")
             elif key not in base:
-                yield _Place(inner, "key is new")
+                yield _Place(inner, f"key is new ({tree[key]!r})")
             elif key not in MEASURED:
                 yield from compare_values(base[key], tree[key], tolerance, inner)
     elif isinstance(base, list) and isinstance(tree, list):
@@ -109,7 +109,7 @@ def compare_values(base: Any, tree: Any, tolerance: float, path: str = "") -> It
             yield _Place(path, f"{len(base)} elements -> {len(tree)}", is_sentence=sentences)
         for base_element, tree_element in zip(base, tree, strict=False):
             yield from compare_values(base_element, tree_element, tolerance, f"{path}[]")
-    elif is_number(base) and is_number(tree):
+    elif is_number(base) and is_number(tree) and not (isinstance(base, int) and isinstance(tree, int)):
         relative = relative_difference(base, tree)
         if relative > tolerance:
             yield _Place(path, f"{base!r} -> {tree!r}", relative)

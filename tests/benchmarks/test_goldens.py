@@ -37,7 +37,7 @@ def test_equal_results_do_not_differ(compare):
 @pytest.mark.parametrize(
     ("change", "place", "what"),
     [
-        ({"findings": []}, "findings", "key is new"),
+        ({"findings": []}, "findings", "key is new ([])"),
         ({"verdict": "unknown_effect"}, "verdict", "'explained' -> 'unknown_effect'"),
         ({"unit": "N m"}, "unit", "'N m s/rad' -> 'N m'"),
         ({"numbers": [1.0, 2.0]}, "numbers", "3 elements -> 2"),
