@@ -111,7 +111,7 @@ def proper(n, lipschitz, h):
 
     def step(z, y):
         new, estimate = observer.step(ObserverState(z[0], z[1], tuple(z[2:])), y, free, jnp.asarray(h))
-        return jnp.stack([new.position, new.velocity, *new.extra_states]), jnp.stack([estimate.position, estimate.velocity])
+        return jnp.stack([new.position, new.velocity, *new.further]), jnp.stack([estimate.position, estimate.velocity])
 
     return step
 
@@ -195,7 +195,7 @@ def searched(kind, gains, noise, most=1_200_000):
         return np.concatenate([spaced, np.clip(NEAR[:, None] - states[:, 0], -noise, noise)])
 
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
-    further = len(observer.start(zero, zero, free, jnp.ones(())).extra_states)
+    further = len(observer.start(zero, zero, free, jnp.ones(())).further)
     return explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * further]), most).worst
 
 

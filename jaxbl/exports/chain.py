@@ -24,18 +24,18 @@ class _ChainState(NamedTuple):
     Attributes:
         observer, equivalent_control, identifier: as in :class:`jaxbl.simulate.State`.
         samples: index of the sample; it stays at the largest integer once it has reached it.
-        samples_uncompensated: samples since the identifier's sums were compensated last.
+        unsettled: samples since the identifier's sums were compensated last.
     """
 
     observer: Any
     equivalent_control: Any
     identifier: Any
     samples: Any
-    samples_uncompensated: Any
+    unsettled: Any
 
 
-def _make_chain_state(state: State, samples: Any, samples_uncompensated: Any) -> _ChainState:
-    return _ChainState(state.observer, state.equivalent_control, state.identifier, samples, samples_uncompensated)
+def _make_chain_state(state: State, samples: Any, unsettled: Any) -> _ChainState:
+    return _ChainState(state.observer, state.equivalent_control, state.identifier, samples, unsettled)
 
 
 def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
@@ -86,12 +86,10 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
             }
         out |= _identified_outputs(lane, new)
         # sums lose nothing over some hundred samples
-        full = state.samples_uncompensated >= LONGEST_BLOCK - 1
+        full = state.unsettled >= LONGEST_BLOCK - 1
         compensated = jax.lax.cond(full, lambda state: end_block(lane, (state, ()))[0], lambda state: state, new)
         samples = jnp.minimum(state.samples, LAST_SAMPLE - 1) + 1
-        return _make_chain_state(
-            compensated, samples, jnp.where(full, 0, state.samples_uncompensated + 1).astype(jnp.int32)
-        ), out
+        return _make_chain_state(compensated, samples, jnp.where(full, 0, state.unsettled + 1).astype(jnp.int32)), out
 
     return trace_block(name, dtype, study_numbers, positions, [torque, *positions], start, sample)
 

@@ -59,7 +59,7 @@ def _stepped(observer: AbstractObserver, states: Any, noise: Any) -> Any:
     free, one = (lambda velocity: 0.0 * velocity), jnp.ones(())
     before = ObserverState(-states[0], -states[1], tuple(-x for x in states[2:]))
     new, estimate = observer.step(before, noise, free, one)
-    return -jnp.stack([new.position, new.velocity, *new.extra_states]), jnp.abs(estimate.velocity)
+    return -jnp.stack([new.position, new.velocity, *new.further]), jnp.abs(estimate.velocity)
 
 
 def step_of(observer: AbstractObserver) -> Step:

@@ -25,12 +25,12 @@ class ObserverState(NamedTuple):
 
     Attributes:
         position, velocity: prediction for the next sample, rad and rad/s.
-        extra_states: further numbers that the observer carries.
+        further: more numbers that the observer carries.
     """
 
     position: Scalar
     velocity: Scalar
-    extra_states: tuple[Scalar, ...] = ()
+    further: tuple[Scalar, ...] = ()
 
 
 class Estimate(NamedTuple):

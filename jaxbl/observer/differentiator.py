@@ -156,7 +156,7 @@ class AbstractDifferentiator(AbstractObserver):
         # h^j times the correction of state j
         corrections = [k * rhos[n + 1 - j] * signed for j, k in enumerate(coefficients[:n], 1)] + [sliding]
         weights = _correction_weights(n)
-        states = [state.position, state.velocity, *state.extra_states]
+        states = [state.position, state.velocity, *state.further]
         position, velocity, *disturbance = [
             x + sum(weights[i][j] * corrections[j] for j in range(i, n + 1)) / periods[i] for i, x in enumerate(states)
         ]

@@ -45,7 +45,7 @@ class AbstractLinearObserver(AbstractObserver):
         return ObserverState(position, velocity, (jnp.zeros_like(jnp.asarray(position + velocity)), *shares))
 
     def step(self, state, measured, acceleration, period):
-        disturbance, *shares = state.extra_states
+        disturbance, *shares = state.further
         share = Correction(*shares)
         innovation = measured - state.position
         position = state.position + share.position * innovation
@@ -258,7 +258,7 @@ class DirtyDerivative(AbstractObserver):
         return ObserverState(position, velocity, (position - period * velocity, velocity + zero, zero, zero, zero, zero))
 
     def step(self, state, measured, acceleration, period):
-        old_position, old_velocity, older_input, old_input, filtered_input, disturbance = state.extra_states
+        old_position, old_velocity, older_input, old_input, filtered_input, disturbance = state.further
         share = period / (self.time_constant + period)
         velocity = old_velocity + share * ((measured - old_position) / period - old_velocity)
         # the second difference spans two periods: the input's acceleration is the mean over both, behind the low-pass

@@ -54,13 +54,13 @@ class IdentifierState(NamedTuple):
     Attributes:
         regressors: filtered regressors, n numbers.
         information: upper triangle of the information matrix, n (n + 1) / 2 sums.
-        moments: n sums for each side.
+        right: n sums for each side.
         weight: the part of settled totals that forgetting has left.
     """
 
     regressors: tuple[Number, ...]
     information: tuple[RunningSum, ...]
-    moments: dict[str, tuple[RunningSum, ...]]
+    right: dict[str, tuple[RunningSum, ...]]
     weight: Number
 
 
@@ -80,7 +80,7 @@ class Identifier(eqx.Module):
         return IdentifierState(
             regressors=(zero,) * n,
             information=(empty,) * (n * (n + 1) // 2),
-            moments=dict.fromkeys(sides, (empty,) * n),
+            right=dict.fromkeys(sides, (empty,) * n),
             weight=jnp.ones_like(zero),
         )
 
@@ -120,7 +120,7 @@ class Identifier(eqx.Module):
         )
         moments = {
             side: tuple(total.add(self.forgetting, p * torque[side]) for total, p in zip(totals, weighted, strict=True))
-            for side, totals in state.moments.items()
+            for side, totals in state.right.items()
         }
         return IdentifierState(filtered, information, moments, self.forgetting * state.weight)
 
@@ -128,7 +128,7 @@ class Identifier(eqx.Module):
         """Settle all sums, so that further samples lose no digits; :func:`jaxbl.simulate.scan` does so block by block."""
         information, moments = jax.tree.map(
             lambda total: total.settle(state.weight),
-            (state.information, state.moments),
+            (state.information, state.right),
             is_leaf=lambda node: isinstance(node, RunningSum),
         )
         return IdentifierState(state.regressors, information, moments, weight=jnp.ones_like(state.weight))
@@ -147,7 +147,7 @@ class Identifier(eqx.Module):
         """Return for each side if the excitation determines the coefficients theta, and theta, which is always finite."""
         information = _sum_values(state, state.information)
         return {
-            side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.moments.items()
+            side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.right.items()
         }
 
     def excitation(self, state: IdentifierState) -> Number:

@@ -32,7 +32,7 @@ def noises(states):
 def searched(kind, gains, most=50_000):
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
     rest = observer.start(zero, zero, lambda v: v, jnp.ones(()))
-    return observer, rest, explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.extra_states)]), most)
+    return observer, rest, explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.further)]), most)
 
 
 def errors_of(observer, rest, noise, push):

@@ -32,7 +32,7 @@ def observe(observer, measured, h, acceleration=free, velocity=0.0, further=None
     dtype = measured.dtype
     start = observer.start(measured[0], jnp.asarray(velocity, dtype), acceleration, jnp.asarray(h, dtype))
     if further is not None:
-        start = start._replace(extra_states=tuple(jnp.asarray(x, dtype) for x in further))
+        start = start._replace(further=tuple(jnp.asarray(x, dtype) for x in further))
     return jax.lax.scan(step, start, measured)[1]
 
 
@@ -176,7 +176,7 @@ def test_any_start_leads_into_the_sliding_set(order):
         # the error is observed: true states zero, but for what the highest derivative does over the period
         new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
         position, velocity, *further = (
-            x - p * top for x, p in zip([new.position, new.velocity, *new.extra_states], push, strict=True)
+            x - p * top for x, p in zip([new.position, new.velocity, *new.further], push, strict=True)
         )
         return ObserverState(position, velocity, tuple(further)), estimate.position
 
@@ -245,7 +245,7 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     if n >= 2:
         estimates.append(estimate.control)
     # further states are predicted for the coming sample, a period that is short beside their own time
-    estimates += [np.roll(x, 1, axis=1) for x in state.extra_states[1:]]
+    estimates += [np.roll(x, 1, axis=1) for x in state.further[1:]]
     late = slice(-20_000, None)
     errors = [np.abs(x - y)[:, late].max(axis=1) for x, y in zip(estimates, true, strict=False)]
     slopes = [np.polyfit(np.log(sizes), np.log(column), 1)[0] for column in errors]
