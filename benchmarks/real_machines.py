@@ -73,15 +73,15 @@ def _lost_motion(case: Case, log: Path) -> str:
     """What `jaxbl inspect` says of the gap of a recording that cannot be diagnosed."""
     from jaxbl.records import inspect
 
-    gearing = inspect(log, case.study["log"]).record.findings.gearing
-    return "" if gearing is None else f"; lost motion by inspect: {gearing.lost_motion_text('rad')}"
+    gearing = inspect(log, case.study["log"]).record.statistics.gearing
+    return "" if gearing is None else f"; lost motion by inspect: {gearing.describe_lost_motion('rad')}"
 
 
 def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
     """Add the torque errors of all tools behind one low-pass."""
     sides = ("motor", "load") if task.config.drive.kind == "two_inertia" else ("motor",)
     fitted, held = (parts_of(one, sides, case.cutoff) for one in (task.record, task.holdout))
-    linear = task.record.findings.channels["theta_e"].unit == "m"
+    linear = task.record.statistics.channels["theta_e"].unit == "m"
     row.unit = "N" if linear else "N m"
     row.driving = driving(held, float(task.config.drive.motor_inertia))
     errors = {"nominal": torque_error(task.config, task.holdout, held)}

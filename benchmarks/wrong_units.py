@@ -82,7 +82,7 @@ def recording(name: str, data: Path, folder: Path) -> MeasuredLog:
     frame = pd.DataFrame({"t": record.time, "u": record.torque, "theta_e": record.positions["motor"]})
     if config.drive.kind == "two_inertia":
         frame["theta_s"] = record.positions["load"]
-    linear = record.findings.channels["theta_e"].unit == "m"
+    linear = record.statistics.channels["theta_e"].unit == "m"
     log = {"closed_loop": True} | ({"theta_e": {"unit": "m"}} if linear else {})
     return MeasuredLog(frame, dict(case.study) | {"log": log}, linear)
 

@@ -78,7 +78,7 @@ def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
 
 def _speed_noise(record: Record, cutoff: float) -> float:
     """Standard deviation of the motor's speed behind an ideal low-pass, by the noise of the readings and their steps."""
-    about, h = record.findings.channels["theta_e"], record.sample_period
+    about, h = record.statistics.channels["theta_e"], record.sample_period
     noise = np.hypot(about.noise, about.resolution / np.sqrt(12.0))
     return float(2.0 * np.pi * noise * np.sqrt(2.0 * h * min(cutoff, 0.5 / h) ** 3 / 3.0))
 

@@ -49,9 +49,9 @@ class RecordedTable(Table):
         """Times, s, and torques, N m, shape (rows,). Raises `InputError`."""
         path = Path(self.file)
         file = read_log_file(path, (self.time_column, self.torque_column))
-        times = file.numbers(self.time_column)
-        file.check_length(file.name(self.torque_column), len(times))
-        torques = file.numbers(self.torque_column)
+        times = file.load_numbers(self.time_column)
+        file.check_length(file.find_column(self.torque_column), len(times))
+        torques = file.load_numbers(self.torque_column)
         if (np.diff(times) <= 0.0).any():
             row = int(np.argmax(np.diff(times) <= 0.0)) + 2
             raise InputError(f"{path}: column '{self.time_column}', data row {row}: times should increase")

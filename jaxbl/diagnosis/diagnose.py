@@ -361,7 +361,7 @@ def _check_shown(setup: Setup, shown: float) -> None:
         return
     record = setup.task.record
     noise = ", ".join(
-        f"{value:.2g} {record.findings.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
+        f"{value:.2g} {record.statistics.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
         for side, value in setup.fitted.noise.items()
     )
     least = SIGNIFICANT / max(shown, 1e-12)

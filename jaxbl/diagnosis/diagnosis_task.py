@@ -111,8 +111,8 @@ def _check_machine(record: Record, other: Record) -> None:
             f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
             f"[log] resample = {record.sample_period:.6g} reads both alike"
         )
-    gears = record.findings.gearing, other.findings.gearing
-    if gears[0] is not None and gears[1] is not None and not (gears[0].wide or gears[1].wide):
+    gears = record.statistics.gearing, other.statistics.gearing
+    if gears[0] is not None and gears[1] is not None and not (gears[0].is_loose or gears[1].is_loose):
         ratios = gears[0].ratio, gears[1].ratio
         clear = all(one.residual < 0.1 for one in gears if one is not None)
         if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
@@ -121,7 +121,7 @@ def _check_machine(record: Record, other: Record) -> None:
                 "is of another machine, or a sign or unit differs"
             )
     inertias = []
-    for one in (record.findings.dynamics, other.findings.dynamics):
+    for one in (record.statistics.dynamics, other.statistics.dynamics):
         if one is not None and one.shares[0] > 0.1 and 10.0 * one.errors[0] * one.inflation[0] < abs(one.values[0]):
             inertias.append(float(one.values[0]))
     if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:

@@ -218,7 +218,7 @@ def _summary(
 ) -> dict[str, Any]:
     """As `diagnosis.json`."""
     record, model = task.record, search.model
-    noise, unit = reading_noise(model.segments)["motor"], record.findings.channels[POSITION_CHANNELS["motor"]].unit
+    noise, unit = reading_noise(model.segments)["motor"], record.statistics.channels[POSITION_CHANNELS["motor"]].unit
     deviation = {one.path: alone.found.spread.covariance[i, i] ** 0.5 for i, one in enumerate(alone.found.free)}
     values = {one.path: (one, alone.values[one.path], deviation.get(one.path)) for one in model.free}
     holdout = alone_on_holdout(task.config, task.holdout, alone, search.none)["position"]["motor"]

@@ -100,7 +100,7 @@ def set_up(task: DiagnosisTask) -> Setup:
     if noise.unfelt > 0.0:
         segments, held = (_quiet(some, noise.unfelt) for some in (recorded, held))
     lacking = residual_torques(nominal, segments)
-    sliding = [side for side in nominal.sides if record.findings.channels[POSITION_CHANNELS[side]].unit == "m"]
+    sliding = [side for side in nominal.sides if record.statistics.channels[POSITION_CHANNELS[side]].unit == "m"]
     coordinates = all_coordinates(nominal, segments, lacking, sliding)
     located = localise(nominal, lacking, segments, coordinates)
     bandwidth = {name: one.bandwidth for name, one in located.items()}

@@ -44,7 +44,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.findings.channels[POSITION_CHANNELS[side]].unit
+        unit = record.statistics.channels[POSITION_CHANNELS[side]].unit
         position[side] = {"rms": after, "nominal_rms": before, "noise": noise[side], "unit": unit}
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
@@ -151,7 +151,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         side: {
             "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
             "noise": noise[side],
-            "unit": record.findings.channels[POSITION_CHANNELS[side]].unit,
+            "unit": record.statistics.channels[POSITION_CHANNELS[side]].unit,
         }
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }

@@ -18,7 +18,7 @@ from jaxbl.drive.effects import EFFECTS, EncoderEffect
 from jaxbl.drive.excitation import Sine
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
+from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
 from jaxbl.simulate import Experiment
 
 from .free_parameters import PLANT_TABLES, is_positive
@@ -115,7 +115,7 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
             records[i] = dataclasses.replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
     others = [_from_zero_of(first, one, config) for one in others]
-    return join([first, *others] if like is None else others)
+    return join_records([first, *others] if like is None else others)
 
 
 def _alike(one: float, other: float) -> bool:
@@ -155,7 +155,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     table, geared = config.log, config.drive.kind == "two_inertia"
     two = geared and all("load" in one.positions for one in (first, record))
     given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
-    if given or "motor" not in record.positions or record.findings.channels["theta_e"].unit != "rad":
+    if given or "motor" not in record.positions or record.statistics.channels["theta_e"].unit != "rad":
         return record
     ratio = config.drive.gear_ratio if geared else 1.0
     motions = []
@@ -163,7 +163,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
         assert one.torque is not None
         load = ratio * one.positions["load"] if two else None
         motions.append(TurningLog(one.torque, one.positions["motor"], load, one.segments, one.sample_period))
-    found = turned(*motions)
+    found = find_zero_shift(*motions)
     if found is None:
         return record
     waves = ", ".join(map(str, found.waves))
@@ -184,7 +184,7 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     table = config.log
     for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
         # a speed in place of a position has no key for some of them, and then no need
-        name, channel = table.position(position)
+        name, channel = table.position_source(position)
         if key in given and (key != "offset" or name == position) and key in type(channel).model_fields:
             table = table.model_copy(update={name: channel.model_copy(update={key: given[key]})})
     return config.model_copy(update={"log": table})

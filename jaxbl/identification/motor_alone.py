@@ -259,7 +259,7 @@ def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.n
     given = np.zeros(len(model.free)) if nominal is None else nominal
     sizes = [float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (given, alone.point.theta)]
     noise = reading_noise(segments)["motor"]
-    unit = record.findings.channels[POSITION_CHANNELS["motor"]].unit
+    unit = record.statistics.channels[POSITION_CHANNELS["motor"]].unit
     position = {"rms": sizes[1], "nominal_rms": sizes[0], "noise": noise, "unit": unit}
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

@@ -196,7 +196,7 @@ def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, st
         if record is not None:
             units_by_side[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
         else:
-            is_linear = config.log.position(channel)[1].si_unit == "m"
+            is_linear = config.log.position_source(channel)[1].si_unit == "m"
             units_by_side[side] = {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
     # gap and stiffness are those of the motor's side
     return {
@@ -323,7 +323,7 @@ class Watcher:
         """Take in rows, and make the values that are due within them."""
         if self.start is None:
             self.start = rows.time
-        first, restarts, count = rows.time - self.start, rows.anew, len(rows.torque)
+        first, restarts, count = rows.time - self.start, rows.starts_segment, len(rows.torque)
         done = 0
         while done < count:
             # the row at which values are due, those of a gap in time once; half a period of slack: times are rounded

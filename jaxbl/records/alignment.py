@@ -62,13 +62,13 @@ class Skew:
         value: s, less the wind-up by the torque in the shaft.
         error: standard error, s.
         windup: what friction can make of it at most, s: all of the work that the motor does, done against the load's.
-        sure: whether it is a clock.
+        is_sure: whether it is a clock.
     """
 
     value: float
     error: float
     max_windup_delay: float
-    sure: bool
+    is_sure: bool
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,14 @@ class Offset:
     Attributes:
         value: rad (m).
         error: standard error, with what a constant torque can make of it.
-        both: whether the load presses on both flanks.
-        sure: whether it is a zero point.
+        both_flanks: whether the load presses on both flanks.
+        is_sure: whether it is a zero point.
     """
 
     value: float
     error: float
-    both: bool
-    sure: bool
+    both_flanks: bool
+    is_sure: bool
 
 
 def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
@@ -183,7 +183,7 @@ class _Regression(NamedTuple):
 def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regression | None:
     """With theta_s moved by a skew (s); None where the motion is too small."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, slope=True)
+    width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, differentiate=True)
     segments = [s for s in grid.segments if s.stop - s.start >= MIN_SAMPLES]
     if not width or not segments or "u" not in grid.values:
         return None

@@ -54,7 +54,7 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
             found[name] = _read_position(file, name, position, stamps)
     if not found:
         columns = ", ".join(map(str, file.columns))
-        raise file.wrong(
+        raise file.error(
             f"no column 'theta_e' or 'theta_s'; columns: {columns}; [log] theta_e can name the motor position, "
             "omega_e its speed"
         )
@@ -75,13 +75,13 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
     if name == "u":
         names = list(file.columns)
         hint = "the file has no header" if all(isinstance(n, int) for n in names) else suggest_word("u", map(str, names))
-        raise file.wrong(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
+        raise file.error(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
     given = (table.t, table.u, table.theta_e, table.theta_s, table.omega_e, table.omega_s)
     used = {t.column for t in given if t is not None}
     for other in file.columns:
         near = isinstance(other, str) and other.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if near and other not in used:
-            raise file.wrong(f"no column '{name}', but '{other}'; [log] {name} = \"{other}\" would read it")
+            raise file.error(f"no column '{name}', but '{other}'; [log] {name} = \"{other}\" would read it")
     if table.kind == "drive":
         file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
     return False
@@ -89,14 +89,14 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
 
 def _read_numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
     """Numbers of a column at the rows that are read, unsigned words made signed."""
-    file.check_length(file.name(column, f"{name}.column"), stamps.total)
-    values = file.numbers(column, f"{name}.column")
+    file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
+    values = file.load_numbers(column, f"{name}.column")
     if bits is not None:
         words = to_signed(values, bits)
         outside = np.isnan(words)
         if outside.any():
             row = int(np.argmax(outside))
-            raise file.wrong(
+            raise file.error(
                 f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
                 f"{name}.signed_bits"
             )
@@ -137,7 +137,7 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     if table.minus is not None:
         values = values - _read_numbers(file, name, table.minus, table.signed_bits, stamps)
     if np.ptp(values) == 0.0:
-        raise file.wrong(
+        raise file.error(
             f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
         )
     if table.wrap is None:
@@ -147,7 +147,7 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     _check_unit(file, name, table, values)
     values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
-        raise file.wrong(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
+        raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
 
 
@@ -157,7 +157,7 @@ def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeSt
     column = table.column_or(channel)
     values = _read_numbers(file, channel, column, table.signed_bits, stamps)
     if np.ptp(values) == 0.0:
-        raise file.wrong(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
+        raise file.error(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
     step = find_resolution(values)
     speed = to_si(table, values)
     position = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(stamps.times))])
@@ -173,7 +173,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     column = table.column_or(name)
     values = _read_numbers(file, name, column, table.signed_bits, stamps)
     if linear and table.unit == "N m":
-        raise file.wrong(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
+        raise file.error(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
     if table.signed_bits is None:
         _check_unsigned(file, name, column, values)
     if name == "u" and np.ptp(values) == 0.0:
@@ -183,14 +183,14 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
         # the margins are for the rounding of decimal numbers
         if np.abs(values).max() > table.saturation * (1.0 + 1e-9):
             row = int(np.argmax(np.abs(values)))
-            raise file.wrong(
+            raise file.error(
                 f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
                 f"{table.saturation:g}; saturation should be the largest value that there can be"
             )
         saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
     values = to_si(table, values)
     if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
-        raise file.wrong(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
+        raise file.error(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if linear else "N m", saturated, table.skew, held=name == "u")
 
 
@@ -200,7 +200,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
 def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
     assert table.wrap is not None
     if np.ptp(values) > 1.001 * table.wrap:
-        raise file.wrong(
+        raise file.error(
             f"column {table.column_or(name)!r} ranges over {np.ptp(values):g}, more than [log] {name}.wrap = "
             f"{table.wrap:g}; wrap should be the period after which it starts again"
         )
@@ -224,7 +224,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarr
     # without its jump by a period the motion goes on as before
     around = [p for p in periods if p >= span * 0.999 and (np.abs(size[at] - p) <= 3.0 * usual + 1e-9 * p).all()]
     if around and usual < 0.05 * around[0]:
-        raise file.wrong(
+        raise file.error(
             f"column {table.column_or(name)!r} ({name}) jumps by about {around[0]:.10g} at {len(at)} rows (data row "
             f"{stamps.rows[at[0] + 1] + 1} first) and goes on from there: it wraps around; set wrap = {around[0]:.10g} in "
             f"[log] {name}"
@@ -242,7 +242,7 @@ def _check_unsigned(file: LogFile, name: str, column: str | int, values: np.ndar
         top = 2.0**bits
         empty = not ((values > 0.375 * top) & (values < 0.625 * top)).any()
         if 0.625 * top <= values.max() < top and empty and (values <= 0.375 * top).any():
-            raise file.wrong(
+            raise file.error(
                 f"column {column!r} ({name}) holds whole numbers up to {values.max():.0f} and none about "
                 f"{0.5 * top:.0f}: signed words of {bits} bits, logged as unsigned; "
                 f"set signed_bits = {bits} in [log] {name}"
@@ -259,12 +259,12 @@ def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarr
     other = "deg" if table.unit == "rad" else "rad"
     long = {"rad": "radians", "deg": "degrees"}
     if _is_encoder_count(turns[other] / step) and not _is_encoder_count(turns[table.unit] / step):
-        raise file.wrong(
+        raise file.error(
             f"{column} has steps of {step:.6g}, a turn of {round(turns[other] / step)} counts in {long[other]}: it is not "
             f'in {long[table.unit]}; set unit = "{other}" in [log] {name}'
         )
     if table.unit == "rad" and math.isclose(step, 1.0, rel_tol=1e-9) and len(np.unique(values)) > 16:
-        raise file.wrong(
+        raise file.error(
             f'{column} holds whole numbers only: counts, not radians; set unit = "counts" and counts_per_turn in [log] '
             + name
         )

@@ -210,7 +210,7 @@ def _average_samples(
     position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
 ) -> tuple[np.ndarray, np.ndarray, list[slice], float, float]:
     """Of neighbouring samples of a long log, as arguments of :func:`_prepare_rig`."""
-    width = find_bandwidth(position[longest_segment(segments)], period, slope=True) or 1.0 / (len(position) * period)
+    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MOST), int(1.0 / (_PER_PERIOD * width * period)))
     if count < 2:
         return position, torque, list(segments), period, noise
@@ -230,7 +230,7 @@ def _average_samples(
 def _prepare_rig(
     position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
 ) -> _Rig | None:
-    width = find_bandwidth(position[longest_segment(segments)], period, slope=True)
+    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
     smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
     stretches: list[slice] = []
     begins: list[bool] = []

@@ -89,11 +89,11 @@ class LogFile:
         self.corrections: dict[str, float] = {}
         self.contradiction = ""
 
-    def wrong(self, text: str) -> InputError:
+    def error(self, text: str) -> InputError:
         """What to raise where something is wrong with the file."""
         return InputError(f"{self.path}: {text}")
 
-    def name(self, column: str | int, channel: str = "") -> str | int:
+    def find_column(self, column: str | int, channel: str = "") -> str | int:
         """The name of a column that is given by name or number; InputError names the nearest where there is none."""
         if column in self.columns:
             return column
@@ -105,43 +105,43 @@ class LogFile:
             if column < len(names):
                 return names[column]
             count = f"has {len(names)} columns, numbered 0 to {len(names) - 1}" if len(names) != 1 else "has only column 0"
-            raise self.wrong(f"no column {column}: the file {count}")
+            raise self.error(f"no column {column}: the file {count}")
         key = f"; [log] {channel} can name another" if channel else ""
         if all(isinstance(name, int) for name in names):
-            raise self.wrong(
+            raise self.error(
                 f"no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
                 + (f", as [log] {channel}" if channel else "")
             )
-        raise self.wrong(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}")
+        raise self.error(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}")
 
-    def length(self, name: str | int) -> int:
+    def count_values(self, name: str | int) -> int:
         """Number of values of a column, which is not loaded; InputError where there are too many."""
         if (count := len(self.columns[name])) > _MOST_ROWS:
-            raise self.wrong(f"column {name!r} has {count} values; at most {_MOST_ROWS} can be read")
+            raise self.error(f"column {name!r} has {count} values; at most {_MOST_ROWS} can be read")
         return count
 
-    def values(self, name: str | int) -> np.ndarray:
+    def load_values(self, name: str | int) -> np.ndarray:
         """A column as the file has it, shape (rows,). InputError where it is too long, or cannot be read."""
-        self.length(name)
+        self.count_values(name)
         try:
             with _one_line_errors(f"column {name!r}"):
                 return np.asarray(self.columns[name])
         except InputError as error:
-            raise self.wrong(str(error)) from None
+            raise self.error(str(error)) from None
 
-    def seconds(self, column: str | int, unit: float, channel: str = "") -> np.ndarray:
+    def load_seconds(self, column: str | int, unit: float, channel: str = "") -> np.ndarray:
         """A column of time stamps, s, shape (rows,), of numbers of so many seconds each, or of dates, from the first one on.
 
         InputError as :meth:`numbers`.
         """
-        name = self.name(column, channel)
-        stamps = self.values(name)
+        name = self.find_column(column, channel)
+        stamps = self.load_values(name)
         if stamps.dtype.kind not in "Mm":
-            return self.numbers(column, channel) * unit
+            return self.load_numbers(column, channel) * unit
         if unit != 1.0:
-            raise self.wrong(f"column {name!r} holds dates or times, which have a unit of their own; leave [log] t.unit out")
+            raise self.error(f"column {name!r} holds dates or times, which have a unit of their own; leave [log] t.unit out")
         if np.isnat(stamps).any():
-            raise self.wrong(
+            raise self.error(
                 f"column {name!r}, data row {int(np.argmax(np.isnat(stamps))) + 1} is empty; it should be a time"
             )
         if stamps.dtype.kind == "M" and len(stamps):
@@ -149,31 +149,31 @@ class LogFile:
         # of whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
         return 1e-9 * (stamps - stamps[:1]).astype("timedelta64[ns]").astype(np.int64)
 
-    def numbers(self, column: str | int, channel: str = "") -> np.ndarray:
+    def load_numbers(self, column: str | int, channel: str = "") -> np.ndarray:
         """A column of finite numbers, shape (rows,); InputError names the first row, counted from 1, that holds none."""
-        name = self.name(column, channel)
-        given = self.values(name)
+        name = self.find_column(column, channel)
+        given = self.load_values(name)
         if given.dtype.kind in "cMm":
             kind = "complex numbers" if given.dtype.kind == "c" else "dates or times"
-            raise self.wrong(f"column {name!r} holds {kind}; it should hold real numbers")
+            raise self.error(f"column {name!r} holds {kind}; it should hold real numbers")
         values = np.asarray(pd.to_numeric(pd.Series(given), errors="coerce"), dtype=float)
         finite = np.abs(values) <= LARGEST
         if not finite.all():
             row = int(np.argmin(finite))
             cell = np.asarray(given, dtype=object)[row]
             if np.isfinite(values[row]):
-                raise self.wrong(
+                raise self.error(
                     f"column {name!r}, data row {row + 1} is {values[row]:g}; a reading should be below {LARGEST:g}"
                 )
             empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
             what = "empty or not a number" if empty else repr(cell)
-            raise self.wrong(f"column {name!r}, data row {row + 1} is {what}; it should be a finite number")
+            raise self.error(f"column {name!r}, data row {row + 1} is {what}; it should be a finite number")
         return values
 
     def check_length(self, name: str | int, length: int) -> None:
         """InputError where the values of a column are not as many as there are time stamps."""
-        if (count := self.length(name)) != length:
-            raise self.wrong(f"column {name!r} has {count} values and the time {length}; they should be equally many")
+        if (count := self.count_values(name)) != length:
+            raise self.error(f"column {name!r} has {count} values and the time {length}; they should be equally many")
 
 
 def is_log(path: Path) -> bool:
@@ -341,8 +341,8 @@ def _read_table(
         """Names of all columns, values of those that are wanted (all, if none is), and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
-            **form.options(),
-            skiprows=form.rows,
+            **form.pandas_options(),
+            skiprows=form.first_row,
             low_memory=False,
             encoding=encoding,
             compression=None,
@@ -387,16 +387,16 @@ class TextFormat(NamedTuple):
         decimal: sign of numbers.
         names: of the columns, or None where there is no header.
         count: of the columns.
-        rows: line in which the rows begin, counted from 0.
+        first_row: line in which the rows begin, counted from 0.
     """
 
     separator: str
     decimal: str
     names: list[str] | None
     count: int
-    rows: int
+    first_row: int
 
-    def options(self) -> Any:
+    def pandas_options(self) -> Any:
         """Those of `pandas.read_csv`."""
         return {
             "sep": self.separator,
@@ -408,13 +408,13 @@ class TextFormat(NamedTuple):
             "index_col": False,
         }
 
-    def numbers(self, lines: list[str]) -> np.ndarray:
+    def parse_numbers(self, lines: list[str]) -> np.ndarray:
         """Rows as numbers, shape (rows, columns); NaN for a cell that holds none. Lines of another number of cells are
         left out."""
         lines = [line for line in lines if len(_split_cells(line, self.separator)) == self.count]
         if not lines:
             return np.empty((0, self.count))
-        options = self.options() | {"names": None}
+        options = self.pandas_options() | {"names": None}
         frame = pd.read_csv(io.StringIO("\n".join(lines)), **options)
         return np.stack([pd.to_numeric(frame[i], errors="coerce").to_numpy(float) for i in range(self.count)], axis=1)
 

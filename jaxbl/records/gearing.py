@@ -55,11 +55,11 @@ class Gearing(LostMotion):
     motion: float
 
     @property
-    def wide(self) -> bool:
+    def is_loose(self) -> bool:
         """Whether the twist is a large part of the motion whatever the ratio, so that the load follows only loosely."""
         return min(self.twist, self.least_twist) > WIDE_TWIST * self.motion
 
-    def lost_motion_text(self, unit: str) -> str:
+    def describe_lost_motion(self, unit: str) -> str:
         """Value, error and interval; in degrees as well."""
         low, high = self.lost_motion_interval
         digits = _decimals(self.lost_motion_error)
@@ -71,7 +71,7 @@ class Gearing(LostMotion):
             text += f"; {value:.{digits}f} ± {error:.{digits}f}°"
         return f"{text})"
 
-    def stands_out(self, noise: float) -> bool:
+    def exceeds_noise(self, noise: float) -> bool:
         """Whether the lost motion is more than its error and the noise (:func:`twist_noise`)."""
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
 
@@ -240,7 +240,7 @@ def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
     """Bandwidth of the velocity, Hz; of motion that is slower than a spectrum shows, a few times one over its duration."""
-    width = find_bandwidth(positions, period, slope=True)
+    width = find_bandwidth(positions, period, differentiate=True)
     slow = 10.0 / (len(positions) * period)
     if width or len(positions) < MIN_SAMPLES:
         return width
@@ -321,7 +321,7 @@ def _fit_lost_motion(
     if wide:
         # a shaft winds up as its load is moved: part of this shift, and in so few cycles it is unknown how much
         alone = lost_motion.fit_lost_motion_by_direction(twist, terms[:, :1], flank, clear)
-        return found.between(alone) if found and alone else found
+        return found.enclose(alone) if found and alone else found
     if found is None or found.lost_motion_error > 0.25 * abs(found.lost_motion):
         # at one speed, delays and wind-up look like lost motion: take a delay to be no more than a period
         delay = ratio * period * _rms(velocity)

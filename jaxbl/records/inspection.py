@@ -18,18 +18,18 @@ from .table import POSITION_CHANNELS, LogTable
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Identifiability:
     """Whether a log can identify a quantity.
 
     Attributes:
         quantity: of the drive.
         answer: yes; weak: with large uncertainty, or only together with another quantity; no.
-        why: one sentence.
+        reason: one sentence.
     """
 
     quantity: str
     answer: Literal["yes", "weak", "no"]
-    why: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Inspection:
         log: how it was read.
         gear_ratio: motor over load motion: the expected one, else that of the log; None with one encoder.
         reversals: how often the direction of motion changes.
-        judgements: what the log can identify.
+        identifiability: what the log can identify.
         element: what a transmission on a test rig is; None of a drive, or where the log shows nothing.
     """
 
@@ -49,26 +49,26 @@ class Inspection:
     log: LogTable
     gear_ratio: float | None
     reversals: int
-    judgements: tuple[Judgement, ...]
+    identifiability: tuple[Identifiability, ...]
     element: Element | None = None
 
-    def as_read(self) -> str:
+    def describe_sizes(self) -> str:
         """Sizes that its user knows, in one sentence: a wrong unit shows in them."""
         record, side = self.record, main_side(self.record)
-        channel = record.findings.channels[POSITION_CHANNELS[side]]
+        channel = record.statistics.channels[POSITION_CHANNELS[side]]
         turning = channel.unit == "rad"
         if self.log.kind == "element":
             moved, torque = np.ptp(element_displacement(record, self.gear_ratio)), record.torque
             assert torque is not None
             return (
                 f"As read: displacement over {moved:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
-                f"{record.findings.channels['u'].unit}. If the rig is another, see the units in [log]."
+                f"{record.statistics.channels['u'].unit}. If the rig is another, see the units in [log]."
             )
         fastest = float(np.quantile(np.abs(compute_velocity(record)), 0.999))
         sizes = [f"{side} up to " + (f"{fastest * 30.0 / math.pi:.3g} rpm" if turning else f"{fastest:.3g} m/s")]
         if record.torque is not None and np.ptp(record.torque):
-            sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.findings.channels['u'].unit}")
-            found = record.findings.dynamics
+            sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.statistics.channels['u'].unit}")
+            found = record.statistics.dynamics
             if found is not None and 0.0 < 4.0 * found.errors[0] < found.values[0] and found.inflation[0] < 10.0:
                 sizes.append(f"inertia about {found.values[0]:.2g} {'kg m²' if turning else 'kg'}")
         return f"As read: {', '.join(sizes)}. If the machine is another, see the units in [log]."
@@ -84,7 +84,7 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """As in `inspection.json`."""
-        record, found = self.record, self.record.findings
+        record, found = self.record, self.record.statistics
         dynamics = found.dynamics
         return {
             "file": str(record.path.resolve()),
@@ -100,7 +100,9 @@ class Inspection:
             "dynamics": None if dynamics is None else dynamics.to_dict(),
             "reversals": self.reversals,
             "element": None if self.element is None else self.element.to_dict(),
-            "identifiable": [asdict(judgement) for judgement in self.judgements],
+            "identifiable": [
+                {"quantity": item.quantity, "answer": item.answer, "why": item.reason} for item in self.identifiability
+            ],
             "warnings": list(record.warnings),
             "notes": list(record.notes),
         }
@@ -122,14 +124,14 @@ def inspect(
         return Inspection(
             record, table, ratio, 0 if element is None else element.reversals, _judge_element(element), element
         )
-    gearing = record.findings.gearing
+    gearing = record.statistics.gearing
     ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
     if len(record.positions) < 2:
         ratio = None
     speed = compute_velocity(record)
     reversals = _count_reversals(record, speed)
     rigid = _judge_rigid_drive(record, speed, reversals)
-    if gearing is not None and gearing.wide:
+    if gearing is not None and gearing.is_loose:
         rigid = [_weaken_for_loose_load(judgement) for judgement in rigid]
     found = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
     return Inspection(record, table, ratio, reversals, tuple(found))
@@ -144,14 +146,14 @@ def element_displacement(record: Record, gear_ratio: float | None) -> np.ndarray
 def fit_record_element(record: Record, gear_ratio: float | None) -> Element | None:
     """What a log says of a transmission on a test rig; None where it shows nothing."""
     assert record.torque is not None
-    channel = record.findings.channels["theta_e"]
+    channel = record.statistics.channels["theta_e"]
     moved, noise = element_displacement(record, gear_ratio), element_noise(record, gear_ratio)
     return fit_element(moved, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m")
 
 
 def element_noise(record: Record, gear_ratio: float | None) -> float:
     """Of an element's displacement, with that of the resolution, rad (m) rms."""
-    found = record.findings.channels
+    found = record.statistics.channels
     ratio = {"theta_e": 1.0, "theta_s": gear_ratio or 1.0}
     parts = [(ratio[n] * found[n].noise, ratio[n] * found[n].resolution / 12.0**0.5) for n in ratio if n in found]
     return float(np.hypot.reduce([one for part in parts for one in part]))
@@ -164,20 +166,22 @@ _ELEMENT_NUMBERS = {
 """Quantity of an element -> its number."""
 
 
-def _judge_element(found: Element | None) -> tuple[Judgement, ...]:
+def _judge_element(found: Element | None) -> tuple[Identifiability, ...]:
     if found is None:
         why = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
-        return tuple(Judgement(quantity, "no", why) for quantity in _ELEMENT_NUMBERS)
+        return tuple(Identifiability(quantity, "no", why) for quantity in _ELEMENT_NUMBERS)
     judgements = []
     for quantity, key in _ELEMENT_NUMBERS.items():
         number = found.numbers.get(key)
         if number is None:
-            judgements.append(Judgement(quantity, "no", "does not make the torque any better on parts of the log left out"))
+            judgements.append(
+                Identifiability(quantity, "no", "does not make the torque any better on parts of the log left out")
+            )
             continue
         low, high = number.interval
         unit = f" {number.unit}" if number.unit else ""
         text = f"{key} = {number.value:.4g} ± {number.error:.2g}{unit}, 95 %: {low:.4g} to {high:.4g}"
-        judgements.append(Judgement(quantity, "weak" if key in found.open else "yes", text))
+        judgements.append(Identifiability(quantity, "weak" if key in found.open else "yes", text))
     return tuple(judgements)
 
 
@@ -189,7 +193,7 @@ def main_side(record: Record) -> str:
 def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,); by default of the main side."""
     side = side or main_side(record)
-    width = record.findings.channels[POSITION_CHANNELS[side]].bandwidth
+    width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
         position = record.positions[side][s]
@@ -207,13 +211,13 @@ def _count_reversals(record: Record, speed: np.ndarray) -> int:
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
 
-def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Judgement]:
-    return [Judgement(quantity, answer, why) for quantity in quantities]
+def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Identifiability]:
+    return [Identifiability(quantity, answer, why) for quantity in quantities]
 
 
-def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> list[Judgement]:
+def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> list[Identifiability]:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
-    torque, found = record.torque, record.findings.dynamics
+    torque, found = record.torque, record.statistics.dynamics
     if torque is None:
         return _judge_alike(names, "no", "no torque was recorded: the log shows kinematics only")
     if np.ptp(torque) == 0.0:
@@ -224,20 +228,24 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
     moving = np.abs(speed[_is_moving(speed)])
     slow, fast = np.quantile(moving, [0.05, 0.95])
     both = min((speed[_is_moving(speed)] > 0).mean(), (speed[_is_moving(speed)] < 0).mean())
-    width = record.findings.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
+    width = record.statistics.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
     percent = [f"{100 * share:.0f} % of the torque" for share in found.shares]
     spread = [abs(error / value) if value else math.inf for value, error in zip(found.values, found.errors, strict=True)]
 
-    def judge(name: str, i: int, yes: str, similar: str) -> Judgement:
+    def judge(name: str, i: int, yes: str, similar: str) -> Identifiability:
         if found.inflation[i] > 10.0:
-            return Judgement(name, "weak", f"hard to separate from {similar} here (variance × {found.inflation[i]:.0f})")
+            return Identifiability(
+                name, "weak", f"hard to separate from {similar} here (variance × {found.inflation[i]:.0f})"
+            )
         if found.values[i] < 2.0 * found.errors[i]:
-            return Judgement(name, "weak", f"a rough fit finds no positive value ({percent[i]}): other effects hide it")
+            return Identifiability(
+                name, "weak", f"a rough fit finds no positive value ({percent[i]}): other effects hide it"
+            )
         if found.shares[i] < 0.05:
-            return Judgement(name, "weak", f"it makes only {percent[i]}")
+            return Identifiability(name, "weak", f"it makes only {percent[i]}")
         if spread[i] > 0.2:
-            return Judgement(name, "weak", f"a rough fit finds it only to ± {100 * spread[i]:.0f} % ({percent[i]})")
-        return Judgement(name, "yes", f"{yes}: {percent[i]}")
+            return Identifiability(name, "weak", f"a rough fit finds it only to ± {100 * spread[i]:.0f} % ({percent[i]})")
+        return Identifiability(name, "yes", f"{yes}: {percent[i]}")
 
     result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
     alone = "motion in one direction only: hard to separate from"
@@ -251,69 +259,72 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
         else:
             result.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
     if both < 0.05:
-        return [*result, Judgement("constant torque", "weak", f"{alone} Coulomb friction")]
+        return [*result, Identifiability("constant torque", "weak", f"{alone} Coulomb friction")]
     why = f"motion in both directions ({100 * both:.0f} % in the less frequent one)"
-    return [*result, Judgement("constant torque", "yes", why)]
+    return [*result, Identifiability("constant torque", "yes", why)]
 
 
-def _weaken_for_loose_load(judgement: Judgement) -> Judgement:
+def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:
     """A fit of one rigid body says little of a motor whose load follows only loosely."""
     if judgement.answer == "no" or judgement.quantity == "constant torque":
         return judgement
-    why = f"{judgement.why}; by a fit of a rigid drive, while here the load follows the motor only loosely"
+    why = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
     return replace(judgement, answer="weak", why=why)
 
 
-def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Judgement]:
+def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:
     names = ("gear ratio", "lost motion", "stiffness")
-    gearing, channels = record.findings.gearing, record.findings.channels
+    gearing, channels = record.statistics.gearing, record.statistics.channels
     if len(record.positions) < 2:
         missing = "load" if "motor" in record.positions else "motor"
         why = f"there is no {missing} encoder: the transmission in between is not observed"
         if missing == "load" and record.torque is not None and reversals >= 2:
             tried = "from the motor's encoder alone: jaxbl identify with a model of two inertias tries"
-            return [Judgement(names[0], "no", why), *_judge_alike(names[1:], "weak", f"{tried}, and says if it cannot")]
+            return [
+                Identifiability(names[0], "no", why),
+                *_judge_alike(names[1:], "weak", f"{tried}, and says if it cannot"),
+            ]
         return _judge_alike(names, "no", why)
     if gearing is None or ratio is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
     left = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
-    if gearing.wide:
+    if gearing.is_loose:
         left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])
-    answer = "yes" if gearing.residual < 0.05 and not gearing.wide else "weak"
+    answer = "yes" if gearing.residual < 0.05 and not gearing.is_loose else "weak"
     return [
-        Judgement("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}"),
+        Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}"),
         _judge_lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
         _judge_stiffness(record, speed, ratio, noise),
     ]
 
 
-def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
-    size = gearing.lost_motion_text(unit)
+def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Identifiability:
+    size = gearing.describe_lost_motion(unit)
     answer, why = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
         answer, why = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
     elif reversals < 2:
         answer, why = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
-    elif gearing.wide:
+    elif gearing.is_loose:
         why = f"shift of {size} includes the wind-up, which this motion does not separate"
-    elif gearing.stands_out(noise):
+    elif gearing.exceeds_noise(noise):
         answer, why = "yes", f"theta_e shifts by {size} from flank to flank"
-    return Judgement("lost motion", answer, why)
+    return Identifiability("lost motion", answer, why)
 
 
-def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:
+def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Identifiability:
     """From twist over torque within one direction of motion; `noise` is the twist's, rms."""
     torque = record.transmitted
     if torque is None:
         if record.torque is None or np.ptp(record.torque) == 0.0:
-            return Judgement("stiffness", "no", "no varying torque was recorded")
+            return Identifiability("stiffness", "no", "no varying torque was recorded")
         torque = record.torque
     twist = record.positions["motor"] - ratio * record.positions["load"]
-    width = record.findings.channels["theta_e"].bandwidth
+    width = record.statistics.channels["theta_e"].bandwidth
     if width == 0.0:
-        return Judgement("stiffness", "no", "the motion does not exceed the noise")
+        return Identifiability("stiffness", "no", "the motion does not exceed the noise")
     targets, rows = [], []
     for s in record.segments:
         signals = np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1)
@@ -322,11 +333,13 @@ def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: flo
         rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
     found, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
     if not np.isfinite(found[0]):
-        return Judgement("stiffness", "weak", "the log is too short to see how the twist follows the torque")
+        return Identifiability("stiffness", "weak", "the log is too short to see how the twist follows the torque")
     reach = abs(float(found[0])) * float(np.std(torque))
-    unit = record.findings.channels["theta_e"].unit
+    unit = record.statistics.channels["theta_e"].unit
     if found[0] < 5.0 * errors[0] or reach < noise:
-        return Judgement("stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)")
-    return Judgement(
+        return Identifiability(
+            "stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)"
+        )
+    return Identifiability(
         "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {noise:.2g}"
     )

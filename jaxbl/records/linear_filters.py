@@ -50,15 +50,15 @@ def butterworth_coefficients(cutoff: float) -> tuple[tuple[float, ...], tuple[fl
 
 
 def filter_both_ways(
-    values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float], beyond: int
+    values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float], padding: int
 ) -> np.ndarray:
     """Values behind a filter forwards and then backwards, without delay; before either end they go on for so many samples as
     their own image, turned about the end."""
-    ends = 2.0 * values[0] - values[beyond:0:-1], 2.0 * values[-1] - values[-2 : -beyond - 2 : -1]
-    longer = np.concatenate([ends[0], values, ends[1]]) if beyond else values
+    ends = 2.0 * values[0] - values[padding:0:-1], 2.0 * values[-1] - values[-2 : -padding - 2 : -1]
+    longer = np.concatenate([ends[0], values, ends[1]]) if padding else values
     there = filter_forwards(longer, numerator, denominator)
     back = filter_forwards(there[::-1], numerator, denominator)[::-1]
-    return back[beyond : len(back) - beyond]
+    return back[padding : len(back) - padding]
 
 
 def welch_spectrum(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,7 @@ _RECEIVED = 1 << 22
 _ASKED = 0.1
 """Seconds between looks whether a socket is to be closed."""
 _BACK = 1.0
-"""Seconds that time goes back where the sender has begun anew; datagrams overtake one another by less."""
+"""Seconds that time goes back where the sender has begun starts_segment; datagrams overtake one another by less."""
 _JUDGED, _APART, _TOLERANCE = 256, 8, 0.02
 """Rows by which the sampling period is judged, over how many of them each interval goes, and its relative tolerance."""
 _PLAIN = bytes(range(32, 127)) + b"\t\r\n"
@@ -51,13 +51,13 @@ class Rows(NamedTuple):
         time: of the first one, s by the stamps.
         torque: N m (N), shape (samples,).
         positions: of motor and load, rad (m), shape (samples,) each.
-        anew: whether they do not continue the rows before.
+        starts_segment: whether they do not continue the rows before.
     """
 
     time: float
     torque: np.ndarray
     positions: dict[str, np.ndarray]
-    anew: bool
+    starts_segment: bool
 
 
 class Source(Protocol):
@@ -89,7 +89,7 @@ def stream_columns(table: LogTable) -> list[str | int]:
     time = table.t or TimeTable()
     found: list[str | int] = [] if time.period is not None else [time.column_or("t")]
     found.append((table.u or TorqueTable()).column_or("u"))
-    ends = [table.position(name) for name in POSITION_CHANNELS.values()]
+    ends = [table.position_source(name) for name in POSITION_CHANNELS.values()]
     found += [one.column_or(channel) for channel, one in ends]
     found += [one.minus for _, one in ends if isinstance(one, PositionTable) and one.minus is not None]
     return list(dict.fromkeys([*found, *(table.where or {})]))
@@ -97,7 +97,7 @@ def stream_columns(table: LogTable) -> list[str | int]:
 
 def _channel_keys(table: LogTable) -> dict[str | int, str]:
     """Column -> the key of `[log]` that can name another one."""
-    ends = [table.position(name) for name in POSITION_CHANNELS.values()]
+    ends = [table.position_source(name) for name in POSITION_CHANNELS.values()]
     pairs = [("t", table.t or TimeTable()), ("u", table.u or TorqueTable()), *ends]
     return {one.column_or(name): name for name, one in pairs}
 
@@ -110,7 +110,7 @@ def check_stream_table(table: LogTable, name: str) -> None:
     """
     if table.absent:
         raise InputError(f"{name}: [log] absent: {', '.join(table.absent)}; a stream needs u, theta_e and theta_s")
-    ends = [(key, *table.position(key)) for key in POSITION_CHANNELS.values()]
+    ends = [(key, *table.position_source(key)) for key in POSITION_CHANNELS.values()]
     channels = [("u", table.u or TorqueTable()), *((channel, one) for _, channel, one in ends)]
     open_ = [f"{channel}.{key}" for channel, one in channels for key in ("skew", "drift") if getattr(one, key, None)]
     open_ += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
@@ -126,7 +126,7 @@ class _ChannelReader:
         self._table, self._count = table, len(columns)
         file = LogFile(Path(name), dict.fromkeys(columns, ()))
         keys = _channel_keys(table)
-        self._at = {one: list(columns).index(file.name(one, keys.get(one, ""))) for one in stream_columns(table)}
+        self._at = {one: list(columns).index(file.find_column(one, keys.get(one, ""))) for one in stream_columns(table)}
         self._before: dict[str, float] = {}
         self._row = 0
 
@@ -146,7 +146,7 @@ class _ChannelReader:
         torque = to_si(torque_table, self._words(values, torque_table.column_or("u"), torque_table.signed_bits))
         raw, ends = {}, {}
         for side, name in POSITION_CHANNELS.items():
-            channel, one = table.position(name)
+            channel, one = table.position_source(name)
             ends[side] = one
             raw[side] = self._words(values, one.column_or(channel), one.signed_bits)
             if isinstance(one, PositionTable) and one.minus is not None:
@@ -184,7 +184,7 @@ class Stream:
     """Rows of a source in SI units, one sampling period apart.
 
     Up to two samples in a row that are lost are interpolated, as in a log: positions linearly, the input held. After a
-    longer gap rows begin anew.
+    longer gap rows begin starts_segment.
 
     Args:
         source: of rows.
@@ -245,7 +245,7 @@ class Stream:
         latest = np.maximum.accumulate(np.concatenate([[-np.inf if self._last is None else self._last[0]], stamps]))
         back = latest[:-1] - stamps > _BACK
         if back.any():
-            # a clock that was set back: rows from there on begin anew
+            # a clock that was set back: rows from there on begin starts_segment
             at = int(np.argmax(back))
             before, after = (
                 (stamps[p], torque[p], {s: x[p] for s, x in positions.items()}) for p in (slice(at), slice(at, None))
@@ -262,19 +262,19 @@ class Stream:
             return []
         starts = np.flatnonzero(np.diff(stamps) > GAP_PERIODS * self._period) + 1
         self._count(GAPS, len(starts))
-        anew = self._last is None
+        starts_segment = self._last is None
         if self._last is not None and stamps[0] - self._last[0] > GAP_PERIODS * self._period:
             self._count(GAPS, 1)
-            self._last, anew = None, True
+            self._last, starts_segment = None, True
         found = []
         for first, end in zip([0, *starts], [*starts, len(stamps)], strict=True):
             part = slice(first, end)
-            found.append(self._even(stamps[part], torque[part], {s: x[part] for s, x in positions.items()}, anew))
-            self._last, anew = None, True
+            found.append(self._even(stamps[part], torque[part], {s: x[part] for s, x in positions.items()}, starts_segment))
+            self._last, starts_segment = None, True
         self._last = float(stamps[-1]), float(torque[-1]), {side: float(values[-1]) for side, values in positions.items()}
         return found
 
-    def _even(self, stamps: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], anew: bool) -> Rows:
+    def _even(self, stamps: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], starts_segment: bool) -> Rows:
         """Rows without a gap, lost ones put in; stamps may jitter by less than half a period."""
         before = self._last
         if before is not None:
@@ -289,7 +289,7 @@ class Stream:
             positions = {side: np.interp(every, at, values) for side, values in positions.items()}
         own = slice(0 if before is None else 1, None)
         first = float(stamps[0]) + (0.0 if before is None else self._period)
-        return Rows(first, torque[own], {side: values[own] for side, values in positions.items()}, anew)
+        return Rows(first, torque[own], {side: values[own] for side, values in positions.items()}, starts_segment)
 
 
 def period_error(name: str, found: float, period: float) -> InputError:
@@ -345,7 +345,7 @@ class FollowedFile:
             self._header = said[0] if self._form.names is not None else ""
         self._lines = []
         rows = [line for line in said if line != self._header]
-        values = self._form.numbers(rows)
+        values = self._form.parse_numbers(rows)
         if len(values) < len(rows):
             self.counts[MALFORMED] += len(rows) - len(values)
             self.fault = f"; a line should have {self._form.count} cells"
@@ -458,7 +458,7 @@ class Datagrams:
         if self._form is None:
             return np.empty((0, 0))
         rows = [one for one in lines if one != self._header]
-        values = self._form.numbers(rows)
+        values = self._form.parse_numbers(rows)
         if len(values) < len(rows):
             self.counts[MALFORMED] += len(rows) - len(values)
             self.fault = f"; a line should have {self._form.count} cells"

@@ -45,7 +45,7 @@ class LostMotion:
         """Where the direction of motion decides the flank."""
         return LostMotion(value, error, _interval(value, error, freedom), "motion", changes, (), (value, value), residual)
 
-    def between(self, other: "LostMotion") -> "LostMotion":
+    def enclose(self, other: "LostMotion") -> "LostMotion":
         """Anywhere between two that rest on different assumptions."""
         value, error = 0.5 * (self.lost_motion + other.lost_motion), 0.5 * abs(self.lost_motion - other.lost_motion)
         error = math.hypot(error, max(self.lost_motion_error, other.lost_motion_error))

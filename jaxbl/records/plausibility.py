@@ -21,7 +21,7 @@ def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
     """Refuse a position that moves by three steps of its resolution or less."""
     step = find_resolution(values)
     if step and np.ptp(values) < 3.5 * step:
-        raise file.wrong(
+        raise file.error(
             f"{name} moves by only {round(np.ptp(values) / step)} steps of its resolution {step:.3g}; a log of a drive in "
             "motion is needed"
         )
@@ -33,24 +33,24 @@ def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
         if not {name, other} & set(POSITION_CHANNELS.values()):
             continue
         if np.array_equal(one.values, two.values, equal_nan=True) and np.any(one.values):
-            raise file.wrong(f"{name} and {other} are the same in every row; each needs a column of its own")
+            raise file.error(f"{name} and {other} are the same in every row; each needs a column of its own")
 
 
 _STANDSTILL_SAMPLES = 20
 """Equal readings in a row from which an encoder stands still: fewer are its resolution, or a reversal."""
 
 
-def note_standing(file: LogFile, segments: SegmentedStamps, channels: Mapping[str, RawChannel]) -> None:
+def note_standing(file: LogFile, segmented: SegmentedStamps, channels: Mapping[str, RawChannel]) -> None:
     """Remark on an encoder that stands exactly still while the other one moves by a fifth of its range."""
     for name, other in (("theta_e", "theta_s"), ("theta_s", "theta_e")):
         values, moving = channels[name].values, channels[other].values
         # what its resolution hides is no standing
         hidden = 2.0 * find_resolution(values) * np.ptp(moving) / np.ptp(values)
-        stays = (stay for part in segments.parts for stay in _find_standstills(values, part))
+        stays = (stay for part in segmented.segments for stay in _find_standstills(values, part))
         stay = next((one for one in stays if np.ptp(moving[one]) > max(0.2 * np.ptp(moving), hidden)), None)
         if stay is None:
             continue
-        begin, end = segments.times[stay][[0, -1]]
+        begin, end = segmented.times[stay][[0, -1]]
         extreme = values[stay.start] in (values.min(), values.max())
         stands = f"{name} stands still{' at the end of its range' * extreme} from {begin:.4g} to {end:.4g} s"
         moves = f"{other} moves by {np.ptp(moving[stay]):.3g} {channels[other].unit}"
@@ -70,7 +70,7 @@ def check_gear_ratio(
 
     Up to a relative deviation of `tolerance` the file gets a remark. Beyond, InputError names the most likely mistake.
     """
-    if expected is not None and (found is None or found.wide or found.residual >= UNRELATED):
+    if expected is not None and (found is None or found.is_loose or found.residual >= UNRELATED):
         _check_size(file, table, grid, expected)
     if found is None or found.residual >= UNRELATED:
         left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
@@ -78,7 +78,7 @@ def check_gear_ratio(
             f"theta_e and theta_s are hardly related{left}: they may not belong to one drive, or the load hardly moves "
             "beyond the lost motion."
         )
-    elif expected is not None and found.wide:
+    elif expected is not None and found.is_loose:
         _check_twist(file, unit, found, expected)
     elif expected is not None:
         _check_ratio(file, table, found, expected, tolerance)
@@ -98,13 +98,13 @@ def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float
         file.notes.append(f"{moves}: effects that the model leaves out may cause this, or gear_ratio is a little wrong.")
         return
     if found.residual < 0.05:
-        raise file.wrong(f"{moves}: {why}")
+        raise file.error(f"{moves}: {why}")
     file.notes.append(f"{moves}, but the two are related only roughly; perhaps {why}.")
 
 
 def _likely_mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
     """Usual mistakes: the factor that each puts on the ratio of both motions, and what is wrong then."""
-    (motor, motor_table), (load, load_table) = table.position("theta_e"), table.position("theta_s")
+    (motor, motor_table), (load, load_table) = table.position_source("theta_e"), table.position_source("theta_s")
     degrees, see = 180.0 / math.pi, "; see unit in [log]"
     motor_text = f"{motor} is not in degrees" if motor_table.unit.startswith("deg") else f"{load} is in degrees"
     load_text = f"{load} is not in degrees" if load_table.unit.startswith("deg") else f"{motor} is in degrees"
@@ -135,7 +135,7 @@ def _check_size(file: LogFile, table: LogTable, grid: Grid, expected: float) -> 
     )
     if least < 0.7:
         size = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
-        raise file.wrong(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
+        raise file.error(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
 
 
 def _check_twist(file: LogFile, unit: str, found: Gearing, expected: float) -> None:
@@ -143,7 +143,7 @@ def _check_twist(file: LogFile, unit: str, found: Gearing, expected: float) -> N
     ranges = f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
     # a load that a motor moves through a gap moves no farther than the motor
     if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
-        raise file.wrong(
+        raise file.error(
             f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {found.ratio:.3g} in place of {expected:g} it "
             f"would be {found.least_twist:.3g} {unit})"
         )
@@ -180,7 +180,7 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         # potential energy may pay for the motion
         share = max(share, 0.0)
     if backwards and share < 0.02:
-        raise file.wrong(
+        raise file.error(
             "the torque has the wrong sign: the drive accelerates against it"
             + (f" and returns {-100 * share:.0f} % of the work" if share < -0.02 else "")
             + "; set sign = -1 in [log] u"
@@ -305,7 +305,7 @@ def note_skew(file: LogFile, found: Gearing, period: float) -> None:
 def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelStatistics]) -> None:
     """Remark on the lost motion where it stands out of the noise of both encoders."""
     unit = figures["theta_e"].unit
-    text = f"Lost motion at the motor: {found.lost_motion_text(unit)}"
+    text = f"Lost motion at the motor: {found.describe_lost_motion(unit)}"
     if found.flank == "load":
         times = ", ".join(f"{t:.3g}" for t in found.flank_times[:6]) + (", ..." if len(found.flank_times) > 6 else "")
         low, high = found.lost_motion_range
@@ -314,5 +314,5 @@ def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelSt
             f"{text}, from positions passed in the same direction before and after the load torque changed its sign, at "
             f"{times} s; {low:.2g} to {high:.2g} {unit} by position." + (one if len(found.flank_times) == 1 else "")
         )
-    elif found.stands_out(twist_noise(found.ratio, figures["theta_e"], figures["theta_s"])) and not found.wide:
+    elif found.exceeds_noise(twist_noise(found.ratio, figures["theta_e"], figures["theta_s"])) and not found.is_loose:
         file.notes.append(f"{text}, from {found.flank_changes} changes of the flank by the direction of motion.")

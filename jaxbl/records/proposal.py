@@ -100,7 +100,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
         channel, wanted = _guess_channel(name, unit), _matches("wanted", name)
         if not channel:
             continue
-        numbers = file.values(column)
+        numbers = file.load_values(column)
         # a torque that was asked for stands for one that was not measured, a side alone for a position
         if numbers.dtype.kind in "iuf" and (channel == "u" or not wanted):
             last = wanted or _matches("load", name) if channel == "u" else not _matches("position", name)
@@ -216,7 +216,7 @@ def propose_study(
         found = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
         for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
             if key in found.record.corrections:
-                name, _ = found.log.position(channel)
+                name, _ = found.log.position_source(channel)
                 table[name] = _as_table(table.get(name, name)) | {key: found.record.corrections[key]}
     return _make_study(found, nominal, table), guesses, found
 
@@ -227,7 +227,7 @@ def _as_table(given: Any) -> dict[str, Any]:
 
 def _fit_nominal_drive(found: Inspection, guesses: list[str], known: float | None) -> NominalDrive:
     """Inertia and friction by the rough fit; of two sides half of it each, at the motor."""
-    dynamics, gearing = found.record.findings.dynamics, found.record.findings.gearing
+    dynamics, gearing = found.record.statistics.dynamics, found.record.statistics.gearing
     inertia, viscous = 1.0, 0.0
     if dynamics is None:
         guesses.append("The log does not show an inertia: 1 is a placeholder.")
@@ -243,7 +243,7 @@ def _fit_nominal_drive(found: Inspection, guesses: list[str], known: float | Non
         return NominalDrive(inertia, viscous)
     both = found.record.positions
     parts = [
-        _load_motion(both["motor"][s], both["load"][s], found.record.findings.channels["theta_e"].bandwidth, period)
+        _load_motion(both["motor"][s], both["load"][s], found.record.statistics.channels["theta_e"].bandwidth, period)
         for s in found.record.segments
         if s.stop - s.start >= MIN_SAMPLES
     ]
@@ -252,7 +252,8 @@ def _fit_nominal_drive(found: Inspection, guesses: list[str], known: float | Non
     if not np.isfinite(values).all() or values[0] <= 0.0:
         raise InputError(
             f"{found.record.path}: theta_e moves {gearing.ratio:.4g} for each 1 of theta_s; it should be more than 0: set "
-            f"sign = -1 in [log] {found.log.position('theta_e')[0]} or {found.log.position('theta_s')[0]}, or leave one of "
+            f"sign = -1 in [log] {found.log.position_source('theta_e')[0]} or "
+            f"{found.log.position_source('theta_s')[0]}, or leave one of "
             "them out, and give the file as --model"
         )
     ratio, whole = float(values[0]), float(round(values[0]))
@@ -295,7 +296,7 @@ def _make_study(found: Inspection, nominal: NominalDrive, table: dict[str, Any])
     if two:
         law = {"law": "dead_zone", "stiffness": nominal.stiffness, "half_gap": nominal.half_gap}
         study["transmission"] = law if nominal.half_gap else {"law": "linear_shaft", "stiffness": law["stiffness"]}
-    noise = record.findings.channels["theta_e" if "motor" in record.positions else "theta_s"].noise
+    noise = record.statistics.channels["theta_e" if "motor" in record.positions else "theta_s"].noise
     return study | {
         "encoders": {"noise": _round_to_3_digits(noise)},
         "run": {"sample_period": record.sample_period, "substeps": plant_steps(nominal, record.sample_period)},

@@ -71,7 +71,7 @@ class Record:
         warnings: those that are to be said first: clock or zero point of an encoder corrected, units in doubt.
         corrections: "skew" of theta_s, s, its "drift", s/s, and "offset" of theta_e, rad (m), as far as they were put in.
         contradiction: why nothing can be fitted to the nominal drive, as units are surely wrong; "" where they are not.
-        findings: figures on its quality.
+        statistics: of its stamps, channels, gearing and torque.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
         logs: file and rows of each log that it was joined from.
     """
@@ -89,14 +89,14 @@ class Record:
     warnings: tuple[str, ...]
     corrections: dict[str, float]
     contradiction: str
-    findings: LogStatistics
+    statistics: LogStatistics
     intervals: np.ndarray
     logs: tuple[tuple[Path, slice], ...]
 
     def unit_of(self, path: str, unit: str) -> str:
         """The unit of a number of one side in this log: N and m in place of N m and rad, if the side moves along a line."""
         side = "load" if any(name.startswith("load") for name in path.split(".")) else "motor"
-        channel = self.findings.channels.get(POSITION_CHANNELS[side])
+        channel = self.statistics.channels.get(POSITION_CHANNELS[side])
         return on_a_line(unit) if channel is not None and channel.unit == "m" else unit
 
 
@@ -145,26 +145,26 @@ def read_record(
         InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
     """
     table = read_log_table(log)
-    file = read_log_file(Path(path), table.columns())
+    file = read_log_file(Path(path), table.list_columns())
     # from columns to SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
     check_distinct(file, channels)
-    segments = split_at_gaps(file, stamps)
-    channels = {name: raw._replace(values=raw.values[segments.distinct]) for name, raw in channels.items()}
+    segmented = split_at_gaps(file, stamps)
+    channels = {name: raw._replace(values=raw.values[segmented.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
     if table.kind == "element" and "theta_e" not in encoders:
-        raise file.wrong(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
+        raise file.error(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
     # the sides of an element move on their own, if they move
     drive = table.kind == "drive"
     for name in encoders if drive else encoders[:1]:
         check_motion(file, name, channels[name].values)
     if drive and len(encoders) == 2:
-        note_standing(file, segments, channels)
+        note_standing(file, segmented, channels)
     # from there to evenly spaced samples
     two = drive and len(encoders) == 2
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None
-    grid, gearing, regular = _resample_and_align(file, table, segments, channels, gear_ratio, shaft)
+    grid, gearing, regular = _resample_and_align(file, table, segmented, channels, gear_ratio, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
     # what these say of the drive
@@ -177,9 +177,9 @@ def read_record(
         if nominal is not None:
             check_units(file, dynamics, encoders[0], nominal)
     # uneven stamps would pass for noise of what moves between them
-    source = Grid(segments.times, {n: raw.values for n, raw in channels.items()}, segments.parts, grid.period)
+    source = Grid(segmented.times, {n: raw.values for n, raw in channels.items()}, segmented.segments, grid.period)
     figures = {
-        name: _measure_channel(file, name, raw, segments, source if regular else grid) for name, raw in channels.items()
+        name: _measure_channel(file, name, raw, segmented, source if regular else grid) for name, raw in channels.items()
     }
     if gearing is not None:
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
@@ -204,8 +204,8 @@ def read_record(
         warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith("Doubtful"))),
         corrections=file.corrections,
         contradiction=file.contradiction,
-        findings=LogStatistics(segments.sampling, figures, gearing, dynamics),
-        intervals=np.diff(segments.times),
+        statistics=LogStatistics(segmented.sampling, figures, gearing, dynamics),
+        intervals=np.diff(segmented.times),
         logs=((file.path, slice(0, len(grid.time))),),
     )
 
@@ -213,18 +213,18 @@ def read_record(
 def _resample_and_align(
     file: LogFile,
     table: LogTable,
-    segments: SegmentedStamps,
+    segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     gear_ratio: float | None,
     shaft: NominalDrive | None,
 ) -> tuple[Grid, Gearing | None, bool]:
     """The channels at even spacing without skews; relation of both encoders; whether the stamps had that spacing already."""
-    period = table.resample or segments.period
-    regular = segments.sampling.even and math.isclose(period, segments.period, rel_tol=1e-9)
+    period = table.resample or segmented.period
+    regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
     delays = {name: Delay(raw.skew if isinstance(raw.skew, float) else 0.0, raw.drift) for name, raw in channels.items()}
 
     def attempt() -> tuple[Grid, Gearing | None]:
-        grid = resample_channels(file, segments, channels, period, delays, interpolate=not regular)
+        grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
@@ -251,7 +251,7 @@ def _resample_and_align(
         grid, gearing = attempt()
     elif open_ and shaft is not None and gearing is not None:
         found = judge_clock_skew(gearing, grid, shaft)
-        if found is not None and found.sure:
+        if found is not None and found.is_sure:
             delays["theta_s"] = Delay(first.skew + found.value, first.drift)
             grid, gearing = attempt()
             said.append(_skew_sentence(found, " in the middle of the log" if said else ""))
@@ -262,7 +262,7 @@ def _resample_and_align(
     if not regular:
         why = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
-            f"Resampled {why}: every {1e3 * period:.6g} ms, sampled every {1e3 * segments.period:.6g} ms; positions by "
+            f"Resampled {why}: every {1e3 * period:.6g} ms, sampled every {1e3 * segmented.period:.6g} ms; positions by "
             "cubic splines, torques with their integral kept."
         )
     for name, delay in delays.items():
@@ -275,7 +275,7 @@ def _resample_and_align(
 def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
     """A drift between the clocks of both encoders, as far as friction of the nominal drive, if one is given, is no cause."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    if gearing.wide:
+    if gearing.is_loose:
         return None
     found = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
     # friction that changes as the machine warms up changes the wind-up, by less than all of it
@@ -289,10 +289,10 @@ def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) 
 
 def _estimate_skew(file: LogFile, gearing: Gearing | None, period: float) -> float:
     if gearing is None or gearing.skew is None or gearing.skew_error is None:
-        raise file.wrong("theta_s.skew = 'estimate': this motion does not show a skew; give it in s, or leave it out")
+        raise file.error("theta_s.skew = 'estimate': this motion does not show a skew; give it in s, or leave it out")
     found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
     if not gearing.skew_error < 0.5 * period:
-        raise file.wrong(
+        raise file.error(
             f"theta_s.skew = 'estimate': found {found}; its error should be less than half the period of "
             f"{1e3 * period:.4g} ms; give the skew in s, or leave it out"
         )
@@ -302,7 +302,7 @@ def _estimate_skew(file: LogFile, gearing: Gearing | None, period: float) -> flo
 
 def _is_left_out(table: LogTable, key: str) -> bool:
     """Whether `[log]` leaves a key of theta_e and theta_s out; a speed in place of theta_s may not have it."""
-    motor, load = table.position("theta_e")[1], table.position("theta_s")[1]
+    motor, load = table.position_source("theta_e")[1], table.position_source("theta_s")[1]
     return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
 
 
@@ -316,7 +316,7 @@ def _skew_sentence(found: Skew, when: str) -> str:
 
 def _delay_advice(table: LogTable, delay: Delay) -> str:
     """What `[log]` would say of a skew that was corrected."""
-    name, _ = table.position("theta_s")
+    name, _ = table.position_source("theta_s")
     if not delay.drift:
         return f"[log] {name}.skew = {delay.skew:.4g} says the same, 0 leaves it as it is."
     return (
@@ -329,7 +329,7 @@ def _correct_offset(
     file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive
 ) -> None:
     """Take an offset between the encoders out of theta_e where it is sure, and say so; say that it may be one, if not."""
-    integrals = [name for name in POSITION_CHANNELS.values() if table.position(name)[0] != name]
+    integrals = [name for name in POSITION_CHANNELS.values() if table.position_source(name)[0] != name]
     if not integrals and not _is_left_out(table, "offset"):
         return
     found = find_encoder_offset(grid, nominal)
@@ -345,7 +345,7 @@ def _correct_offset(
         return
     size = f"{found.value:.4g} ± {found.error:.1g} {channels['theta_e'].unit}"
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
-    if found.sure:
+    if found.is_sure:
         grid.values["theta_e"] = grid.values["theta_e"] - found.value
         file.corrections["offset"] = -found.value
         channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - found.value)
@@ -354,7 +354,11 @@ def _correct_offset(
             f"{-found.value:.4g} says the same, 0 leaves it as it is."
         )
         return
-    cause = "a constant torque in the shaft" if found.both else "a constant torque that holds the load on one flank of a gap"
+    cause = (
+        "a constant torque in the shaft"
+        if found.both_flanks
+        else "a constant torque that holds the load on one flank of a gap"
+    )
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
         f"[log] theta_e.offset = {-found.value:.4g} takes it for an offset, 0 for none."
@@ -362,7 +366,7 @@ def _correct_offset(
 
 
 def _measure_channel(
-    file: LogFile, name: str, raw: RawChannel, segments: SegmentedStamps, source: Grid
+    file: LogFile, name: str, raw: RawChannel, segmented: SegmentedStamps, source: Grid
 ) -> ChannelStatistics:
     """Figures on a channel, with remarks; noise and bandwidth are taken from the longest part of `source`."""
     part = longest_segment(source.segments)
@@ -371,8 +375,8 @@ def _measure_channel(
     figures = measure_channel(
         values,
         period,
-        [raw.values[p] for p in segments.parts],
-        None if segments.sampling.even else [segments.times[p] for p in segments.parts],
+        [raw.values[p] for p in segmented.segments],
+        None if segmented.sampling.even else [segmented.times[p] for p in segmented.segments],
         unit=raw.unit,
         is_position=name.startswith("theta"),
         saturated=raw.saturated,

@@ -44,7 +44,7 @@ class Delay(NamedTuple):
 
 def resample_channels(
     file: LogFile,
-    segments: SegmentedStamps,
+    segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     period: float,
     delays: Mapping[str, Delay],
@@ -57,8 +57,8 @@ def resample_channels(
     is too short for period and skews.
     """
     times, values, parts, begin = [], {name: [] for name in channels}, [], 0
-    for part in segments.parts:
-        stamps = segments.times[part]
+    for part in segmented.segments:
+        stamps = segmented.times[part]
         first = float(stamps[0])
         if not interpolate and not any(map(any, delays.values())):
             grid = first + period * np.arange(len(stamps), dtype=float)
@@ -89,11 +89,11 @@ def _common_times(
         low = first + period * math.ceil((low - first) / period - 1e-6)
     count = math.floor((high - low) / period + 1e-6) + 1
     if count > _FINEST * len(stamps) + MIN_SAMPLES:
-        raise file.wrong(
+        raise file.error(
             f"a period of {period:g} s makes {count} samples of {len(stamps)}; at least a hundredth of the log's is needed"
         )
     if count < MIN_SAMPLES // 2:
-        raise file.wrong(
+        raise file.error(
             f"with these skews and this period a segment has {max(count, 0)} samples; at least {MIN_SAMPLES // 2} are needed"
         )
     return low + period * np.arange(count, dtype=float)

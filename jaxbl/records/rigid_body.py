@@ -69,7 +69,7 @@ def smooth_sign(velocity: np.ndarray) -> np.ndarray:
 
 def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
     """Regress a torque, held from each stamp to the next, on the motion of one encoder; None where that is too small."""
-    width = find_bandwidth(position[longest_segment(segments)], period, slope=True)
+    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
     if width == 0.0 or np.ptp(torque) == 0.0:
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes

@@ -70,7 +70,7 @@ def measure_channel(
         largest=float(every.max()),
         resolution=step,
         noise=float(np.sqrt(noise_floor(frequency, density) * 0.5 / period)),
-        bandwidth=find_bandwidth(values, period, slope=is_position) if np.ptp(values) else 0.0,
+        bandwidth=find_bandwidth(values, period, differentiate=is_position) if np.ptp(values) else 0.0,
         saturated=saturated or (0.0 if is_position else saturated_share(every, step)),
         jumps=found,
     )
@@ -93,7 +93,7 @@ def find_resolution(values: np.ndarray) -> float:
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
-def power_spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def power_spectrum(values: np.ndarray, period: float, *, differentiate: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """One-sided power spectral density of evenly spaced values, or of their slope, by Welch's method.
 
     Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
@@ -105,7 +105,7 @@ def power_spectrum(values: np.ndarray, period: float, *, slope: bool = False) ->
     frequency, density = frequency[1:], density[1:]
     density = density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
     frequency = frequency / period
-    return frequency, density * (2.0 * np.pi * frequency) ** 2 if slope else density
+    return frequency, density * (2.0 * np.pi * frequency) ** 2 if differentiate else density
 
 
 def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
@@ -122,14 +122,14 @@ def estimate_white_noise(parts: Sequence[np.ndarray]) -> float:
     return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
 
 
-def find_bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
+def find_bandwidth(values: np.ndarray, period: float, *, differentiate: bool) -> float:
     """Frequency in Hz below which 95 % of the power lies that stands out of the noise, of values or their slope; 0: none."""
     frequency, density = power_spectrum(values, period)
     # steps of the resolution make noise of their own, and not always up to the end of the band
     floor = max(noise_floor(frequency, density), find_resolution(values) ** 2 / 6.0 * period)
     # differences of noise leak into the first two frequencies
     clear = np.where(np.arange(len(density)) < 2, 24.0, 6.0) * floor
-    power = np.where(density > clear, density - floor, 0.0) * (frequency**2 if slope else 1.0)
+    power = np.where(density > clear, density - floor, 0.0) * (frequency**2 if differentiate else 1.0)
     if not power.any():
         return 0.0
     total = np.cumsum(power)

@@ -259,7 +259,7 @@ class LogTable(StrictTable):
             raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
-    def columns(self) -> set[str | int]:
+    def list_columns(self) -> set[str | int]:
         """Names and numbers of all columns that may be read."""
         found: set[str | int] = {*(self.where or {})}
         for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
@@ -269,7 +269,7 @@ class LogTable(StrictTable):
                 found.add(channel.minus)
         return found
 
-    def position(self, name: str) -> tuple[str, PositionTable | SpeedTable]:
+    def position_source(self, name: str) -> tuple[str, PositionTable | SpeedTable]:
         """What the position theta_e or theta_s is read from, itself or the speed in its place: channel and table."""
         omega = SPEED_CHANNELS[name]
         speed = getattr(self, omega)

@@ -50,17 +50,17 @@ class TimeStamps(NamedTuple):
         times: s from the first stamp of the file, shape (rows,).
         start: first stamp of the file, s.
         rows: their numbers in the file, counted from 0, shape (rows,).
-        total: rows of the file.
-        median: median interval of the file, s.
-        gap: longest interval that is no gap, s.
+        file_rows: rows of the file.
+        median_interval: median interval of the file, s.
+        max_interval: longest interval that is no gap, s.
     """
 
     times: np.ndarray
     start: float
     rows: np.ndarray
-    total: int
-    median: float
-    gap: float
+    file_rows: int
+    median_interval: float
+    max_interval: float
 
 
 class SegmentedStamps(NamedTuple):
@@ -69,14 +69,14 @@ class SegmentedStamps(NamedTuple):
     Attributes:
         times: s, shape (rows,); where the stamps are even, those of their grid.
         distinct: False for rows left out as their stamp is that of the row before, shape (rows of the time stamps,).
-        parts: rows of each.
+        segments: rows of each.
         period: of the grid where the stamps are even, else their median interval, s.
         sampling: figures on the stamps.
     """
 
     times: np.ndarray
     distinct: np.ndarray
-    parts: list[slice]
+    segments: list[slice]
     period: float
     sampling: Sampling
 
@@ -92,7 +92,7 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     # stamps that were rounded to more than a period come in groups
     group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
     if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
-        raise file.wrong(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
+        raise file.error(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
     if median >= _SLOW:
         file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
@@ -104,20 +104,20 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
     time = table.t or TimeTable()
     if time.period is not None:
         # other vectors of the file may be longer
-        read = (table.columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
-        length = max(file.length(file.name(one)) for one in read or file.columns)
+        read = (table.list_columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
+        length = max(file.count_values(file.find_column(one)) for one in read or file.columns)
         stamps = np.arange(length, dtype=float) * time.period
     else:
-        stamps = file.seconds(time.column_or("t"), SECONDS_PER_UNIT[time.unit], "t.column")
+        stamps = file.load_seconds(time.column_or("t"), SECONDS_PER_UNIT[time.unit], "t.column")
     if len(stamps) < MIN_SAMPLES:
-        raise file.wrong(f"has {len(stamps)} rows; a log needs at least {MIN_SAMPLES}")
+        raise file.error(f"has {len(stamps)} rows; a log needs at least {MIN_SAMPLES}")
     back = np.diff(stamps) < 0.0
     if back.any() or stamps[0] == stamps[-1]:
         wrong = f" is {stamps[0]:g} s in all rows"
         if back.any():
             row = int(np.argmax(back)) + 1
             wrong = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
-        raise file.wrong(f"column {file.name(time.column_or('t'))!r}{wrong}; stamps should increase")
+        raise file.error(f"column {file.find_column(time.column_or('t'))!r}{wrong}; stamps should increase")
     return stamps
 
 
@@ -125,18 +125,18 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarr
     """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
     keep = np.ones(len(stamps), dtype=bool)
     for column, value in (table.where or {}).items():
-        file.check_length(file.name(column), len(stamps))
-        given = file.values(file.name(column))
+        file.check_length(file.find_column(column), len(stamps))
+        given = file.load_values(file.find_column(column))
         keep &= given == value
         if not keep.any():
             found = ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in np.unique(given.astype(object))[:6])
-            raise file.wrong(f"[log] where leaves no row: '{column}' is never {value!r}; values: {found}")
+            raise file.error(f"[log] where leaves no row: '{column}' is never {value!r}; values: {found}")
     for limit, outside in ((table.start, np.less), (table.stop, np.greater)):
         if limit is not None:
             keep &= ~outside(stamps, limit)
     rows = np.flatnonzero(keep)
     if len(rows) < MIN_SAMPLES:
-        raise file.wrong(
+        raise file.error(
             f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
         )
     if len(rows) < len(stamps):
@@ -147,9 +147,9 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarr
 def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     """Parts between gaps, without those that are too short and without repeated stamps; InputError where few are left."""
     times, rows = stamps.times, stamps.rows
-    parts = _split_at_intervals(times, stamps.gap)
+    parts = _split_at_intervals(times, stamps.max_interval)
     grids = [fit_even_stamps(times[p]) for p in parts if _is_long_enough(p)]
-    even = bool(grids) and all(grid.even for grid in grids)
+    even = bool(grids) and all(grid.is_even for grid in grids)
     distinct = np.ones(len(times), dtype=bool)
     if not even:
         # no spline takes a stamp twice
@@ -159,12 +159,12 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         row = rows[int(np.argmin(distinct))] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
         times, rows = times[distinct], rows[distinct]
-        parts = _split_at_intervals(times, stamps.gap)
+        parts = _split_at_intervals(times, stamps.max_interval)
     kept = [p for p in parts if _is_long_enough(p)]
     samples = sum(map(_count_samples, kept))
     if samples < MIN_SAMPLES:
         most = max(map(_count_samples, parts))
-        raise file.wrong(f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {most}); a log needs them")
+        raise file.error(f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {most}); a log needs them")
     intervals = np.diff(times)
     if len(parts) > 1:
         widest = int(np.argmax(intervals))
@@ -173,8 +173,8 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
             f"Gaps: {len(parts) - 1}; segments: {len(kept)}; the longest gap is {intervals[widest]:.4g} s, "
             f"after data row {rows[widest] + 1}" + (f"; {left_out} samples between gaps were left out." if left_out else ".")
         )
-    inside = intervals[intervals <= stamps.gap]
-    period = stamps.median
+    inside = intervals[intervals <= stamps.max_interval]
+    period = stamps.median_interval
     if even:
         times = times.copy()
         for p, grid in zip(kept, grids, strict=True):
@@ -182,7 +182,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         period = grids[kept.index(longest_segment(kept))].period
     sampling = Sampling(
         samples=len(stamps.times),
-        median_period=stamps.median,
+        median_period=stamps.median_interval,
         jitter=float(np.std(inside)) if len(inside) else 0.0,
         longest_interval=float(intervals.max()),
         gaps=len(parts) - 1,
@@ -208,7 +208,7 @@ def _split_at_intervals(stamps: np.ndarray, gap: float) -> list[slice]:
 class StampFit(NamedTuple):
     """The even grid that fits stamps best: whether they lie on it, its period and its first time, s."""
 
-    even: bool
+    is_even: bool
     period: float
     first: float
 

@@ -78,7 +78,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
 def draw_element(found: ElementIdentification) -> list[Drawn]:
     """All figures of a transmission on a test rig."""
     trace, record = found.trace, found.task.record
-    channels = record.findings.channels
+    channels = record.statistics.channels
     unit, torque_unit = channels["theta_e"].unit, channels["u"].unit
     x, u, fitted = (trace[name].to_numpy() for name in ("displacement", "u", "torque"))
     every = max(len(x) // _POINTS, 1)

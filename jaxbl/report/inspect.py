@@ -36,19 +36,19 @@ def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequenc
     record = inspection.record
     text = json.dumps(to_jsonable(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
-    judgements = [(one.quantity, one.answer, one.why) for one in inspection.judgements]
+    judgements = [(one.quantity, one.answer, one.reason) for one in inspection.identifiability]
     tables = [
         PageTable("What the log can identify", ["quantity", "", "why"], judgements),
         PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
     ]
     how = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
-    lead = [*record.warnings, _headline(record), inspection.as_read()]
+    lead = [*record.warnings, _headline(record), inspection.describe_sizes()]
     write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, how, record.notes, steps)
     return summary(inspection)
 
 
 def _headline(record: Record) -> str:
-    sampling, count = record.findings.sampling, len(record.segments)
+    sampling, count = record.statistics.sampling, len(record.segments)
     span = float(sum(record.time[s][-1] - record.time[s][0] for s in record.segments)) + count * record.sample_period
     stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
     parts = "one segment" if count == 1 else f"{count} segments"
@@ -59,7 +59,7 @@ _CHANNEL_COLUMNS = ("channel", "unit", "least", "largest", "resolution", "noise"
 
 
 def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
-    for name, c in record.findings.channels.items():
+    for name, c in record.statistics.channels.items():
         skew = "–" if c.skew is None or c.skew_error is None else f"{1e3 * c.skew:.2g} ± {1e3 * c.skew_error:.1g} ms"
         yield (
             name, c.unit, f"{c.least:.4g}", f"{c.largest:.4g}", f"{c.resolution:.3g}" if c.resolution else "–",
@@ -71,12 +71,14 @@ def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
 def summary(inspection: Inspection) -> list[str]:
     """The log: channels and what can be identified, in tables of 80 columns, and as many remarks as there is room for."""
     record = inspection.record
-    lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.as_read(), ""]
+    lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.describe_sizes(), ""]
     columns = list(zip(_CHANNEL_COLUMNS, *_channel_rows(record), strict=True))
     lines += format_table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
     lines += [
         "",
-        *format_descriptions([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)]),
+        *format_descriptions(
+            [("identifies", "", ""), *((j.quantity, j.answer, j.reason) for j in inspection.identifiability)]
+        ),
     ]
     room = max(_LINES - len(lines) - 1, _REMARKS)
     notes = list(record.notes)
@@ -94,7 +96,7 @@ def draw_inspection(inspection: Inspection) -> list[Drawn]:
         drawn.append(_torque_over_velocity(record))
     if inspection.twist is not None:
         drawn.append(_twist(inspection))
-    if not record.findings.sampling.even:
+    if not record.statistics.sampling.even:
         drawn.append(_intervals(record))
     return drawn
 
@@ -114,8 +116,8 @@ def _shown(record: Record, segments: Sequence[slice]) -> np.ndarray:
 def _channels(record: Record) -> Drawn:
     values = _values(record)
     side = main_side(record)
-    unit = record.findings.channels[POSITION_CHANNELS[side]].unit
-    channels = [(_CHANNELS[n][0], record.findings.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
+    unit = record.statistics.channels[POSITION_CHANNELS[side]].unit
+    channels = [(_CHANNELS[n][0], record.statistics.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
     rows = [*channels, (f"{side} velocity", f"{unit}/s", compute_velocity(record, side), COLOURS[3])]
     figure, axes = stacked(len(rows), 1.5, width=7.0)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
@@ -132,7 +134,7 @@ def _spectra(record: Record) -> Drawn:
     part = longest_segment(record.segments)
     figure, axes = stacked(len(values), 2.1, "frequency (Hz)", width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
-        channel = record.findings.channels[name]
+        channel = record.statistics.channels[name]
         frequency, density = power_spectrum(signal[part], record.sample_period)
         label, colour = _CHANNELS[name]
         ax.loglog(frequency, np.sqrt(density), color=colour, lw=1.0)
@@ -153,8 +155,8 @@ def _spectra(record: Record) -> Drawn:
 def _torque_over_velocity(record: Record) -> Drawn:
     assert record.torque is not None
     side = main_side(record)
-    channel = record.findings.channels[POSITION_CHANNELS[side]]
-    dynamics = record.findings.dynamics
+    channel = record.statistics.channels[POSITION_CHANNELS[side]]
+    dynamics = record.statistics.dynamics
     speed = compute_velocity(record, side)
     torque, label, less, edge = record.torque.copy(), "torque u", "", 0
     if dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05:
@@ -174,7 +176,7 @@ def _torque_over_velocity(record: Record) -> Drawn:
     ax.axvline(0.0, color=FAINT, lw=0.8)
     # a few samples at sharp corners of the motion would set the scale
     ends = limits(torque[at], share=0.002, room=0.15)
-    torque_unit = record.findings.channels["u"].unit
+    torque_unit = record.statistics.channels["u"].unit
     ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({torque_unit})", ylim=ends)
     return Drawn("torque_over_velocity", figure, f"Torque over velocity: friction, as far as this log shows it.{less}")
 
@@ -182,15 +184,15 @@ def _torque_over_velocity(record: Record) -> Drawn:
 def _twist(inspection: Inspection) -> Drawn:
     record, twist = inspection.record, inspection.twist
     assert twist is not None
-    unit = record.findings.channels["theta_e"].unit
+    unit = record.statistics.channels["theta_e"].unit
     torque = record.torque if record.transmitted is None else record.transmitted
-    panels = [(record.positions["load"], f"load position θs ({record.findings.channels['theta_s'].unit})")]
+    panels = [(record.positions["load"], f"load position θs ({record.statistics.channels['theta_s'].unit})")]
     if torque is not None and np.ptp(torque):
         name = "u" if record.transmitted is None else "transmitted"
-        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({record.findings.channels[name].unit})"))
+        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({record.statistics.channels[name].unit})"))
     figure, axes = subplots(7.0, 3.6, columns=len(panels), sharey=True)
     at = _shown(record, record.segments)
-    gearing = record.findings.gearing
+    gearing = record.statistics.gearing
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")
         chosen = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
@@ -213,11 +215,11 @@ def _twist(inspection: Inspection) -> Drawn:
 
 def _intervals(record: Record) -> Drawn:
     ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
-    inside = record.intervals <= GAP_PERIODS * record.findings.sampling.median_period
+    inside = record.intervals <= GAP_PERIODS * record.statistics.sampling.median_period
     ends, intervals = ends[inside], intervals[inside]
     figure, (left, right) = subplots(7.0, 2.6, columns=2, width_ratios=(3, 1), sharey=True)
     left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
-    left.axhline(1e3 * record.findings.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
+    left.axhline(1e3 * record.statistics.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
     left.set(xlabel="time (s)", ylabel="interval\n(ms)")
     legend(left)
     right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])

@@ -38,7 +38,7 @@ class LogSignals:
         self.time = self.trace["t"].to_numpy()
         self.sides = [side for side in SIDES if f"{side}.velocity" in self.trace]
         self.geared = "twist" in self.trace
-        channels = self.record.findings.channels
+        channels = self.record.statistics.channels
         self.unit = {side: channels[POSITION_CHANNELS[side]].unit for side in self.sides}
         self.torque_unit = "N" if self.unit["motor"] == "m" else "N m"
         self.experiment = found.model.build()

@@ -73,9 +73,9 @@ def test_a_log_without_torque_says_what_is_missing(tmp_path, log):
 
 
 def test_inspect_says_what_needs_the_load(log):
-    answers = {one.quantity: one for one in inspect(log).judgements}
+    answers = {one.quantity: one for one in inspect(log).identifiability}
     assert answers["lost motion"].answer == "weak"
-    assert "jaxbl identify" in answers["lost motion"].why
+    assert "jaxbl identify" in answers["lost motion"].reason
 
 
 def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeypatch):

@@ -38,7 +38,7 @@ def test_both_are_found_and_corrected(read, gap, skew, offset):
         assert record.warnings[0].startswith("theta_s is 3.0") and "ms later than theta_e" in record.warnings[0]
         assert record.warnings[1].startswith("theta_e - 20 theta_s is 0.37") and "corrected" in record.warnings[1]
     # what was taken for a delay, or for a zero point, is no lost motion
-    assert record.findings.gearing.lost_motion == pytest.approx(gap + 4e-3, abs=1e-3 + 0.02 * gap)
+    assert record.statistics.gearing.lost_motion == pytest.approx(gap + 4e-3, abs=1e-3 + 0.02 * gap)
 
 
 def test_what_log_says_holds(read):
@@ -74,7 +74,7 @@ def test_a_constant_torque_of_the_motor_is_no_sure_offset(read):
 def test_friction_that_winds_up_a_soft_shaft_is_no_clock(read):
     soft = NominalDrive(**vars(NOMINAL) | {"stiffness": 2.0})
     record = read(axis(stiffness=2.0), nominal=soft)
-    assert record.findings.gearing.skew > 1e-3
+    assert record.statistics.gearing.skew > 1e-3
     assert record.corrections == {} and record.warnings == ()
 
 
@@ -123,7 +123,7 @@ def test_a_screw_twists_in_radians(read):
     frame["theta_s"] *= 1e3
     frame = frame.iloc[:4000]
     record = read(frame, {"theta_s": {"unit": "mm"}})
-    assert record.findings.channels["theta_s"].unit == "m"
+    assert record.statistics.channels["theta_s"].unit == "m"
     (note,) = (one for one in record.notes if one.startswith("Lost motion"))
     assert " rad (95 %" in note
 

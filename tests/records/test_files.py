@@ -79,9 +79,9 @@ def test_every_kind_of_file_gives_the_same_columns(name, tmp_path):
     keys = (0, 1) if name.startswith("bare") else ("t", "u")
     assert set(keys) <= set(columns.columns)
     for key, number, values in zip(keys, (0, 1), (T, U), strict=True):
-        np.testing.assert_array_equal(columns.numbers(key), values)
+        np.testing.assert_array_equal(columns.load_numbers(key), values)
         if not name.endswith(".json"):
-            np.testing.assert_array_equal(columns.numbers(number), values)
+            np.testing.assert_array_equal(columns.load_numbers(number), values)
 
 
 @settings(max_examples=50, deadline=None)
@@ -95,8 +95,8 @@ def test_numbers_survive_text(tmp_path_factory, values, separator, header):
     rows = [separator.join(repr(v) for v in (value, -value)) for value in values]
     path.write_text("\n".join([separator.join("ab")] * header + rows))
     columns = read_log_file(path)
-    np.testing.assert_array_equal(columns.numbers("a" if header else 0), values)
-    np.testing.assert_array_equal(columns.numbers(1), np.negative(values))
+    np.testing.assert_array_equal(columns.load_numbers("a" if header else 0), values)
+    np.testing.assert_array_equal(columns.load_numbers(1), np.negative(values))
 
 
 def test_structures_and_matrices_of_matlab_have_columns_of_their_own(tmp_path):
@@ -107,7 +107,7 @@ def test_structures_and_matrices_of_matlab_have_columns_of_their_own(tmp_path):
     for name in ("a.mat", "b.mat"):
         columns = read_log_file(tmp_path / name)
         for column, values in {"log.t": T, "log.inner.u": U, "both[0]": T, "both[1]": U}.items():
-            np.testing.assert_array_equal(columns.numbers(column), values)
+            np.testing.assert_array_equal(columns.load_numbers(column), values)
 
 
 def test_cells_of_matlab_and_matrices_of_json(tmp_path):
@@ -124,7 +124,7 @@ def test_cells_of_matlab_and_matrices_of_json(tmp_path):
     for name, columns in (names | {"d.json": (0, 1)}).items():
         file = read_log_file(tmp_path / name, {"runs[0]"})
         for column, values in zip(columns, (T, U), strict=True):
-            np.testing.assert_array_equal(file.numbers(column), values)
+            np.testing.assert_array_equal(file.load_numbers(column), values)
 
 
 def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkeypatch):
@@ -136,8 +136,8 @@ def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkey
         file = read_log_file(tmp_path / name, {"t", 1})
         assert list(file.columns) == ["t", "u", "other"] and isinstance(file.columns["other"], Column)
         assert len(file.columns["other"]) == 5
-        np.testing.assert_array_equal(file.numbers("u"), U)
-        np.testing.assert_array_equal(file.numbers("other"), 2.0 * U)
+        np.testing.assert_array_equal(file.load_numbers("u"), U)
+        np.testing.assert_array_equal(file.load_numbers("other"), 2.0 * U)
 
 
 BAD = {
@@ -234,7 +234,7 @@ def test_exports_with_remarks_before_their_rows(tmp_path):
     (tmp_path / "epos.csv").write_bytes(EPOS.replace("\n", "\r\n").encode())
     file = read_log_file(tmp_path / "epos.csv")
     assert list(file.columns) == ["t", "Velocity actual value averaged", "Torque actual value averaged"]
-    np.testing.assert_array_equal(file.numbers(1), [0.0, -3.0, 7.0])
+    np.testing.assert_array_equal(file.load_numbers(1), [0.0, -3.0, 7.0])
     assert file.units["t"] == "ms" and file.units["Torque actual value averaged"] == "%"
     assert file.notes == [
         "Units by the file itself, which [log] has to repeat: t ms, Velocity actual value averaged rpm, Torque actual value "
@@ -243,9 +243,9 @@ def test_exports_with_remarks_before_their_rows(tmp_path):
     (tmp_path / "scope.csv").write_text(SCOPE)
     file = read_log_file(tmp_path / "scope.csv")
     assert list(file.columns) == ["t", "position", "current", "fast"]
-    np.testing.assert_array_equal(file.numbers("position"), [0.5, 1.5, 2.5])
+    np.testing.assert_array_equal(file.load_numbers("position"), [0.5, 1.5, 2.5])
     # sampled at times of its own: the last is before those of the others
-    np.testing.assert_array_equal(file.numbers("fast"), [0.0, 20.0, 20.0])
+    np.testing.assert_array_equal(file.load_numbers("fast"), [0.0, 20.0, 20.0])
     assert file.notes == ["'fast' has times of its own; its values are interpolated to the others' times."]
 
 
@@ -256,8 +256,8 @@ def test_tdms_by_its_library(tmp_path):
         writer.write_segment(channels)
     file = read_log_file(tmp_path / "log.tdms")
     assert list(file.columns) == ["u", "theta_e", "t"]
-    np.testing.assert_array_equal(file.numbers("u"), U)
-    np.testing.assert_allclose(file.numbers("t"), T)
+    np.testing.assert_array_equal(file.load_numbers("u"), U)
+    np.testing.assert_allclose(file.load_numbers("t"), T)
 
 
 @pytest.mark.filterwarnings("ignore")  # of the library
@@ -269,9 +269,9 @@ def test_mdf_by_its_library(tmp_path):
         mdf.save(tmp_path / "log.mf4")
     file = read_log_file(tmp_path / "log.mf4")
     assert set(file.columns) == {"t", "u", "theta_e", "slow"}
-    np.testing.assert_array_equal(file.numbers("theta_e"), 2.0 * U)
-    np.testing.assert_allclose(file.numbers("t"), T)
-    np.testing.assert_allclose(file.numbers("slow"), [0.0, 1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(file.load_numbers("theta_e"), 2.0 * U)
+    np.testing.assert_allclose(file.load_numbers("t"), T)
+    np.testing.assert_allclose(file.load_numbers("slow"), [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
 def wrote_mcap(path):
@@ -304,12 +304,12 @@ def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
     file = read_log_file(tmp_path / "log.mcap", {"t", "/axis.u", "/slow.v"})
     assert list(file.columns) == ["t", "/axis.u", "/axis.angles[0]", "/axis.angles[1]", "/slow.v"]
     for column, values in {"t": T, "/axis.u": U, "/axis.angles[0]": T, "/slow.v": 10.0 * T}.items():
-        np.testing.assert_allclose(file.numbers(column), values, atol=1e-7)
+        np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-7)
     assert file.notes == ["/slow is interpolated to the times of /axis, of which there are most."]
     wrote_bag(tmp_path / "bag")
     file = read_log_file(tmp_path / "bag", {"t", "/joint_states.position[0]"})
     for column, values in {"t": T, "/joint_states.position[0]": T, "/joint_states.effort[0]": U}.items():
-        np.testing.assert_allclose(file.numbers(column), values, atol=1e-9)
+        np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_names_within_a_structure_are_told(tmp_path):
     """Nothing wanted is in the file: its user learns what is."""
     savemat(tmp_path / "log.mat", {"log": {"time": T, "u": U}, "rate": T[:3]})
     with pytest.raises(InputError, match=r"no column 'theta_e'; valid: rate, log.time, log.u"):
-        read_log_file(tmp_path / "log.mat", {"t", "u", "theta_e"}).name("theta_e")
+        read_log_file(tmp_path / "log.mat", {"t", "u", "theta_e"}).find_column("theta_e")
     with pytest.raises(InputError, match=r"log.mat: no column 't'; .*log\.u"):
         read_record(tmp_path / "log.mat")
 
@@ -345,7 +345,7 @@ def test_a_decimal_comma_that_comes_late(tmp_path):
     rows = [*(f"{i};0;0" for i in range(60)), "60,500;1,5;2"]
     (tmp_path / "log.csv").write_text("t;u;x\n" + "\n".join(rows))
     file = read_log_file(tmp_path / "log.csv")
-    assert file.numbers("t")[-1] == 60.5 and file.numbers("u")[-1] == 1.5
+    assert file.load_numbers("t")[-1] == 60.5 and file.load_numbers("u")[-1] == 1.5
 
 
 def test_a_period_in_place_of_stamps_counts_the_channels_that_are_read(tmp_path):
@@ -363,7 +363,7 @@ def test_columns_are_found_by_the_name_that_the_file_has_and_by_the_one_that_mes
     pd.DataFrame({"t": T, name: U}).to_csv(tmp_path / "log.csv", index=False)
     file = read_log_file(tmp_path / "log.csv", ("t", name))
     for column in (name, repr(name)[1:-1]):
-        np.testing.assert_array_equal(file.numbers(column), U)
+        np.testing.assert_array_equal(file.load_numbers(column), U)
 
 
 def read_blocks(path):
@@ -400,7 +400,7 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
     assert files.is_log(tmp_path / "log.REC") and files.log_suffixes()[-1] == ".rec"
     columns = read_log_file(tmp_path / "log.REC", ("t", "u"))
     for name, values in {"t": T, "u": U}.items():
-        np.testing.assert_array_equal(columns.numbers(name), values)
+        np.testing.assert_array_equal(columns.load_numbers(name), values)
     assert columns.notes == (["Read block by block."] if read is lazy_blocks else [])
 
 

@@ -38,20 +38,20 @@ def looked_at(tmp_path, frame, gear_ratio, log=None):
 
 def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide):
     found = looked_at(tmp_path, wide, 5.0)
-    gearing = found.record.findings.gearing
-    assert gearing.wide and gearing.skew is None
+    gearing = found.record.statistics.gearing
+    assert gearing.is_loose and gearing.skew is None
     assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
     assert len(found.record.notes) == 1
     assert found.record.notes[0].startswith("theta_e - 5 theta_s ranges over 0.3")
     assert found.record.notes[0].endswith("with backlash or wind-up of that size this log hardly confirms gear_ratio.")
     # asymptotically 4 j0 either way, if nothing is known of the wind-up
     assert gearing.lost_motion_interval[0] < 0.14 and gearing.lost_motion_interval[1] > 0.16
-    answers = {j.quantity: j for j in found.judgements}
+    answers = {j.quantity: j for j in found.identifiability}
     assert answers["gear ratio"].answer == answers["lost motion"].answer == "weak"
-    assert "gap and wind-up take" in answers["gear ratio"].why
+    assert "gap and wind-up take" in answers["gear ratio"].reason
     # the gap passes for friction in a rigid drive
     for quantity in ("inertia", "viscous friction", "Coulomb friction"):
-        assert answers[quantity].answer == "weak" and "loosely" in answers[quantity].why
+        assert answers[quantity].answer == "weak" and "loosely" in answers[quantity].reason
     assert looked_at(tmp_path, wide, None).record.notes == ()
 
 

@@ -16,7 +16,10 @@ from jaxbl.records import inspect
 
 def answers(tmp_path, frame, log=None, gear_ratio=GEAR_RATIO):
     frame.to_parquet(tmp_path / "log.parquet")
-    return {j.quantity: (j.answer, j.why) for j in inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio).judgements}
+    return {
+        j.quantity: (j.answer, j.reason)
+        for j in inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio).identifiability
+    }
 
 
 QUANTITIES = ["inertia", "viscous friction", "Coulomb friction", "constant torque", "gear ratio", "lost motion", "stiffness"]
@@ -38,10 +41,10 @@ def test_a_gap_whose_flank_is_chosen_by_inertia(tmp_path):
     frame["theta_s"] -= 0.05 * np.sign(acceleration) / GEAR_RATIO
     frame.to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
-    gearing = found.record.findings.gearing
+    gearing = found.record.statistics.gearing
     assert gearing.lost_motion == pytest.approx(0.1, rel=0.1)
     assert gearing.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
-    assert found.judgements[5].answer == "yes"
+    assert found.identifiability[5].answer == "yes"
 
 
 def test_a_load_that_moves_on_its_own_tells_no_skew(tmp_path):
@@ -50,7 +53,7 @@ def test_a_load_that_moves_on_its_own_tells_no_skew(tmp_path):
     frame.to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO).record
     assert any(note.startswith("theta_e and theta_s are hardly related") for note in found.notes)
-    assert found.findings.channels["theta_s"].skew is None
+    assert found.statistics.channels["theta_s"].skew is None
 
 
 def test_a_compliant_transmission_shows_its_stiffness(tmp_path):
@@ -163,13 +166,13 @@ def test_the_whole_as_plain_data(tmp_path):
 
 
 def test_real_machines(tmp_path):
-    found = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).judgements}
+    found = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).identifiability}
     assert [found[q] for q in QUANTITIES] == ["yes"] * 4 + ["no"] + ["weak"] * 2
     found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    assert [j.answer for j in found.judgements[:5]] == ["no"] * 4 + ["yes"]
+    assert [j.answer for j in found.identifiability[:5]] == ["no"] * 4 + ["yes"]
     assert np.ptp(np.degrees(found.twist)) == pytest.approx(2.9, abs=0.5)
     free = inspect(real("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
-    assert free.judgements[0].answer == "weak"
+    assert free.identifiability[0].answer == "weak"
 
 
 def test_a_measured_transmitted_torque_shows_the_stiffness_without_an_input(tmp_path):

@@ -60,7 +60,7 @@ def taken(*blocks, table=None, columns=NAMES):
 def test_blocks_of_any_size_give_the_rows_as_they_are():
     rows = moved(1000)
     found, counts = taken(rows[:1], rows[1:300], rows[300:301], rows[301:])
-    assert [one.anew for one in found] == [True, False, False, False]
+    assert [one.starts_segment for one in found] == [True, False, False, False]
     assert [one.time for one in found] == pytest.approx([0.0, 0.001, 0.3, 0.301])
     np.testing.assert_array_equal(np.concatenate([one.torque for one in found]), rows[:, 1])
     for i, side in enumerate(("motor", "load")):
@@ -75,7 +75,7 @@ def test_lost_samples_are_interpolated_and_counted(cut):
     left = np.delete(rows, [500, 501], axis=0)
     found, counts = taken(left[:cut], left[cut:])
     assert counts == {LOST: 2}
-    assert not any(one.anew for one in found[1:])
+    assert not any(one.starts_segment for one in found[1:])
     torque = np.concatenate([one.torque for one in found])
     np.testing.assert_array_equal(torque[500:502], rows[499, 1])
     motor = np.concatenate([one.positions["motor"] for one in found])
@@ -88,7 +88,7 @@ def test_a_gap_in_time_begins_anew():
     for blocks in ((left,), (left[:500], left[500:])):
         found, counts = taken(*blocks)
         assert counts == {GAPS: 1}
-        assert [(one.anew, len(one.torque)) for one in found] == [(True, 500), (True, 490)]
+        assert [(one.starts_segment, len(one.torque)) for one in found] == [(True, 500), (True, 490)]
         assert found[1].time == pytest.approx(0.51)
 
 
@@ -106,7 +106,7 @@ def test_late_repeated_and_unreadable_rows_are_left_out():
 def test_a_clock_that_is_set_back_begins_anew():
     found, counts = taken(np.concatenate([moved(300, start=50.0), moved(200)]))
     assert counts == {RESTARTS: 1}
-    assert [(one.time, len(one.torque), one.anew) for one in found] == [(50.0, 300, True), (0.0, 200, True)]
+    assert [(one.time, len(one.torque), one.starts_segment) for one in found] == [(50.0, 300, True), (0.0, 200, True)]
 
 
 def test_stamps_may_jitter():

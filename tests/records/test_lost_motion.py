@@ -65,7 +65,7 @@ def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
             found = geared(load_driven(seed, around=around, **options), 1.0)
             assert found.flank == "motion", (seed, options)
-            assert not found.stands_out(1e-4) or found.lost_motion < 0.005
+            assert not found.exceeds_noise(1e-4) or found.lost_motion < 0.005
 
 
 def test_places_where_the_load_hardly_pulls_do_not_count():
@@ -81,7 +81,7 @@ def test_places_where_the_load_hardly_pulls_do_not_count():
 def test_it_is_told_with_its_interval(tmp_path):
     load_driven(0).to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", {"absent": ["u"]}, gear_ratio=1.0)
-    why = next(j.why for j in found.judgements if j.quantity == "lost motion")
+    why = next(j.reason for j in found.identifiability if j.quantity == "lost motion")
     assert why.startswith("theta_e shifts by 0.0") and why.endswith("as the load torque changes its sign")
     assert any(
         "after the load torque changed its sign, at 6" in note and "slipped coupling" in note for note in found.record.notes
@@ -104,11 +104,11 @@ def test_too_little_tells_nothing():
 def test_a_real_servo_whose_load_was_turned_around():
     """Published: the load's direction is reversed at 60 to 66 s, which shifts one encoder by 0.39 to 0.40 degrees."""
     found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    lost = found.record.findings.gearing
+    lost = found.record.statistics.gearing
     low, high = np.degrees(lost.lost_motion_interval)
     assert lost.flank == "load" and len(lost.flank_times) == 1
     assert 60.0 < lost.flank_times[0] < 66.0
     assert np.degrees(lost.lost_motion) == pytest.approx(0.395, abs=0.01)
     assert low < 0.39 and high > 0.40 and high - low < 0.15
-    assert next(j for j in found.judgements if j.quantity == "lost motion").answer == "yes"
+    assert next(j for j in found.identifiability if j.quantity == "lost motion").answer == "yes"
     assert any(note.startswith("Lost motion at the motor: 0.0069") for note in found.record.notes)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxbl.records import TurningLog, turned
+from jaxbl.records import TurningLog, find_zero_shift
 
 
 def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0) -> TurningLog:
@@ -24,14 +24,14 @@ def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns
 
 @pytest.mark.parametrize("gear", [False, True])
 def test_the_difference_of_the_zeros_is_found(gear: bool):
-    found = turned(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
+    found = find_zero_shift(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
     assert found is not None and found.waves == (5, 10)
     assert abs(found.value - 0.4) < 4.0 * found.error < 0.04
 
 
 def test_the_smallest_of_equal_places_is_taken():
     # 5 and 10 a turn repeat every 72 degrees
-    found = turned(log(1, 0.0), log(2, 3.0))
+    found = find_zero_shift(log(1, 0.0), log(2, 3.0))
     assert found is not None
     assert abs(found.value - (3.0 - 2.0 * 2.0 * np.pi / 5.0)) < 4.0 * found.error
 
@@ -47,4 +47,4 @@ def test_the_smallest_of_equal_places_is_taken():
     ids=["one zero", "no cogging", "cogging in one alone", "less than a turn"],
 )
 def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
-    assert turned(first, second) is None
+    assert find_zero_shift(first, second) is None

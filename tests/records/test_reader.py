@@ -11,7 +11,7 @@ from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, 
 from small_study import small
 
 from jaxbl.errors import InputError
-from jaxbl.records import LogTable, NominalDrive, join, read_log_table, read_record
+from jaxbl.records import LogTable, NominalDrive, join_records, read_log_table, read_record
 from jaxbl.sweeps.trial import run
 
 
@@ -31,13 +31,13 @@ def test_a_log_in_si_units_is_read_as_it_stands(tmp_path):
     assert record.sample_period == pytest.approx(1e-3, rel=1e-12)
     assert record.segments == (slice(0, 4000),)
     assert (record.start, record.closed_loop, record.transmitted, record.notes) == (0.0, None, None, ())
-    assert record.findings.sampling.even
+    assert record.statistics.sampling.even
     # the rough regression finds the drive that made the log
-    found = dict(zip(record.findings.dynamics.names, record.findings.dynamics.values, strict=True))
+    found = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
     assert found["inertia"] == pytest.approx(INERTIA, rel=0.01)
     assert found["viscous"] == pytest.approx(VISCOUS, rel=0.02)
     assert found["coulomb"] == pytest.approx(COULOMB, rel=0.1)
-    assert abs(record.findings.channels["u"].skew) < 1e-4
+    assert abs(record.statistics.channels["u"].skew) < 1e-4
 
 
 def test_what_simulate_leaves_is_a_log(tmp_path):
@@ -45,8 +45,8 @@ def test_what_simulate_leaves_is_a_log(tmp_path):
     trial = run(small(changes))
     record = read_record(wrote(tmp_path, trial.trace), trial.config.log, gear_ratio=5.0)
     np.testing.assert_array_equal(record.torque, trial.trace["u"])
-    assert record.findings.channels["theta_e"].resolution == pytest.approx(1e-4)
-    assert record.findings.channels["theta_s"].resolution == pytest.approx(1e-5)
+    assert record.statistics.channels["theta_e"].resolution == pytest.approx(1e-4)
+    assert record.statistics.channels["theta_s"].resolution == pytest.approx(1e-5)
 
 
 ONE = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "m": 1.0, "mm": 1e-3}
@@ -92,7 +92,7 @@ def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
     # where a wrapped position starts is not known
     motion -= round(motion[0] / (one * factor * log["wrap"])) * one * factor * log["wrap"] if "wrap" in log else 0.0
     np.testing.assert_allclose(motion, 0.0, atol=0.5 * step + 1e-6)
-    assert record.findings.channels["theta_e"].unit == ("m" if unit in ("m", "mm") else "rad")
+    assert record.statistics.channels["theta_e"].unit == ("m" if unit in ("m", "mm") else "rad")
 
 
 @settings(max_examples=40, deadline=None)
@@ -119,7 +119,7 @@ def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, s
 def test_linear_axes_measure_force(tmp_path):
     frame = made().drop(columns="theta_s")
     record = read_record(wrote(tmp_path, frame), {"theta_e": {"unit": "m"}})
-    assert [record.findings.channels[name].unit for name in ("u", "theta_e")] == ["N", "m"]
+    assert [record.statistics.channels[name].unit for name in ("u", "theta_e")] == ["N", "m"]
     with pytest.raises(
         InputError, match=r"\[log\] u.unit is N m, but the position is in m; on a linear axis it should be N"
     ):
@@ -142,7 +142,7 @@ def test_rounded_stamps_are_an_even_grid(tmp_path):
     for step in (1e-3, 5e-3):
         stamps = np.floor(frame["t"] / step + 1e-9) * step
         record = read_record(wrote(tmp_path, frame.assign(t=stamps)), gear_ratio=GEAR_RATIO)
-        assert record.findings.sampling.even and record.findings.sampling.repeated == 0
+        assert record.statistics.sampling.even and record.statistics.sampling.repeated == 0
         assert record.sample_period == pytest.approx(1.25e-3, rel=1e-4)
         np.testing.assert_array_equal(record.torque, frame["u"])
 
@@ -155,8 +155,8 @@ def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
     times = uneven()
     record = read_record(wrote(tmp_path, made(times)), gear_ratio=GEAR_RATIO)
     truth = made(times[0] + record.time)
-    assert record.sample_period == record.findings.sampling.median_period == pytest.approx(np.median(np.diff(times)))
-    assert not record.findings.sampling.even
+    assert record.sample_period == record.statistics.sampling.median_period == pytest.approx(np.median(np.diff(times)))
+    assert not record.statistics.sampling.even
     assert any(note.startswith("Resampled from uneven stamps: every 1.0") for note in record.notes)
     np.testing.assert_allclose(np.diff(record.time), record.sample_period, rtol=1e-9)
     np.testing.assert_allclose(record.positions["motor"], truth["theta_e"], atol=1e-8)
@@ -168,7 +168,7 @@ def test_resampling_keeps_the_impulse_of_a_held_torque(tmp_path):
     frame = made(times)
     for period in (None, 5e-4, 3.7e-3):
         record = read_record(wrote(tmp_path, frame), {"resample": period} if period else None)
-        assert record.sample_period == (period or record.findings.sampling.median_period)
+        assert record.sample_period == (period or record.statistics.sampling.median_period)
         impulse = np.concatenate([[0.0], np.cumsum(frame["u"].to_numpy()[:-1] * np.diff(times))])
         ends = record.time + times[0]
         expected = np.interp(ends, times, impulse)
@@ -196,7 +196,7 @@ def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
     kept = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
     again = pd.concat([kept.iloc[:500], kept.iloc[[499, 499]], kept.iloc[500:]])
     record = read_record(wrote(tmp_path, again), gear_ratio=GEAR_RATIO)
-    sampling = record.findings.sampling
+    sampling = record.statistics.sampling
     assert (sampling.repeated, sampling.gaps, len(record.segments)) == (2, 2, 3)
     assert sampling.longest_interval == pytest.approx(0.21, rel=0.05)
     assert "2 rows have the stamp of the row before and were left out (data row 501 first)." in record.notes
@@ -247,7 +247,7 @@ def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew,
     frame = made(count=6000, skew=skew, seed=seed, **quality)
     path = wrote(tmp_path, frame)
     record = read_record(path, gear_ratio=GEAR_RATIO)
-    found = record.findings.gearing
+    found = record.statistics.gearing
     assert abs(found.skew - skew) < 4.0 * found.skew_error
     assert found.skew_error < 5e-5
     assert found.lost_motion == pytest.approx(quality.get("gap", 0.0), rel=0.03, abs=2e-3)
@@ -256,7 +256,7 @@ def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew,
     # undone on request
     undone = read_record(path, {"theta_s": {"skew": "estimate"}})
     assert any(note.startswith("theta_s: moved by its skew") for note in undone.notes)
-    assert abs(undone.findings.gearing.skew) < 4.0 * found.skew_error
+    assert abs(undone.statistics.gearing.skew) < 4.0 * found.skew_error
 
 
 def test_a_given_skew_is_undone(tmp_path):
@@ -269,10 +269,10 @@ def test_a_given_skew_is_undone(tmp_path):
     np.testing.assert_allclose(record.torque, frame["u"][3:], atol=1e-9)
     np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], frame["theta_e"][3:], atol=1e-6)
     late = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
-    found = read_record(wrote(tmp_path, late)).findings.channels["u"]
+    found = read_record(wrote(tmp_path, late)).statistics.channels["u"]
     assert found.skew == pytest.approx(4e-3, abs=4.0 * found.skew_error + 1e-4)
     record = read_record(wrote(tmp_path, late), {"u": {"skew": 4e-3}})
-    assert abs(record.findings.channels["u"].skew) < 2e-4
+    assert abs(record.statistics.channels["u"].skew) < 2e-4
 
 
 def test_resolution_noise_saturation_and_jumps(tmp_path):
@@ -283,22 +283,22 @@ def test_resolution_noise_saturation_and_jumps(tmp_path):
     frame.loc[1500, "theta_e"] += 100.0 * step
     frame.loc[2500:, "theta_e"] -= 150.0 * step
     record = read_record(wrote(tmp_path, frame))
-    motor, torque = record.findings.channels["theta_e"], record.findings.channels["u"]
+    motor, torque = record.statistics.channels["theta_e"], record.statistics.channels["u"]
     assert motor.resolution == pytest.approx(step, rel=1e-6)
-    load = record.findings.channels["theta_s"]
+    load = record.statistics.channels["theta_s"]
     assert GEAR_RATIO * load.noise == pytest.approx(math.hypot(5e-3, step / math.sqrt(12.0)), rel=0.1)
     assert motor.jumps == 2
     assert any(note.startswith("theta_e: 2 jumps") for note in record.notes)
     assert torque.saturated == pytest.approx((frame["u"].abs() == limit).mean())
     assert load.jumps == 0
     declared = read_record(wrote(tmp_path, frame), {"u": {"saturation": float(limit)}})
-    assert declared.findings.channels["u"].saturated == torque.saturated
+    assert declared.statistics.channels["u"].saturated == torque.saturated
     assert motor.bandwidth == pytest.approx(2.1, abs=1.0)
 
 
 def test_uneven_stamps_are_no_noise_and_no_jumps(tmp_path):
     record = read_record(wrote(tmp_path, made(uneven(), noise=2e-3)))
-    motor = record.findings.channels["theta_e"]
+    motor = record.statistics.channels["theta_e"]
     # splines between the readings smooth a little
     assert motor.noise == pytest.approx(2e-3, rel=0.3)
     assert motor.jumps == 0
@@ -602,14 +602,14 @@ def test_emps_is_read_as_published():
     for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
         record = read_record(real(f"emps/{name}"), EMPS)
         assert (len(record.time), record.sample_period) == (24841, pytest.approx(1e-3))
-        assert record.findings.sampling.even and record.closed_loop
+        assert record.statistics.sampling.even and record.closed_loop
         assert record.notes == ("There is no theta_s (load position) in this log.",)
         # the published fit: 95.109 kg, 203.5 N s/m, 20.394 N, -3.165 N
-        found = dict(zip(record.findings.dynamics.names, record.findings.dynamics.values, strict=True))
+        found = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
         assert found["inertia"] == pytest.approx(95.1, rel=0.03)
         assert found["viscous"] == pytest.approx(203.5, rel=0.1)
         assert found["coulomb"] == pytest.approx(20.4, rel=0.15)
-        assert abs(record.findings.channels["u"].skew) < 1e-3
+        assert abs(record.statistics.channels["u"].skew) < 1e-3
 
 
 def test_emps_with_the_wrong_sign_is_refused():
@@ -622,10 +622,10 @@ def test_xl330_records_are_resampled():
     assert len(files) == 8
     for file in files:
         record = read_record(file, XL330)
-        assert not record.findings.sampling.even
+        assert not record.statistics.sampling.even
         assert 3.4e-3 < record.sample_period < 5.4e-3
-        assert record.findings.channels["theta_e"].resolution == pytest.approx(2.0 * math.pi / 4096, rel=1e-6)
-        assert record.findings.channels["theta_e"].jumps == 0
+        assert record.statistics.channels["theta_e"].resolution == pytest.approx(2.0 * math.pi / 4096, rel=1e-6)
+        assert record.statistics.channels["theta_e"].jumps == 0
         assert np.abs(record.torque).max() <= 1.0
         np.testing.assert_allclose(np.diff(record.time), record.sample_period, rtol=1e-6)
         if record.torque.min() < 0.0:
@@ -639,10 +639,10 @@ def test_servoproject_has_two_encoders_and_no_torque():
     path = real("servoproject_dual_encoder/outputEncoderData.txt")
     record = read_record(path, SERVO, gear_ratio=1.0)
     assert (len(record.time), record.torque) == (42000, None)
-    assert record.findings.gearing.ratio == pytest.approx(1.0, abs=0.01)
-    assert abs(record.findings.gearing.skew) < 4.0 * record.findings.gearing.skew_error
+    assert record.statistics.gearing.ratio == pytest.approx(1.0, abs=0.01)
+    assert abs(record.statistics.gearing.skew) < 4.0 * record.statistics.gearing.skew_error
     # counts of 220/4096 degrees, in parts of 32
-    assert record.findings.channels["theta_s"].resolution == pytest.approx(math.radians(220.0 / 4096.0 / 32.0), rel=1e-6)
+    assert record.statistics.channels["theta_s"].resolution == pytest.approx(math.radians(220.0 / 4096.0 / 32.0), rel=1e-6)
     raw = np.loadtxt(path)
     np.testing.assert_allclose(record.positions["motor"], np.radians((raw[:, 1] - raw[:, 2]) * 220.0 / 4096.0), atol=1e-12)
     with pytest.raises(InputError, match="the sign of one of them is wrong"):
@@ -672,7 +672,7 @@ def logs(tmp_path):
 
 def test_each_log_is_a_segment_with_its_own_rows(logs):
     first, second = logs("a.csv", count=1500), logs("b.csv", count=2500, seed=1)
-    both = join([first, second])
+    both = join_records([first, second])
     assert len(both.time) == 4000
     assert [(part.start, part.stop) for part in both.segments] == [(0, 1500), (1500, 4000)]
     assert np.all(np.diff(both.time) > 0.0)
@@ -681,7 +681,7 @@ def test_each_log_is_a_segment_with_its_own_rows(logs):
         np.testing.assert_array_equal(both.positions[side][1500:], second.positions[side])
     np.testing.assert_array_equal(both.torque, np.concatenate([first.torque, second.torque]))
     assert both.notes[0] == "2 logs, one after the other: a.csv, b.csv."
-    assert join([first]) is first
+    assert join_records([first]) is first
 
 
 def test_logs_that_are_not_alike(logs, tmp_path):
@@ -689,11 +689,11 @@ def test_logs_that_are_not_alike(logs, tmp_path):
     with pytest.raises(
         InputError, match=r"slow\.csv: is sampled every 0\.002 s, .*a\.csv every 0\.001 s; \[log\] resample = "
     ):
-        join([first, slow])
+        join_records([first, slow])
     made().drop(columns="u").to_csv(tmp_path / "free.csv", index=False)
     free = read_record(tmp_path / "free.csv", {"absent": ["u"]})
     with pytest.raises(InputError, match=r"free\.csv: has no torque, which .*a\.csv has"):
-        join([first, free])
+        join_records([first, free])
 
 
 def test_a_speed_stands_for_a_position(tmp_path):

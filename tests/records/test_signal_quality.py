@@ -39,7 +39,7 @@ def test_spectrum_has_the_power_of_the_signal():
     time = period * np.arange(20000)
     values = 3.0 * np.sin(2.0 * np.pi * 20.0 * time)
     for slope, power in ((False, 4.5), (True, 4.5 * (2.0 * np.pi * 20.0) ** 2)):
-        frequency, density = signal_quality.power_spectrum(values, period, slope=slope)
+        frequency, density = signal_quality.power_spectrum(values, period, differentiate=slope)
         assert density.sum() * frequency[0] == pytest.approx(power, rel=0.03)
         assert frequency[np.argmax(density)] == pytest.approx(20.0, abs=frequency[0])
 
@@ -49,9 +49,9 @@ def test_bandwidth_leaves_noise_and_steps_out():
     motion = np.sin(2.0 * np.pi * 1.5 * time) + 0.2 * np.sin(2.0 * np.pi * 9.0 * time)
     for values in (motion, motion + 1e-3 * RANDOM.standard_normal(10000), np.round(motion / 1e-3) * 1e-3):
         # velocity: 1.5² against (0.2 · 9)²
-        assert signal_quality.find_bandwidth(values, 1e-3, slope=True) == pytest.approx(9.0, abs=0.6)
-        assert signal_quality.find_bandwidth(values, 1e-3, slope=False) == pytest.approx(1.5, abs=0.6)
-    assert signal_quality.find_bandwidth(RANDOM.standard_normal(10000), 1e-3, slope=False) == 0.0
+        assert signal_quality.find_bandwidth(values, 1e-3, differentiate=True) == pytest.approx(9.0, abs=0.6)
+        assert signal_quality.find_bandwidth(values, 1e-3, differentiate=False) == pytest.approx(1.5, abs=0.6)
+    assert signal_quality.find_bandwidth(RANDOM.standard_normal(10000), 1e-3, differentiate=False) == 0.0
 
 
 def test_stays_at_an_extreme_value():
