@@ -61,7 +61,7 @@ class Skew:
     Attributes:
         value: s, less the wind-up by the torque in the shaft.
         error: standard error, s.
-        windup: what friction can make of it at most, s: all of the work that the motor does, done against the load's.
+        max_windup_delay: largest delay that friction can imitate, s: the motor does all its work against the load's friction.
         is_sure: whether it is a clock.
     """
 

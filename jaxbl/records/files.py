@@ -619,7 +619,7 @@ def _read_matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, A
     return _require_columns(columns)
 
 
-_ColumnsType = TypeVar("_Some", bound=dict[str | int, Any])
+_ColumnsType = TypeVar("_ColumnsType", bound=dict[str | int, Any])
 
 
 def _add_matlab_columns(columns: dict[str | int, Any], name: str, value: Any) -> None:

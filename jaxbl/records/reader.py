@@ -310,7 +310,7 @@ def _skew_sentence(found: Skew, when: str) -> str:
     how = "later" if found.value > 0.0 else "earlier"
     return (
         f"theta_s is {1e3 * abs(found.value):.3g} ± {1e3 * found.error:.1g} ms {how} than theta_e{when}, more than friction "
-        f"can make (at most {1e3 * found.windup:.2g} ms): corrected."
+        f"can make (at most {1e3 * found.max_windup_delay:.2g} ms): corrected."
     )
 
 
