@@ -61,7 +61,7 @@ class Skew:
     Attributes:
         value: s, less the wind-up by the torque in the shaft.
         error: standard error, s.
-        max_windup_delay: largest delay that friction can imitate, s: the motor does all its work against the load's friction.
+        max_windup_delay: largest delay that friction can imitate, s: all of the motor's work goes into the load's friction.
         is_sure: whether it is a clock.
     """
 
