@@ -103,7 +103,7 @@ def main():
         print("cells at the boundary: {}, with a corner not simulated: {}".format(*missed(config, whole, result.frame)))
     for size in options.layouts:
         other = Engine(config, Layout(1, size))
-        (chunk, *_) = other.split(0, other.points.coarse_points(np.arange(other.points.coarse_size)))
+        (chunk, *_) = other.split_points(0, other.points.coarse_points(np.arange(other.points.coarse_size)))
         other.run(chunk)
         seconds = []
         for _ in range(4):

@@ -145,7 +145,10 @@ BAD = {
         ["sweep", "axis.toml", "--dry-run"],
         "axis.toml: axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
     ),
-    "no such backend": (["sweep", "study.toml", "--backend", "gpu"], "--backend: there is no 'gpu'; one of fused, scan"),
+    "no such backend": (
+        ["sweep", "study.toml", "--backend", "gpu"],
+        "--backend: there is no 'gpu'; it should be one of fused, scan",
+    ),
     "seeds alone, fused": (
         ["sweep", "seeds.toml", "--backend", "fused"],
         "seeds.toml: --backend fused: the fused loop does not support lanes that differ only in their seed; "
@@ -153,11 +156,11 @@ BAD = {
     ),
     "no such backend for gains": (
         ["tune", "study.toml", "--backend", "Scan"],
-        "--backend: there is no 'Scan'; one of fused, scan",
+        "--backend: there is no 'Scan'; it should be one of fused, scan",
     ),
     "no such backend for conditions": (
         ["verify", "study.toml", "--backend", "xla"],
-        "--backend: there is no 'xla'; one of fused, scan",
+        "--backend: there is no 'xla'; it should be one of fused, scan",
     ),
     "wrong figure": (
         ["sweep", "figure.toml"],

@@ -182,7 +182,7 @@ def _estimate_cost(study: "Config", backend: "Backend | None") -> Outcome:
     refined = study.sweep.refine is not None
     rows = [("points", f"{cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)")]
     if refined:
-        most = f"at most {cost.most_points} points; as many as the borders need, not counted below"
+        most = f"at most {cost.max_points} points; as many as the borders need, not counted below"
         rows.append(("refinement", most))
     rate = f"{cost.lane_steps_per_second:.2g} lane-steps/s measured, backend {cost.backend}"
     rows += [

@@ -1,8 +1,10 @@
-"""What a study takes on either backend, before anything of it is compiled: how much its step does, counted in its traced
-form, times what this machine takes for that, measured once and kept with the compiled programs.
+"""Predicted run time of a study on either backend, before anything of it is compiled.
 
-Backends differ in roundings. Numbers that are counted and remembered choose the same one each time; a short run of the study
-itself would not, where the two are close.
+The operations of a sample are counted in its traced step; what an operation costs on this machine is measured once, and
+stored with the compiled programs.
+
+Backends round differently, so that the same study should always get the same backend. Counts and stored costs do not change;
+a short run of the study would choose at random where the backends are equally fast.
 """
 
 import functools
@@ -26,8 +28,14 @@ from .programs import BACKENDS, Backend, Layout, compile_program, without_cache_
 
 
 class Operations(NamedTuple):
-    """What a sample takes, in operations that count as much as a sum: those that all lanes share, and each lane's own; the
-    bytes that a lane carries from sample to sample; and how many equations there are to compile."""
+    """Operations of a sample, in units of an addition.
+
+    Attributes:
+        shared: operations that all lanes share.
+        lane: operations of each lane.
+        carried: bytes that a lane carries from sample to sample.
+        equations: number of equations to compile.
+    """
 
     shared: float
     lane: float
@@ -36,8 +44,14 @@ class Operations(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Seconds that a backend takes for a sample, for each operation of it whatever the number of lanes, and for each
-    operation of each lane; and to compile an equation."""
+    """Seconds that a backend takes.
+
+    Attributes:
+        sample: for a sample.
+        operation: for an operation of a sample, apart from the number of lanes.
+        lane: for an operation of one lane.
+        equation: to compile an equation.
+    """
 
     sample: float
     operation: float
@@ -46,171 +60,206 @@ class Cost(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Of both backends; `cache`: bytes that the lanes of a device may carry where the scan is fastest."""
+    """Costs of both backends; with up to `cache` bytes carried by the lanes of a device the scan is fastest."""
 
     fused: Cost
     scan: Cost
     cache: float
 
     def of(self, backend: Backend) -> Cost:
-        """Of a backend."""
+        """The cost of a backend."""
         return self.fused if backend == "fused" else self.scan
 
-    def compile_seconds(self, backend: Backend, work: Operations) -> float:
+    def compile_seconds(self, backend: Backend, operations: Operations) -> float:
         """Seconds to compile a program."""
-        return self.of(backend).equation * work.equations
+        return self.of(backend).equation * operations.equations
 
-    def sample(self, backend: Backend, work: Operations, layout: Layout) -> float:
-        """Seconds of a sample of a chunk. The fused loop takes seed after seed, and does for each what its lanes share; the
-        scan has all lanes side by side, and starts kernels for all operations."""
+    def sample_seconds(self, backend: Backend, operations: Operations, layout: Layout) -> float:
+        """Seconds for a sample of a chunk.
+
+        The fused loop takes one seed after the other, and computes for each what its lanes share. The scan has all lanes
+        side by side, and starts kernels for all operations.
+        """
         seeds, points = layout
         cost = self.of(backend)
-        lanes = cost.lane * work.lane * seeds * points
+        lane_seconds = cost.lane * operations.lane * seeds * points
         if backend == "fused":
-            return seeds * (cost.sample + cost.operation * work.shared) + lanes
-        return cost.sample + cost.operation * (work.shared + work.lane) + lanes
+            return seeds * (cost.sample + cost.operation * operations.shared) + lane_seconds
+        return cost.sample + cost.operation * (operations.shared + operations.lane) + lane_seconds
 
-    def lanes(self, backend: Backend, work: Operations, devices: int) -> int:
-        """Lanes that a device computes at once: by the scan as many as its cache holds, by the fused loop so many that what
-        they share counts little."""
+    def best_lanes(self, backend: Backend, operations: Operations, devices: int) -> int:
+        """Number of lanes that a device should compute at once.
+
+        For the scan, as many as its cache holds. For the fused loop, so many that the operations that they share take little
+        of the time.
+        """
         if backend == "scan":
-            wanted = self.cache / max(work.carried, 1.0)
+            lanes = self.cache / max(operations.carried, 1.0)
         else:
-            shared = self.fused.sample + self.fused.operation * work.shared
-            wanted = shared / (_SHARE * self.fused.lane * max(work.lane, 1.0)) / devices
-        return 2 ** round(math.log2(min(max(wanted, _LANES[0]), _LANES[1])))
+            shared_seconds = self.fused.sample + self.fused.operation * operations.shared
+            lanes = shared_seconds / (_SHARED_TIME * self.fused.lane * max(operations.lane, 1.0)) / devices
+        return 2 ** round(math.log2(min(max(lanes, _MIN_LANES), _MAX_LANES)))
 
 
-_SHARE = 0.03
-"""Of a sample's time, what lanes share."""
-_LANES = 2**10, 2**16
-"""The fewest and the most that a processor's core computes at once."""
-_LANES_ON_A_GPU = 2**18
-"""By either backend: some 2000 lanes for each of its processors, which is what keeps all of it busy."""
+_SHARED_TIME = 0.03
+"""Share of a sample's time that operations shared by all lanes may take."""
+_MIN_LANES, _MAX_LANES = 2**10, 2**16
+"""Limits of the lanes that a processor's core computes at once."""
+_GPU_LANES = 2**18
+"""Lanes for either backend: some 2000 for each of the GPU's processors keep all of them busy."""
 
 _CPU = Costs(Cost(0.5e-6, 2e-9, 0.02e-9, 3e-4), Cost(0.0, 4e-9, 0.05e-9, 2e-3), 1e6)
-"""Where nothing is kept: two cores of an AMD EPYC with AVX-512 (benchmarks/NOTES.md)."""
+"""Costs if none can be stored: two cores of an AMD EPYC with AVX-512 (benchmarks/NOTES.md)."""
 _GPU = Costs(Cost(1e-6, 0.0, 0.0, 0.0), Cost(8e-6, 0.0, 0.0, 0.0), 0.0)
-"""What a sample takes, published for a scan by XLA; not measured here."""
+"""Costs of a sample as published for scans by XLA; not measured here."""
 
 
 def load_costs(devices: Sequence[Any]) -> Costs:
-    """Of these devices. Of a processor's cores they are measured, once for this machine and what is installed on it, where
-    programs are kept."""
+    """The costs of devices: for a processor's cores as measured on this machine, if programs are stored; else typical ones.
+
+    They are measured once for this machine and the versions that are installed.
+    """
     if devices[0].platform != "cpu":
         return _GPU
     key = program_cache.program_key("costs", len(devices))
     if key is None:
         return _CPU
-    found = program_cache.load(key)
-    if found is None:
+    costs = program_cache.load(key)
+    if costs is None:
         announce("measuring this machine")
-        found = measure_costs(list(devices))
-        program_cache.save(key, found)
+        costs = measure_costs(list(devices))
+        program_cache.save(key, costs)
         announce("running")
-    return found
+    return costs
 
 
-def lanes_at_once(devices: Sequence[Any], backend: Backend, work: Operations) -> int:
-    """Lanes that a device computes at once where nothing else is asked for."""
-    return _LANES_ON_A_GPU if devices[0].platform == "gpu" else load_costs(devices).lanes(backend, work, len(devices))
+def lanes_at_once(devices: Sequence[Any], backend: Backend, operations: Operations) -> int:
+    """Number of lanes that a device computes at once unless the study sets it."""
+    return _GPU_LANES if devices[0].platform == "gpu" else load_costs(devices).best_lanes(backend, operations, len(devices))
 
 
 def choose_backend(
     devices: Sequence[Any],
-    works: Mapping[Backend, Operations],
+    operations: Mapping[Backend, Operations],
     layouts: Mapping[Backend, Layout],
     samples: Mapping[Backend, int],
     programs: int,
 ) -> Backend:
-    """The backend that takes less time to compile so many programs, and to take chunks of these shapes through so many
-    samples in all."""
+    """The backend that takes less time in all.
+
+    Args:
+        devices: JAX devices to use.
+        operations: operations of a sample, by backend.
+        layouts: shape of a chunk, by backend.
+        samples: samples of all chunks, by backend.
+        programs: number of programs to compile.
+    """
     if devices[0].platform not in ("cpu", "gpu") or (devices[0].platform == "gpu" and len(devices) > 1):
-        # the fused loop knows neither
+        # the fused loop supports neither
         return "scan"
-    known = load_costs(devices)
+    costs = load_costs(devices)
 
-    def total(backend: Backend) -> float:
-        running = samples[backend] * known.sample(backend, works[backend], layouts[backend])
-        return programs * known.compile_seconds(backend, works[backend]) + running
+    def total_seconds(backend: Backend) -> float:
+        run_seconds = samples[backend] * costs.sample_seconds(backend, operations[backend], layouts[backend])
+        return programs * costs.compile_seconds(backend, operations[backend]) + run_seconds
 
-    return min(BACKENDS, key=total)
+    return min(BACKENDS, key=total_seconds)
 
 
 def count_operations(config: Config, paths: Sequence[str], names: MetricNames = None) -> Operations:
-    """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
+    """Count the operations of a sample.
+
+    Args:
+        config: the study.
+        paths: paths whose values differ from lane to lane.
+        names: metrics that are computed; None for all.
+    """
     with precision(config):
         experiment = prepare(config)
         key = program_cache.hash_program("work", experiment, tuple(paths), names)
-        # a study of many sweeps asks for the same one, also where nothing is kept on disk
-        found = _works.get(key) or program_cache.load(key)
-        if found is None:
-            found = _count_traced_operations(experiment, paths, names)
-            program_cache.save(key, found)
+        # a search runs many sweeps with the same operations; this also helps if nothing is stored on disk
+        operations = _counted_operations.get(key) or program_cache.load(key)
+        if operations is None:
+            operations = _trace_operations(experiment, paths, names)
+            program_cache.save(key, operations)
         if key is not None:
-            _works[key] = found
-    return found
+            _counted_operations[key] = operations
+    return operations
 
 
-_works: dict[str | None, Operations] = {}
+_counted_operations: dict[str | None, Operations] = {}
 
 
-_COUNTED = 1009
-"""Lanes of the program that is counted: a length that no other array has."""
-_FREE = ("broadcast_in_dim", "reshape", "squeeze", "convert_element_type", "slice", "copy", "copy_p", "transpose", "iota")
+_TRACED_LANES = 1009
+"""Lanes of the traced program: a prime, so that arrays with an axis of lanes are told from others by their shape."""
+_FREE_PRIMITIVES = (
+    "broadcast_in_dim",
+    "reshape",
+    "squeeze",
+    "convert_element_type",
+    "slice",
+    "copy",
+    "copy_p",
+    "transpose",
+    "iota",
+)
 _WEIGHTS = {
-    **dict.fromkeys(_FREE, 0.0),
+    **dict.fromkeys(_FREE_PRIMITIVES, 0.0),
     **dict.fromkeys(("div", "sqrt", "rsqrt", "rem"), 5.0),
     **dict.fromkeys(("exp", "expm1", "exp2", "log", "log1p", "logistic", "tanh", "sin", "cos", "tan", "atan2", "pow"), 20.0),
     **dict.fromkeys(("erf_inv", "random_bits", "threefry2x32"), 40.0),
 }
-"""What an operation takes of a processor, about, where that is not as much as a sum."""
+"""Rough cost of operations on a processor, in units of an addition; 1 if not listed."""
 
 
-def _count_traced_operations(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Operations:
-    def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
+def _trace_operations(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Operations:
+    """Trace a run of many lanes, and count its operations for each sample."""
+
+    def run_lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
         return scan(set_leaves(experiment, values), seed, (metrics_reducer(names),))[0]
 
-    one = jax.ShapeDtypeStruct((_COUNTED,), jnp.result_type(experiment.run.sample_period))
-    traced = jax.make_jaxpr(jax.vmap(lane, (0, None), axis_size=_COUNTED))(
-        dict.fromkeys(paths, one), jax.ShapeDtypeStruct((), np.uint32)
+    column = jax.ShapeDtypeStruct((_TRACED_LANES,), jnp.result_type(experiment.run.sample_period))
+    traced = jax.make_jaxpr(jax.vmap(run_lane, (0, None), axis_size=_TRACED_LANES))(
+        dict.fromkeys(paths, column), jax.ShapeDtypeStruct((), np.uint32)
     )
-    shared = own = carried = 0.0
+    shared = per_lane = carried = 0.0
     equations = 0
-    for times, eqn in _equations(traced.jaxpr, 1.0):
-        by_lane = [v.aval for v in eqn.outvars if _COUNTED in v.aval.shape]
-        if times == 0.0:
-            carried = max(carried, sum(aval.size * aval.dtype.itemsize for aval in by_lane) / _COUNTED)
+    for repetitions, eqn in _equations(traced.jaxpr, 1.0):
+        lane_avals = [v.aval for v in eqn.outvars if _TRACED_LANES in v.aval.shape]
+        if repetitions == 0.0:
+            carried = max(carried, sum(aval.size * aval.dtype.itemsize for aval in lane_avals) / _TRACED_LANES)
             continue
         equations += 1
-        work = times * _WEIGHTS.get(eqn.primitive.name, 1.0) * max((v.aval.size for v in eqn.outvars), default=0)
-        if by_lane:
-            own += work / _COUNTED
+        size = max((v.aval.size for v in eqn.outvars), default=0)
+        operations = repetitions * _WEIGHTS.get(eqn.primitive.name, 1.0) * size
+        if lane_avals:
+            per_lane += operations / _TRACED_LANES
         else:
-            shared += work
+            shared += operations
     steps = experiment.run.steps
-    return Operations(shared / steps, own / steps, carried, equations)
+    return Operations(shared / steps, per_lane / steps, carried, equations)
 
 
-def _equations(jaxpr: Any, times: float) -> Iterator[tuple[float, Any]]:
-    """How often each equation is evaluated; a loop itself with a zero, before what is in it."""
+def _equations(jaxpr: Any, repetitions: float) -> Iterator[tuple[float, Any]]:
+    """Yield each equation with the number of times that it is evaluated; a loop with 0, before the equations in it."""
     for eqn in jaxpr.eqns:
-        inner = [one for value in eqn.params.values() for one in _jaxprs(value)]
-        if not inner:
-            yield times, eqn
+        inner_jaxprs = [inner for param in eqn.params.values() for inner in _jaxprs(param)]
+        if not inner_jaxprs:
+            yield repetitions, eqn
             continue
-        loop = eqn.primitive.name == "scan"
-        if loop:
+        is_loop = eqn.primitive.name == "scan"
+        if is_loop:
             yield 0.0, eqn
-        for one in inner:
-            yield from _equations(one, times * (eqn.params["length"] if loop else 1))
+        for inner in inner_jaxprs:
+            yield from _equations(inner, repetitions * (eqn.params["length"] if is_loop else 1))
 
 
-def _jaxprs(value: Any) -> list[Any]:
-    if isinstance(value, tuple | list):
-        return [one for each in value for one in _jaxprs(each)]
-    value = getattr(value, "jaxpr", value)
-    return [value] if hasattr(value, "eqns") else []
+def _jaxprs(param: Any) -> list[Any]:
+    """The jaxprs in a parameter of an equation."""
+    if isinstance(param, tuple | list):
+        return [jaxpr for part in param for jaxpr in _jaxprs(part)]
+    jaxpr = getattr(param, "jaxpr", param)
+    return [jaxpr] if hasattr(jaxpr, "eqns") else []
 
 
 _STUDY = {
@@ -220,66 +269,69 @@ _STUDY = {
     "observer": {"motor": {"lambda": 20.0, "alpha": 400.0}},
     "run": {"duration": 0.512, "sample_period": 1e-3, "substeps": 10},
 }
-"""What is measured: small, as it is compiled for several numbers of lanes."""
+"""The study that is timed: small, since it is compiled for several numbers of lanes."""
 _PATHS = "observer.motor.lambda", "drive.motor_inertia"
-"""What differs from lane to lane: a gain, so that lanes share the plant, or an inertia, so that each has its own."""
-_FEW, _MANY, _MORE = 16, 2**12, 2**14
-"""Lanes of a device."""
+"""The path that differs from lane to lane: a gain, so that lanes share the plant, or an inertia, so that none do."""
+_FEW_LANES, _CACHED_LANES, _MORE_LANES = 16, 2**12, 2**14
+"""Lanes of a device in timed programs: few, as many as are taken to fit its cache, and more."""
 _ROUNDS = 5
 
-Tried = tuple[Backend, str, int]
-"""Backend, path, and number of lanes."""
+TimedCase = tuple[Backend, str, int]
+"""Backend, path, and number of lanes of a program that is timed."""
 
 
 def measure_costs(devices: list[Any]) -> Costs:
-    """Costs of this machine, from short runs of a small study."""
-    # here, as it takes a quarter of a second, once
+    """Measure the costs of this machine by short runs of a small study."""
+    # imported here, as it takes a quarter of a second and is needed once
     from scipy.optimize import nnls
 
     config, count = read_config(_STUDY), len(devices)
-    works = {path: count_operations(config, [path]) for path in _PATHS}
-    few, many, more = _FEW * count, _MANY * count, _MORE * count
+    operations = {path: count_operations(config, [path]) for path in _PATHS}
+    few, cached, more = _FEW_LANES * count, _CACHED_LANES * count, _MORE_LANES * count
     # few scans: XLA compiles longer than they run
-    fused: list[Tried] = [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
-    scans: list[Tried] = [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
-    took, compiling = _time_programs(config, devices, [*fused, *scans, ("scan", _PATHS[1], many)])
+    fused_cases: list[TimedCase] = [("fused", path, lanes) for path in _PATHS for lanes in (few, cached)]
+    scan_cases: list[TimedCase] = [("scan", _PATHS[0], lanes) for lanes in (few, cached, more)]
+    cases = [*fused_cases, *scan_cases, ("scan", _PATHS[1], cached)]
+    sample_seconds, compile_seconds = _time_programs(config, devices, cases)
 
-    def cost(backend: Backend) -> Cost:
+    def fit_cost(backend: Backend) -> Cost:
         rows = []
-        for (which, path, lanes), seconds in took.items():
-            if which == backend and lanes != more:
-                work = works[path]
-                fixed = [1.0, work.shared] if backend == "fused" else [0.0, work.shared + work.lane]
-                rows.append(np.array([*fixed, work.lane * lanes]) / seconds)
-        # by their ratio to what was measured, each counts as much
-        table, size = np.stack(rows), np.max(rows, axis=0)
-        size[size == 0.0] = 1.0
-        found, _ = nnls(table / size, np.ones(len(rows)))
-        sample, operation, lane = (found / size).tolist()
-        return Cost(sample, operation, lane, compiling[backend] / works[_PATHS[0]].equations)
+        for (case_backend, path, lanes), seconds in sample_seconds.items():
+            if case_backend == backend and lanes != more:
+                shared, per_lane = operations[path].shared, operations[path].lane
+                fixed = [1.0, shared] if backend == "fused" else [0.0, shared + per_lane]
+                # divided by the time, so that relative errors are fitted
+                rows.append(np.array([*fixed, per_lane * lanes]) / seconds)
+        scale = np.max(rows, axis=0)
+        scale[scale == 0.0] = 1.0
+        solution, _ = nnls(np.stack(rows) / scale, np.ones(len(rows)))
+        sample, operation, lane = (solution / scale).tolist()
+        return Cost(sample, operation, lane, compile_seconds[backend] / operations[_PATHS[0]].equations)
 
-    fits = took["scan", _PATHS[0], more] / more < 1.15 * took["scan", _PATHS[0], many] / many
-    return Costs(cost("fused"), cost("scan"), (_MORE if fits else _MANY) * works[_PATHS[0]].carried)
+    more_seconds, cached_seconds = (sample_seconds["scan", _PATHS[0], lanes] / lanes for lanes in (more, cached))
+    more_fit = more_seconds < 1.15 * cached_seconds
+    cache = (_MORE_LANES if more_fit else _CACHED_LANES) * operations[_PATHS[0]].carried
+    return Costs(fit_cost("fused"), fit_cost("scan"), cache)
 
 
 def _time_programs(
-    config: Config, devices: list[Any], wanted: Sequence[Tried]
-) -> tuple[dict[Tried, float], dict[Backend, float]]:
-    """Seconds that a sample takes, the least of some rounds in turns; and those that a backend takes to compile."""
-    runs, compiling = {}, dict.fromkeys(BACKENDS, math.inf)
+    config: Config, devices: list[Any], cases: Sequence[TimedCase]
+) -> tuple[dict[TimedCase, float], dict[Backend, float]]:
+    """Seconds of a sample for each case, the least of several rounds in turns; and seconds to compile for each backend."""
+    runs, compile_seconds = {}, dict.fromkeys(BACKENDS, math.inf)
     with precision(config), without_cache_writes():
         experiment = prepare(config)
-        for backend, path, count in wanted:
-            columns = {path: np.full(count, get_leaf(experiment, path))}
-            begun = time.perf_counter()
-            program = compile_program(experiment, Layout(1, count), devices, backend, columns)
-            # the least: the first one also loads what compiles
-            compiling[backend] = min(compiling[backend], time.perf_counter() - begun)
-            runs[backend, path, count] = functools.partial(program.run, columns, np.zeros(1, np.uint32))
-        least = dict.fromkeys(runs, math.inf)
+        for backend, path, lanes in cases:
+            columns = {path: np.full(lanes, get_leaf(experiment, path))}
+            start = time.perf_counter()
+            program = compile_program(experiment, Layout(1, lanes), devices, backend, columns)
+            # the least: the first compilation also loads the compiler
+            compile_seconds[backend] = min(compile_seconds[backend], time.perf_counter() - start)
+            runs[backend, path, lanes] = functools.partial(program.run, columns, np.zeros(1, np.uint32))
+        sample_seconds = dict.fromkeys(runs, math.inf)
         for _ in range(_ROUNDS):
-            for one, run in runs.items():
-                begun = time.perf_counter()
+            for case, run in runs.items():
+                start = time.perf_counter()
                 jax.block_until_ready(run())
-                least[one] = min(least[one], (time.perf_counter() - begun) / config.run.steps)
-    return least, compiling
+                sample_seconds[case] = min(sample_seconds[case], (time.perf_counter() - start) / config.run.steps)
+    return sample_seconds, compile_seconds

@@ -1,11 +1,12 @@
-"""Runs the points of a study: chunks of one static shape over all local devices, one atomic file per chunk.
+"""Computes the points of a study in chunks of one shape, on all local devices.
 
-A chunk is a block of seeds times a block of points. The lane function is vmapped over points inside and seeds outside, so
-that what depends on neither (the excitation, the plant in a gain map) is computed once, and noise once a seed.
+A chunk has several seeds at a slice of the points. The scan is vmapped over points inside and over seeds outside: what all
+lanes share (the excitation, in a gain map also the plant) is computed once, and noise once for each seed.
 """
 
 import dataclasses
 import functools
+import itertools
 import math
 import statistics
 import time
@@ -35,8 +36,14 @@ from .programs import (
 
 
 class Chunk(NamedTuple):
-    """One call of a compiled program: every one of some seeds at every one of some points of a group (their indices), as
-    many of both as the layout's, or fewer."""
+    """The lanes of one call of a compiled program: all its seeds at all its points.
+
+    Attributes:
+        index: number of the chunk, and of the part that stores it.
+        group: index of the points' group.
+        seeds: noise seeds, at most as many as the layout has.
+        points: indices of points in the group, at most as many as the layout has.
+    """
 
     index: int
     group: int
@@ -45,21 +52,26 @@ class Chunk(NamedTuple):
 
 
 _REFINED_LANES_PER_DEVICE = 1024
-"""Lanes that a device computes at once in a refined study: its batches are small, and fill larger chunks badly
-(benchmarks/NOTES.md)."""
+"""Lanes that a device computes at once in a refined study: its batches are small, and would leave larger chunks mostly
+empty (benchmarks/NOTES.md)."""
 
 
 def layout_for(config: Config, points: Points, count: int, capacity: int) -> Layout:
-    """Chunk shape of at most so many lanes for so many devices: whole rows of points before several seeds.
+    """Choose the shape of chunks: all points before a second seed, or in a refined study all seeds before further points.
 
-    Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
+    Every device gets at least two lanes: a program for a single lane would round differently.
+
+    Args:
+        config: the study.
+        points: its points.
+        count: number of devices.
+        capacity: largest number of lanes of a chunk.
     """
     if points.refinement is not None:
-        # several seeds before whole rows of points: a batch has few points, and needs all seeds of them; as many seeds as
-        # leave every device 64 points of a chunk
+        # a batch has few points and needs all their seeds; each device still gets 64 points of a chunk
         seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
         return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
-    # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
+    # chunks of equal size need little padding; devices share the points or else the seeds, in a multiple of their number
     per_chunk = math.ceil(points.group_size / math.ceil(points.group_size / capacity))
     if points.group_size >= count and points.group_size > 1:
         per_chunk = max(math.ceil(per_chunk / count), 2) * count
@@ -71,27 +83,27 @@ def layout_for(config: Config, points: Points, count: int, capacity: int) -> Lay
     return Layout(seeds, per_chunk)
 
 
-_PROGRAMS = 16
-"""Compiled programs that are kept, one a group."""
-_TRIED_SAMPLES, _TRIED_SECONDS = 2000, 0.3
-"""Of the short runs that an estimate is made from, at least."""
+_MAX_PROGRAMS = 16
+"""Number of compiled programs in memory; each group has one."""
+_TIMED_SAMPLES, _TIMED_SECONDS = 2000, 0.3
+"""Least length of the short runs that an estimate is made from."""
 _COUNTED_GROUPS = 24
-"""Groups whose steps an estimate counts, at most."""
+"""Largest number of groups whose operations an estimate counts."""
 
 
-def _coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Place of each of some blocks in an order that covers them coarsely first, and its level `(count,)`.
+def _rank_coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rank indices 0 ... count - 1 so that the first ranks cover them coarsely; return rank and level of each `(count,)`.
 
-    Level 0 is one block, and each further level doubles their number, one in each part of the whole: van der Corput's
-    sequence, scrambled (Owen 1995), as blocks at even distances would fall together with rows of a map.
+    Level 0 is one index, and each level doubles their number, so that each part of the range has one. This is van der
+    Corput's sequence, scrambled (Owen 1995): indices at even distances would coincide with the rows of a map.
     """
     rng, bits = np.random.default_rng(0), max(count - 1, 0).bit_length()
     index = np.arange(count)
-    place = np.zeros(count, int)
+    rank = np.zeros(count, int)
     for level in range(bits):
         swapped = rng.integers(0, 2, 1 << level)[index >> bits - level]
-        place |= (index >> bits - 1 - level & 1 ^ swapped) << level
-    return place, np.frexp(place)[1]
+        rank |= (index >> bits - 1 - level & 1 ^ swapped) << level
+    return rank, np.frexp(rank)[1]
 
 
 class Engine:
@@ -117,47 +129,46 @@ class Engine:
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.backend: Backend = check_backend(backend) or self._faster()
+        self.backend: Backend = check_backend(backend) or self._choose_backend()
         self.require_backend = require_backend
-        self.layout = layout or self._layout(self.backend, config.sweep.chunk)
+        self.layout = layout or self._choose_layout(self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
-        self._compiled: OrderedDict[int, Program] = OrderedDict()
-        self._judging: set[str] = set()
+        self._programs: OrderedDict[int, Program] = OrderedDict()
+        self._gain_metric_dtypes: set[str] = set()
 
-    def _faster(self) -> Backend:
-        """By the study, however it is cut: roundings differ between backends."""
-        if not self._varied:
-            # lanes that differ only in their seed
+    def _choose_backend(self) -> Backend:
+        """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
+        if not self._varied_paths:
+            # the fused loop does not support lanes that differ only in their seed
             return "scan"
-        layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
+        layouts: dict[Backend, Layout] = {backend: self._choose_layout(backend, None) for backend in BACKENDS}
         steps = sum(group.config.run.steps for group in self.points.groups)
         samples: dict[Backend, int] = {
-            b: steps * self._chunks(layout, self.points.coarse_size) for b, layout in layouts.items()
+            backend: steps * self._count_chunks(layout, self.points.coarse_size) for backend, layout in layouts.items()
         }
-        return choose_backend(self.devices, self._works, layouts, samples, len(self.points.groups))
+        return choose_backend(self.devices, self._operations, layouts, samples, len(self.points.groups))
 
-    def _layout(self, backend: Backend, chunk: int | None) -> Layout:
-        """Chunk shape: as many lanes as asked for, or as the devices want at once."""
+    def _choose_layout(self, backend: Backend, chunk: int | None) -> Layout:
+        """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices."""
         if chunk is None and self.points.refinement is not None:
             chunk = _REFINED_LANES_PER_DEVICE * len(self.devices)
-        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._works[backend])
+        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._operations[backend])
         return layout_for(self.config, self.points, len(self.devices), capacity)
 
     @functools.cached_property
-    def _works(self) -> dict[Backend, Operations]:
-        """Of a sample by either backend, in the group that has most of them."""
+    def _operations(self) -> dict[Backend, Operations]:
+        """Operations of a sample by backend, in the group with most samples."""
         config = max(self.points.groups, key=lambda group: group.config.run.steps).config
-        asked: dict[Backend, MetricNames] = {
-            backend: computed_metrics(backend, config.sweep.requested_metrics) for backend in BACKENDS
-        }
-        found = {names: count_operations(config, self._varied, names) for names in set(asked.values())}
-        return {backend: found[names] for backend, names in asked.items()}
+        requested = config.sweep.requested_metrics
+        names: dict[Backend, MetricNames] = {backend: computed_metrics(backend, requested) for backend in BACKENDS}
+        operations = {computed: count_operations(config, self._varied_paths, computed) for computed in set(names.values())}
+        return {backend: operations[computed] for backend, computed in names.items()}
 
     @property
-    def _varied(self) -> list[str]:
-        """Paths that differ from lane to lane."""
+    def _varied_paths(self) -> list[str]:
+        """Paths whose values differ from lane to lane."""
         return list(self.points.columns(np.arange(1)))
 
     def __len__(self) -> int:
@@ -165,50 +176,60 @@ class Engine:
         return len(self.points.groups) * self.count_chunks(self.points.coarse_size)
 
     def count_chunks(self, points: int) -> int:
-        """Number of chunks that some points of a group take."""
-        return self._chunks(self.layout, points)
+        """Number of chunks for a number of points of a group, with all seeds."""
+        return self._count_chunks(self.layout, points)
 
-    def _chunks(self, layout: Layout, points: int) -> int:
+    def _count_chunks(self, layout: Layout, points: int) -> int:
         return math.ceil(self.config.sweep.seeds / layout.seeds) * math.ceil(points / layout.points)
 
     def chunk(self, index: int) -> Chunk:
-        """A chunk by its index; of a refined study, one of its coarse grid."""
-        blocks = math.ceil(self.points.coarse_size / self.layout.points)
-        group, rest = divmod(index, len(self._seeds) * blocks)
-        seeds, block = divmod(rest, blocks)
-        first = block * self.layout.points
+        """The chunk with an index; of a refined study, one of its coarse grid."""
+        slice_count = math.ceil(self.points.coarse_size / self.layout.points)
+        group, index_in_group = divmod(index, len(self._seed_slices) * slice_count)
+        seed_slice, point_slice = divmod(index_in_group, slice_count)
+        first = point_slice * self.layout.points
         last = min(first + self.layout.points, self.points.coarse_size)
-        return Chunk(index, group, self._seeds[seeds], self.points.coarse_points(np.arange(first, last)))
+        return Chunk(index, group, self._seed_slices[seed_slice], self.points.coarse_points(np.arange(first, last)))
 
-    def lanes(self, index: int) -> int:
-        """Lanes of a chunk."""
+    def count_lanes(self, index: int) -> int:
+        """Number of lanes of a chunk."""
         chunk = self.chunk(index)
         return len(chunk.seeds) * len(chunk.points)
 
     def chunk_order(self) -> list[int]:
-        """Indices of all chunks, those first that cover the grid coarsely: the first seeds of every second block of points,
-        of those between, and so on, then the next seeds. Groups take turns where their programs can all be kept."""
-        blocks = math.ceil(self.points.coarse_size / self.layout.points)
-        shape = len(self.points.groups), len(self._seeds), blocks
-        group, seeds, block = np.unravel_index(np.arange(math.prod(shape)), shape)
-        place, level = _coarse_first(blocks)
-        turns = level[block] if shape[0] <= _PROGRAMS else np.zeros_like(block)
-        outer = (seeds, turns, group) if shape[0] <= _PROGRAMS else (group, seeds, turns)
-        # the last key is the first one to be sorted by
-        return np.lexsort((place[block], *reversed(outer))).tolist()
+        """Indices of all chunks in the order in which they are computed, so that the grid is covered coarsely first.
 
-    def split(self, group: int, points: np.ndarray, first_index: int = 0) -> list[Chunk]:
-        """Chunks for any points of a group, given by their indices `(points,)`, with all seeds; numbered from `first_index`.
-
-        They share the compiled program of all chunks. Points come in their order, all of them for some seeds first.
+        The first seeds come first, slices of points by their rank (:func:`_rank_coarse_first`); then the next seeds. Groups
+        take turns if the programs of all groups can be held in memory.
         """
-        parts = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
-        crossed = [(seeds, part) for seeds in self._seeds for part in parts]
-        return [Chunk(index, group, *both) for index, both in enumerate(crossed, first_index)]
+        slice_count = math.ceil(self.points.coarse_size / self.layout.points)
+        shape = len(self.points.groups), len(self._seed_slices), slice_count
+        group, seed_slice, point_slice = np.unravel_index(np.arange(math.prod(shape)), shape)
+        rank, level = _rank_coarse_first(slice_count)
+        if len(self.points.groups) <= _MAX_PROGRAMS:
+            keys = seed_slice, level[point_slice], group, rank[point_slice]
+        else:
+            keys = group, seed_slice, rank[point_slice]
+        # lexsort takes the last key first
+        return np.lexsort(keys[::-1]).tolist()
+
+    def split_points(self, group: int, points: np.ndarray, first_index: int = 0) -> list[Chunk]:
+        """Make chunks for points of a group with all seeds.
+
+        They run by the same compiled program as all chunks. The chunks of the first seeds come first.
+
+        Args:
+            group: index of the group.
+            points: indices of the points, `(points,)`.
+            first_index: index of the first chunk; the others count up from it.
+        """
+        slices = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
+        pairs = itertools.product(self._seed_slices, slices)
+        return [Chunk(index, group, seeds, point_slice) for index, (seeds, point_slice) in enumerate(pairs, first_index)]
 
     @functools.cached_property
-    def _seeds(self) -> list[np.ndarray]:
-        """All seeds, as many at once as a chunk takes."""
+    def _seed_slices(self) -> list[np.ndarray]:
+        """All seeds, divided into those of one chunk each."""
         end = self.config.sweep.first_seed + self.config.sweep.seeds
         return [
             np.arange(first, min(first + self.layout.seeds, end))
@@ -217,66 +238,66 @@ class Engine:
 
     @property
     def rows(self) -> int:
-        """Rows of all chunks: points times seeds."""
+        """Number of rows of all chunks: points times seeds."""
         return len(self.points.groups) * self.points.coarse_size * self.config.sweep.seeds
 
     def run(self, chunk: Chunk) -> pd.DataFrame:
-        """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
+        """Compute a chunk; the frame has one row for each seed and point, without padding."""
         group = self.points.groups[chunk.group]
         program = self._program(chunk.group)
         with precision(group.config):
-            given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
+            arguments = self._pad_arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
-            found = jax.block_until_ready(program.run(*given))
+            metrics, gains = jax.block_until_ready(program.run(*arguments))
             self.run_seconds += time.perf_counter() - start
-            # only now, as the first lanes need not wait for them
+            # compiled only now, so that the first chunk starts earlier
             self._compile_gain_metrics(group.config.run.precision)
             start = time.perf_counter()
-            figures = self._judged(*found)
+            metrics = self._complete_metrics(metrics, gains)
             self.run_seconds += time.perf_counter() - start
-        data = self.row_labels(chunk)
+        columns = self.row_labels(chunk)
         for name in self.points.metrics:
-            own = np.asarray(figures.get(name, np.full((len(chunk.seeds), len(chunk.points)), np.nan)))
-            data[name] = own[: len(chunk.seeds), : len(chunk.points)].ravel()
-        return pd.DataFrame(data)
+            padded = np.asarray(metrics.get(name, np.full((len(chunk.seeds), len(chunk.points)), np.nan)))
+            columns[name] = padded[: len(chunk.seeds), : len(chunk.points)].ravel()
+        return pd.DataFrame(columns)
 
     def row_labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
-        """What tells the rows of a chunk apart: values by axis path, and seeds."""
+        """Axis values by path, and seeds, of the rows of a chunk."""
         group = self.points.groups[chunk.group]
         values = group.structural | self.points.columns(chunk.points)
         shape = (len(chunk.seeds), len(chunk.points))
-        data = {path: np.broadcast_to(values[path], shape).ravel() for path in self.points.paths}
-        data["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
-        return data
+        columns = {path: np.broadcast_to(values[path], shape).ravel() for path in self.points.paths}
+        columns["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
+        return columns
 
-    def _arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
-        """Padded arrays for a compiled program: values by path, seeds."""
+    def _pad_arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
+        """Arguments of a compiled program, padded to the layout: values by path, and seeds."""
 
         def pad(values: np.ndarray, size: int) -> np.ndarray:
             return np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)])
 
         dtype = config.run.precision
-        padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
+        padded = {path: pad(np.asarray(column, dtype), self.layout.points) for path, column in columns.items()}
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
     def compile_all(self) -> None:
-        """Compile the programs of all groups; the first ones are kept. Raises `InputError` if the backend cannot be had."""
+        """Compile the programs of all groups. Raises `InputError` if the required backend cannot run one."""
         for group in reversed(range(len(self.points.groups))):
             self._program(group)
 
     def _program(self, group: int) -> Program:
-        """The compiled program of a group; those used last are kept."""
-        if group not in self._compiled:
-            self._compiled[group] = self._compile(self.points.groups[group].config)
-        self._compiled.move_to_end(group)
-        while len(self._compiled) > _PROGRAMS:
-            self._compiled.popitem(last=False)
-        return self._compiled[group]
+        """The compiled program of a group; the last ones used stay in memory."""
+        if group not in self._programs:
+            self._programs[group] = self._compile(self.points.groups[group].config)
+        self._programs.move_to_end(group)
+        while len(self._programs) > _MAX_PROGRAMS:
+            self._programs.popitem(last=False)
+        return self._programs[group]
 
     def _compile(self, config: Config) -> Program:
         with precision(config):
             experiment = prepare(config)
-            columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
+            columns, _ = self._pad_arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
             program = compile_program(
                 experiment,
@@ -292,88 +313,92 @@ class Engine:
                 self.fallback_reasons.append(program.fallback_reason)
             return program
 
-    def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
-        """Figures of a chunk with those that follow from them, if any of these is asked for."""
-        return add_gain_metrics(figures, gains) if needs_gain_metrics(self.config.sweep.requested_metrics) else figures
+    def _complete_metrics(self, metrics: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
+        """Metrics of a chunk, with gain metrics if any are requested."""
+        return add_gain_metrics(metrics, gains) if needs_gain_metrics(self.config.sweep.requested_metrics) else metrics
 
     def _compile_gain_metrics(self, dtype: str) -> None:
-        if dtype not in self._judging and needs_gain_metrics(self.config.sweep.requested_metrics):
-            self._judging.add(dtype)
+        """Compile the gain metrics for a precision, unless that is done or none are requested."""
+        if dtype not in self._gain_metric_dtypes and needs_gain_metrics(self.config.sweep.requested_metrics):
+            self._gain_metric_dtypes.add(dtype)
             start = time.perf_counter()
             compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
             self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
-        """Memory and time of all chunks, from a compilation and short runs of a chunk of the group that has most samples."""
+        """Estimate memory and time of all chunks, by a compilation and short runs of the group with most samples."""
         groups = self.points.groups
         group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
         config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
         with without_cache_writes():
             program = self._compile(config)
-            a_program = self.compile_seconds
+            program_seconds = self.compile_seconds
             with precision(config):
                 self._compile_gain_metrics(config.run.precision)
-        compiling = a_program * len(groups) + self.compile_seconds - a_program
+        compile_seconds = program_seconds * len(groups) + self.compile_seconds - program_seconds
         backend: Backend = "scan" if program.fallback_reason is not None else self.backend
-        # long enough for what a call costs not to count
-        expected = self._seconds(backend, config) / config.run.steps
-        steps = min(config.run.steps, max(_TRIED_SAMPLES, int(_TRIED_SECONDS / expected)))
-        brief = config.model_copy(
-            update={"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
-        )
-        tried = self._compile(brief)
-        running, judging = [], []
+        # so long that the overhead of a call does not count
+        predicted = self._predict_seconds(backend, config)
+        steps = min(config.run.steps, max(_TIMED_SAMPLES, int(_TIMED_SECONDS / (predicted / config.run.steps))))
+        short_run = config.run.model_copy(update={"duration": steps * config.run.sample_period})
+        short_config = config.model_copy(update={"run": short_run})
+        short_program = self._compile(short_config)
+        loop_seconds, gain_metric_seconds = [], []
         with precision(config):
-            given = self._arguments(brief, self.points.columns(chunk.points), chunk.seeds)
+            arguments = self._pad_arguments(short_config, self.points.columns(chunk.points), chunk.seeds)
             for _ in range(3):
-                begun = time.perf_counter()
-                found = jax.block_until_ready(tried.run(*given))
-                ended = time.perf_counter()
-                self._judged(*found)
-                running.append(ended - begun)
-                judging.append(time.perf_counter() - ended)
-        # other groups take other numbers of plant steps, say; where there are many, some stand for all
+                start = time.perf_counter()
+                metrics, gains = jax.block_until_ready(short_program.run(*arguments))
+                end = time.perf_counter()
+                self._complete_metrics(metrics, gains)
+                loop_seconds.append(end - start)
+                gain_metric_seconds.append(time.perf_counter() - end)
+        # groups differ in plant steps, say; of many groups a selection is counted
         counted = groups[:: math.ceil(len(groups) / _COUNTED_GROUPS)]
-        all_groups = sum(self._seconds(backend, one.config) for one in counted) * len(groups) / len(counted)
-        a_chunk = statistics.median(running) / steps * config.run.steps * all_groups / self._seconds(backend, config)
+        predicted_sum = sum(self._predict_seconds(backend, group.config) for group in counted) * len(groups) / len(counted)
+        measured = statistics.median(loop_seconds) / steps * config.run.steps
         chunks, lanes = len(self) // len(groups), math.prod(self.layout)
-        run_seconds = chunks * (a_chunk + statistics.median(judging) * len(groups))
+        run_seconds = chunks * (measured * predicted_sum / predicted + statistics.median(gain_metric_seconds) * len(groups))
         return SweepEstimate(
             points=len(groups) * self.points.coarse_size,
             rows=self.rows,
-            most_points=len(self.points),
+            max_points=len(self.points),
             chunks=len(self),
             lanes_a_chunk=lanes,
-            compile_seconds=compiling,
+            compile_seconds=compile_seconds,
             run_seconds=run_seconds,
-            lane_steps_per_second=chunks * lanes * sum(one.config.run.steps for one in groups) / run_seconds,
+            lane_steps_per_second=chunks * lanes * sum(group.config.run.steps for group in groups) / run_seconds,
             megabytes=program.megabytes,
             backend=backend,
         )
 
-    def _seconds(self, backend: Backend, config: Config) -> float:
-        """That a chunk of a group should take."""
-        work = count_operations(config, self._varied, computed_metrics(backend, config.sweep.requested_metrics))
-        return load_costs(self.devices).sample(backend, work, self.layout) * config.run.steps
+    def _predict_seconds(self, backend: Backend, config: Config) -> float:
+        """Seconds that a chunk of a group should take."""
+        names = computed_metrics(backend, config.sweep.requested_metrics)
+        operations = count_operations(config, self._varied_paths, names)
+        return load_costs(self.devices).sample_seconds(backend, operations, self.layout) * config.run.steps
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepEstimate:
-    """What a study will cost; a refined one, what its coarse grid will cost.
+    """Estimated time and memory of a study; of a refined study, for its coarse grid.
 
     Attributes:
-        points: points that are simulated in any case.
-        rows: these with all seeds.
-        most_points: points of the study; of a refined one, those of its fine grid.
-        chunks: chunks for `rows`, of `lanes_a_chunk` lanes each.
-        compile_seconds: time of all compilations; `run_seconds`, of all chunks.
-        lane_steps_per_second: rate over all chunks, with `backend`.
+        points: number of points that are simulated in any case.
+        rows: number of these points with all seeds.
+        max_points: number of points of the study; of a refined study, those of its fine grid.
+        chunks: number of chunks for `rows`.
+        lanes_a_chunk: number of lanes of a chunk.
+        compile_seconds: time of all compilations, s.
+        run_seconds: time of all chunks, s.
+        lane_steps_per_second: rate over all chunks.
         megabytes: memory of a chunk, MB.
+        backend: backend that was timed.
     """
 
     points: int
     rows: int
-    most_points: int
+    max_points: int
     chunks: int
     lanes_a_chunk: int
     compile_seconds: float

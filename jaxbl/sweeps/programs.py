@@ -27,29 +27,34 @@ BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
 
 def check_backend(name: str | None, source: str = "backend") -> Backend | None:
-    """A backend by its name, None for none. Raises `InputError` for another; `source` is what it was given as."""
+    """Return the name if it is a backend or None; otherwise raise `InputError` that begins with `source`, the option."""
     if name is not None and name not in BACKENDS:
-        raise InputError(f"{source}: there is no {name!r}; one of {', '.join(BACKENDS)}")
+        raise InputError(f"{source}: there is no {name!r}; it should be one of {', '.join(BACKENDS)}")
     return name
 
 
 def computed_metrics(backend: Backend, names: MetricNames) -> MetricNames:
-    """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
-    computes all, so that those asked for are to the bit what they are beside the others."""
+    """The metrics that a backend computes if `names` are requested.
+
+    XLA rounds differently if it computes less. The scan therefore computes all metrics: a metric has the same bits whichever
+    others are requested.
+    """
     return names if backend == "fused" else None
 
 
-Result = TypeVar("Made")
+Result = TypeVar("Result")
 
 _MAX_SHARED = 16
-"""Programs that studies share, at most."""
+"""Number of programs that are held for other studies."""
 _shared_results: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
 
 
 @contextmanager
 def share_programs() -> Iterator[None]:
-    """Studies that are run inside share their programs, as those of the stages of one search: what differs in nothing but
-    the values of its lanes is compiled once."""
+    """Let studies that run inside share programs: studies that differ only in the values of their lanes compile once.
+
+    The stages of a search for gains are such studies.
+    """
     before = _shared_results.set(OrderedDict())
     try:
         yield
@@ -58,8 +63,14 @@ def share_programs() -> Iterator[None]:
 
 
 def share_result(experiment: Experiment, paths: Iterable[str], arguments: Any, build: Callable[[], Result]) -> Result:
-    """What `build` makes of an experiment whose leaves at `paths` may have any values, and of other hashable arguments
-    `arguments`; inside :func:`sharing`, what it has made of them before."""
+    """Call `build`, or inside :func:`share_programs` return the result of an earlier call with equal arguments.
+
+    Args:
+        experiment: argument of `build`; its leaves at `paths` may differ.
+        paths: leaves on whose values the result does not depend.
+        arguments: other arguments of `build`, hashable.
+        build: makes the result.
+    """
     results = _shared_results.get()
     if results is None:
         return build()
@@ -82,9 +93,14 @@ class Layout(NamedTuple):
 
 
 class Program(NamedTuple):
-    """What runs a chunk: `run` maps values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains,
-    which have these axes or fit them; it takes `megabytes` of memory. Where the scan takes the fused loop's place, `instead`
-    says what the loop does not support."""
+    """A compiled program for chunks of one shape.
+
+    Attributes:
+        run: maps values by path `(points,)` and seeds `(seeds,)` to metrics by column `(seeds, points)`, and to gains by
+            side that broadcast to these axes.
+        megabytes: memory that it takes.
+        fallback_reason: what the fused loop does not support, if the scan takes its place.
+    """
 
     run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
     megabytes: float
@@ -93,15 +109,14 @@ class Program(NamedTuple):
 
 @contextmanager
 def without_cache_writes() -> Iterator[None]:
-    """What is compiled inside is not put into JAX's cache of programs, and taken from it if it is there: compiling takes as
-    long as it would without."""
-    least = "jax_persistent_cache_min_compile_time_secs"
-    before = jax.config.values[least]
-    jax.config.update(least, math.inf)
+    """Write no program that is compiled inside to JAX's cache, so that a later compilation takes as long as without this."""
+    threshold = "jax_persistent_cache_min_compile_time_secs"
+    before = jax.config.values[threshold]
+    jax.config.update(threshold, math.inf)
     try:
         yield
     finally:
-        jax.config.update(least, before)
+        jax.config.update(threshold, before)
 
 
 def compile_program(
@@ -129,24 +144,23 @@ def compile_program(
         InputError: the fused loop is required and cannot run the experiment.
     """
 
-    def compiled() -> Program:
-        if backend == "fused":
-            try:
-                with raising_unsupported():
-                    return _fused(experiment, layout, devices, tuple(columns), metric_names)
-            except Unsupported as why:
-                if require_backend:
-                    raise InputError(f"--backend fused: the fused loop does not support {why}; use --backend scan") from None
-                return _scanned(experiment, layout, devices, columns)._replace(fallback_reason=str(why))
-        return _scanned(experiment, layout, devices, columns)
+    def compile_backend() -> Program:
+        if backend == "scan":
+            return _compile_scan(experiment, layout, devices, columns)
+        try:
+            with raising_unsupported():
+                return _compile_fused(experiment, layout, devices, tuple(columns), metric_names)
+        except Unsupported as reason:
+            if require_backend:
+                raise InputError(f"--backend fused: the fused loop does not support {reason}; use --backend scan") from None
+            return _compile_scan(experiment, layout, devices, columns)._replace(fallback_reason=str(reason))
 
     dtypes = tuple(column.dtype for column in columns.values())
-    return share_result(
-        experiment, columns, (layout, tuple(devices), backend, dtypes, metric_names, require_backend), compiled
-    )
+    arguments = layout, tuple(devices), backend, dtypes, metric_names, require_backend
+    return share_result(experiment, columns, arguments, compile_backend)
 
 
-def _fused(
+def _compile_fused(
     experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: MetricNames
 ) -> Program:
     if not paths:
@@ -154,38 +168,38 @@ def _fused(
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
     if devices[0].platform == "cpu":
-        passage: LaneSimulator = HostSimulator(experiment, (metrics_reducer(names),), paths, layout.points, len(devices))
+        simulator: LaneSimulator = HostSimulator(experiment, (metrics_reducer(names),), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:
         with jax.default_device(devices[0]):
-            passage = DeviceSimulator(experiment, (metrics_reducer(names),), paths, layout.points)
+            simulator = DeviceSimulator(experiment, (metrics_reducer(names),), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 
     with jax.default_device(devices[0]):
-        # what draws the noise is compiled at its first use
-        next(passage.stretches(0))
+        # compile the program that draws the noise, now and not with the first chunk
+        next(simulator.stretches(0))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
-            # seeds that only fill up the last chunk are copies of one; those of a chunk are likely those of the next
-            different = dict.fromkeys(int(seed) for seed in seeds)
-            passage.keep(different)
-            found = {seed: passage(values, seed) for seed in different}
-        stacked = {name: np.stack([found[int(seed)][name] for seed in seeds]) for name in found[int(seeds[0])]}
-        return stacked, observer_gains(set_leaves(experiment, values))
+            # seeds may repeat, as padding of the last chunk; the next chunk has probably the same ones
+            unique_seeds = dict.fromkeys(int(seed) for seed in seeds)
+            simulator.keep(unique_seeds)
+            metrics = {seed: simulator(values, seed) for seed in unique_seeds}
+        columns = {name: np.stack([metrics[int(seed)][name] for seed in seeds]) for name in metrics[int(seeds[0])]}
+        return columns, observer_gains(set_leaves(experiment, values))
 
-    size = jnp.result_type(experiment.run.sample_period).itemsize
-    figures = len(metric_columns(experiment, names)) * layout.seeds
-    return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
+    item_size = jnp.result_type(experiment.run.sample_period).itemsize
+    column_count = len(metric_columns(experiment, names)) * layout.seeds
+    return Program(run, (simulator.carried + len(paths) + column_count) * layout.points * item_size / 1e6)
 
 
-def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
-    def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
-        experiment_of_lane = set_leaves(experiment, values)
-        figures, _ = scan(experiment_of_lane, seed, (ALL_METRICS,))
-        return figures, observer_gains(experiment_of_lane)
+def _compile_scan(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
+    def run_lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
+        lane_experiment = set_leaves(experiment, values)
+        metrics, _ = scan(lane_experiment, seed, (ALL_METRICS,))
+        return metrics, observer_gains(lane_experiment)
 
-    # shards along the longer side that divides evenly; one device does the rest
+    # devices share the points, or else the seeds, if their number divides evenly; otherwise one device computes all
     seeds, points = layout
     count = len(devices)
     by_points, by_seeds = points % count == 0, points % count != 0 and seeds % count == 0
@@ -193,15 +207,15 @@ def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns
     over_points = PartitionSpec("lanes" if by_points else None)
     over_seeds = PartitionSpec("lanes" if by_seeds else None)
     local_points = points // count if by_points else points
-    chunk = jax.shard_map(
-        jax.vmap(jax.vmap(lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
+    run_chunk = jax.shard_map(
+        jax.vmap(jax.vmap(run_lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
         mesh=mesh,
         in_specs=(over_points, over_seeds),
         out_specs=PartitionSpec(*over_seeds, *over_points),
         check_vma=False,
     )
     example = {path: np.zeros(points, column.dtype) for path, column in columns.items()}, np.zeros(seeds, np.uint32)
-    program = jax.jit(chunk).lower(*example).compile()
+    program = jax.jit(run_chunk).lower(*example).compile()
     memory = program.memory_analysis()
-    size = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
-    return Program(program, size / 1e6)
+    byte_count = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
+    return Program(program, byte_count / 1e6)

@@ -145,7 +145,7 @@ class Run:
         """Run the whole study, or the chunks that were asked for."""
         if self.engine.points.refinement is None:
             if self._indices is not None:
-                self._chunks, self._total = len(self._indices), sum(map(self.engine.lanes, self._indices))
+                self._chunks, self._total = len(self._indices), sum(map(self.engine.count_lanes, self._indices))
             self.ensure(map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices))
             return
         for group in range(len(self.engine.points.groups)):
@@ -174,7 +174,7 @@ class Run:
             expected = 0
             if self._store is not None:
                 self._store.grow(self._chunks, self._total)
-            chunks = self.engine.split(group, points, self._next)
+            chunks = self.engine.split_points(group, points, self._next)
             self._next += len(chunks)
             self.ensure(chunks)
             values = np.empty((seeds, len(points), len(columns)))

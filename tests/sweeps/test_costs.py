@@ -40,15 +40,15 @@ def test_counted_work():
 def test_measured_costs_are_those_of_the_machine(monkeypatch):
     """Of a made-up one, whose times follow from its costs."""
 
-    def times(config, devices, wanted):
+    def times(config, devices, cases):
         took = {}
-        for backend, path, lanes in wanted:
-            work = count_operations(config, [path])
-            took[backend, path, lanes] = KNOWN.sample(backend, work, Layout(1, lanes))
+        for backend, path, lanes in cases:
+            operations = count_operations(config, [path])
+            took[backend, path, lanes] = KNOWN.sample_seconds(backend, operations, Layout(1, lanes))
             if backend == "scan" and lanes > 10_000:
                 # the cache is too small
                 took[backend, path, lanes] *= 2.0
-        equations = count_operations(config, [wanted[0][1]]).equations
+        equations = count_operations(config, [cases[0][1]]).equations
         return took, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
 
     monkeypatch.setattr(under_test, "_time_programs", times)

@@ -126,7 +126,7 @@ def test_the_faster_backend_is_chosen():
     assert backend(3, 1) == "fused"
     # seed after seed would pay for each what lanes share
     assert backend(3, 1000) == "scan"
-    with pytest.raises(InputError, match="no 'Fused'; one of fused, scan"):
+    with pytest.raises(InputError, match="no 'Fused'; it should be one of fused, scan"):
         sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
 
 
@@ -345,6 +345,6 @@ def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
     engine, alone = run(metrics=["converged"])
     assert list(alone)[4:] == ["finite", "motor.converged"]
     assert_equal(alone, full[list(alone)])
-    assert engine._judging == set()
+    assert engine._gain_metric_dtypes == set()
     # the scan computes the others all the same
-    assert engine._works["fused"].carried < engine._works["scan"].carried
+    assert engine._operations["fused"].carried < engine._operations["scan"].carried

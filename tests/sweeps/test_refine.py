@@ -394,7 +394,8 @@ def whole_grid(data):
     engine = Engine(read_config(data), Layout(read_config(data).sweep.seeds, 2048))
     every = np.arange(engine.points.group_size)
     return pd.concat(
-        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split(g, every)], ignore_index=True
+        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split_points(g, every)],
+        ignore_index=True,
     )
 
 
@@ -600,7 +601,7 @@ def test_a_part_that_is_not_right_is_computed_again(tmp_path, finished, computed
 
 def test_dry_run_knows_the_coarse_grid():
     cost = dry_run(study(seeds=2))
-    assert (cost.points, cost.rows, cost.most_points) == (25, 50, 1089)
+    assert (cost.points, cost.rows, cost.max_points) == (25, 50, 1089)
 
 
 def test_as_a_dataset(finished):
