@@ -1,4 +1,4 @@
-"""Whether a log fits what is said of it: motion at all, gear ratio, sign of the torque; and remarks on what is odd."""
+"""Checks of a log against its study: motion, gear ratio, sign of the torque, units; and remarks on what is odd."""
 
 import itertools
 import math
@@ -17,8 +17,8 @@ from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import SegmentedStamps
 
 
-def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
-    """Refuse a position that moves by three steps of its resolution or less."""
+def check_position_moves(file: LogFile, name: str, values: np.ndarray) -> None:
+    """Refuse a position that moves by at most three steps of its resolution."""
     step = find_resolution(values)
     if step and np.ptp(values) < 3.5 * step:
         raise file.error(
@@ -27,83 +27,93 @@ def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
         )
 
 
-def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
-    """Refuse a position that is another channel's readings over again."""
-    for (name, one), (other, two) in itertools.combinations(channels.items(), 2):
+def check_channels_differ(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
+    """Refuse two channels with the same readings, of which one is a position."""
+    for (name, first), (other, second) in itertools.combinations(channels.items(), 2):
         if not {name, other} & set(POSITION_CHANNELS.values()):
             continue
-        if np.array_equal(one.values, two.values, equal_nan=True) and np.any(one.values):
+        if np.array_equal(first.values, second.values, equal_nan=True) and np.any(first.values):
             raise file.error(f"{name} and {other} are the same in every row; each needs a column of its own")
 
 
 _STANDSTILL_SAMPLES = 20
-"""Equal readings in a row from which an encoder stands still: fewer are its resolution, or a reversal."""
+"""Equal readings in a row that count as a standstill: fewer are a matter of resolution, or a reversal."""
 
 
-def note_standing(file: LogFile, segmented: SegmentedStamps, channels: Mapping[str, RawChannel]) -> None:
-    """Remark on an encoder that stands exactly still while the other one moves by a fifth of its range."""
+def note_standstill(file: LogFile, segmented: SegmentedStamps, channels: Mapping[str, RawChannel]) -> None:
+    """Remark on an encoder that stands exactly still while the other one moves by more than a fifth of its range."""
     for name, other in (("theta_e", "theta_s"), ("theta_s", "theta_e")):
         values, moving = channels[name].values, channels[other].values
-        # what its resolution hides is no standing
-        hidden = 2.0 * find_resolution(values) * np.ptp(moving) / np.ptp(values)
-        stays = (stay for part in segmented.segments for stay in _find_standstills(values, part))
-        stay = next((one for one in stays if np.ptp(moving[one]) > max(0.2 * np.ptp(moving), hidden)), None)
-        if stay is None:
+        # motion of the other side within two steps of the resolution is not a standstill
+        hidden_motion = 2.0 * find_resolution(values) * np.ptp(moving) / np.ptp(values)
+        standstills = (standstill for segment in segmented.segments for standstill in _find_standstills(values, segment))
+        standstill = next(
+            (candidate for candidate in standstills if np.ptp(moving[candidate]) > max(0.2 * np.ptp(moving), hidden_motion)),
+            None,
+        )
+        if standstill is None:
             continue
-        begin, end = segmented.times[stay][[0, -1]]
-        extreme = values[stay.start] in (values.min(), values.max())
-        stands = f"{name} stands still{' at the end of its range' * extreme} from {begin:.4g} to {end:.4g} s"
-        moves = f"{other} moves by {np.ptp(moving[stay]):.3g} {channels[other].unit}"
+        begin, end = segmented.times[standstill][[0, -1]]
+        is_extreme = values[standstill.start] in (values.min(), values.max())
+        stands = f"{name} stands still{' at the end of its range' * is_extreme} from {begin:.4g} to {end:.4g} s"
+        moves = f"{other} moves by {np.ptp(moving[standstill]):.3g} {channels[other].unit}"
         file.notes.append(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
 
 
-def _find_standstills(values: np.ndarray, part: slice) -> Iterator[slice]:
-    """Where values of a part are equal for long."""
-    ends = np.flatnonzero(np.diff(values[part], prepend=np.nan, append=np.nan) != 0.0) + part.start
-    yield from (slice(a, b) for a, b in itertools.pairwise(ends.tolist()) if b - a >= _STANDSTILL_SAMPLES)
+def _find_standstills(values: np.ndarray, segment: slice) -> Iterator[slice]:
+    """Yield the rows of a segment in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
+    edges = np.flatnonzero(np.diff(values[segment], prepend=np.nan, append=np.nan) != 0.0) + segment.start
+    yield from (
+        slice(start, stop) for start, stop in itertools.pairwise(edges.tolist()) if stop - start >= _STANDSTILL_SAMPLES
+    )
 
 
 def check_gear_ratio(
-    file: LogFile, table: LogTable, grid: Grid, found: Gearing | None, expected: float | None, tolerance: float, unit: str
+    file: LogFile, table: LogTable, grid: Grid, gearing: Gearing | None, expected: float | None, tolerance: float, unit: str
 ) -> None:
-    """Compare the ratio of both motions with the gear ratio that is expected, if it is known; `unit` is that of theta_e.
+    """Compare the ratio of both motions with the expected gear ratio, if there is one.
 
-    Up to a relative deviation of `tolerance` the file gets a remark. Beyond, InputError names the most likely mistake.
+    A ratio that is off by at most the relative `tolerance` gives a remark. `unit` is that of theta_e.
+
+    Raises:
+        InputError: the ratio is further off; the message names the most likely mistake.
     """
-    if expected is not None and (found is None or found.is_loose or found.residual >= UNRELATED):
-        _check_size(file, table, grid, expected)
-    if found is None or found.residual >= UNRELATED:
-        left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
+    if expected is not None and (gearing is None or gearing.is_loose or gearing.residual >= UNRELATED):
+        _check_motion_sizes(file, table, grid, expected)
+    if gearing is None or gearing.residual >= UNRELATED:
+        unexplained = "" if gearing is None else f" ({100 * gearing.residual:.0f} % of theta_e is not explained by theta_s)"
         file.notes.append(
-            f"theta_e and theta_s are hardly related{left}: they may not belong to one drive, or the load hardly moves "
-            "beyond the lost motion."
+            f"theta_e and theta_s are hardly related{unexplained}: they may belong to different drives, or the load hardly "
+            "moves beyond the lost motion."
         )
-    elif expected is not None and found.is_loose:
-        _check_twist(file, unit, found, expected)
+    elif expected is not None and gearing.is_loose:
+        _check_twist_range(file, unit, gearing, expected)
     elif expected is not None:
-        _check_ratio(file, table, found, expected, tolerance)
+        _check_ratio(file, table, gearing, expected, tolerance)
 
 
-def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float, tolerance: float) -> None:
-    relative = found.ratio / expected
+def _check_ratio(file: LogFile, table: LogTable, gearing: Gearing, expected: float, tolerance: float) -> None:
+    relative_ratio = gearing.ratio / expected
     # 2 %: backlash and elasticity change the ratio of a short motion by as much
-    uncertain = max(0.02, 3.0 * found.residual, 5.0 * found.ratio_error / abs(expected))
-    if abs(relative - 1.0) <= uncertain:
+    tolerated = max(0.02, 3.0 * gearing.residual, 5.0 * gearing.ratio_error / abs(expected))
+    if abs(relative_ratio - 1.0) <= tolerated:
         return
-    guess, why = min(_likely_mistakes(table, expected), key=lambda pair: abs(relative / pair[0] - 1.0))
-    if abs(relative / guess - 1.0) > uncertain:
-        why = "gear_ratio, or a unit in [log], is wrong"
-    moves = f"theta_e moves {found.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
-    if abs(relative - 1.0) <= tolerance:
-        file.notes.append(f"{moves}: effects that the model leaves out may cause this, or gear_ratio is a little wrong.")
+    likely_factor, mistake = min(_likely_mistakes(table, expected), key=lambda pair: abs(relative_ratio / pair[0] - 1.0))
+    if abs(relative_ratio / likely_factor - 1.0) > tolerated:
+        mistake = "gear_ratio, or a unit in [log], is wrong"
+    comparison = f"theta_e moves {gearing.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
+    if abs(relative_ratio - 1.0) <= tolerance:
+        file.notes.append(
+            f"{comparison}: effects that the model leaves out may cause this, or gear_ratio is a little wrong."
+        )
         return
-    if found.residual < 0.05:
-        raise file.error(f"{moves}: {why}")
-    file.notes.append(f"{moves}, but the two are related only roughly; perhaps {why}.")
+    if gearing.residual < 0.05:
+        raise file.error(f"{comparison}: {mistake}")
+    file.notes.append(f"{comparison}, but the two are related only roughly; perhaps {mistake}.")
 
 
 def _likely_mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
-    """Usual mistakes: the factor that each puts on the ratio of both motions, and what is wrong then."""
+    """Return the usual mistakes: the factor by which each changes the ratio of both motions, and a sentence on it."""
     (motor, motor_table), (load, load_table) = table.position_source("theta_e"), table.position_source("theta_s")
     degrees, see = 180.0 / math.pi, "; see unit in [log]"
     motor_text = f"{motor} is not in degrees" if motor_table.unit.startswith("deg") else f"{load} is in degrees"
@@ -118,201 +128,220 @@ def _likely_mistakes(table: LogTable, expected: float) -> list[tuple[float, str]
     ]
 
 
-def _check_size(file: LogFile, table: LogTable, grid: Grid, expected: float) -> None:
-    """Refuse motions of sizes so different that wrong units or swapped sides explain them better than any gap."""
+def _check_motion_sizes(file: LogFile, table: LogTable, grid: Grid, expected: float) -> None:
+    """Refuse a log if wrong units or swapped sides explain the sizes of both motions better than a gap does."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
 
     def relative_twist(ratio: float) -> float:
-        """Rms of the twist over that of the motion: far below 1 where load and motor move together."""
+        """Return the rms twist over the rms motion: far below 1 if load and motor move together."""
         moved = max(float(np.std(motor)), abs(ratio) * float(np.std(load)))
         return float(np.std(motor - ratio * load)) / moved if moved else 0.0
 
     if relative_twist(expected) < 0.8:
         return
     # load and motor may well move against each other, beyond a resonance or in a gap: no mistake of sign is meant here
-    least, why = min(
-        (relative_twist(expected * factor), why) for factor, why in _likely_mistakes(table, expected) if factor > 0.0
+    smallest_twist, mistake = min(
+        (relative_twist(expected * factor), mistake) for factor, mistake in _likely_mistakes(table, expected) if factor > 0.0
     )
-    if least < 0.7:
-        size = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
-        raise file.error(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
-
-
-def _check_twist(file: LogFile, unit: str, found: Gearing, expected: float) -> None:
-    """Where the twist is as large as the motion, so that the log fits many ratios: refuse a twist beyond the motion."""
-    ranges = f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
-    # a load that a motor moves through a gap moves no farther than the motor
-    if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
+    if smallest_twist < 0.7:
+        relative_motion = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
         raise file.error(
-            f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {found.ratio:.3g} in place of {expected:g} it "
-            f"would be {found.least_twist:.3g} {unit})"
+            f"theta_e moves {relative_motion:.3g} times as far as gear_ratio {expected:g} times theta_s: {mistake}"
         )
-    against = " They mostly move in opposite directions: perhaps the sign of one of them is wrong."
+
+
+def _check_twist_range(file: LogFile, unit: str, gearing: Gearing, expected: float) -> None:
+    """Refuse a twist larger than the motion; remark on any other, as a loose load hardly shows the gear ratio."""
+    ranges = (
+        f"theta_e - {expected:g} theta_s ranges over {gearing.twist:.3g} {unit}, theta_e over {gearing.motion:.3g} {unit}"
+    )
+    # a load that a motor moves through a gap moves no farther than the motor
+    if gearing.twist > max(3.0 * gearing.least_twist, 1.5 * gearing.motion):
+        raise file.error(
+            f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {gearing.ratio:.3g} in place of {expected:g} it "
+            f"would be {gearing.least_twist:.3g} {unit})"
+        )
+    opposite_sign = " They mostly move in opposite directions: perhaps the sign of one of them is wrong."
     file.notes.append(
         f"{ranges}: with backlash or wind-up of that size this log hardly confirms gear_ratio."
-        + (against if found.ratio * expected < 0.0 else "")
+        + (opposite_sign if gearing.ratio * expected < 0.0 else "")
     )
 
 
 _MAX_RETURNED_WORK = -0.5
-"""Work put in, over that which torque and motion exchange, below which no model of a drive can follow."""
+"""Share of the exchanged work, below which more comes back than any model of a drive can return."""
 
 
-def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarray) -> None:
-    """Refuse a torque of the wrong sign, or remark on it: a passive drive takes energy from its input; inertia is positive.
+def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: np.ndarray) -> None:
+    """Refuse a torque of the wrong sign, or remark on a doubtful one.
 
-    `position` is what the torque, `u` of the grid, moves.
+    A passive drive takes energy from its input, and its inertia is positive. `position` is that of the encoder which the
+    torque `u` moves, rad (m), shape (samples,).
     """
-    work = total = travel = away = 0.0
-    for s in grid.segments:
-        torque, steps = grid.values["u"][s][:-1], np.diff(position[s])
+    work = exchanged = travel = displacement = 0.0
+    for segment in grid.segments:
+        torque, steps = grid.values["u"][segment][:-1], np.diff(position[segment])
         work += float(torque @ steps)
-        total += float(np.abs(torque) @ np.abs(steps))
+        exchanged += float(np.abs(torque) @ np.abs(steps))
         travel += float(np.abs(steps).sum())
-        away += abs(float(position[s][-1] - position[s][0]))
-    share = work / total if total else 0.0
-    heavy = found.inflation[0] < 10.0 and found.shares[0] > 0.1
-    # the wrong sign has to be sure; that it is the right one need only be likely
-    backwards, forwards = (
-        heavy and sign * found.values[0] > least * found.errors[0] for sign, least in ((-1.0, 8.0), (1.0, 3.0))
+        displacement += abs(float(position[segment][-1] - position[segment][0]))
+    work_share = work / exchanged if exchanged else 0.0
+    has_clear_inertia = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
+    # 8 standard errors prove the wrong sign, 3 are enough for the right one
+    accelerates_against_torque, accelerates_with_torque = (
+        has_clear_inertia and sign * rigid_fit.values[0] > errors_required * rigid_fit.errors[0]
+        for sign, errors_required in ((-1.0, 8.0), (1.0, 3.0))
     )
-    if away > 0.2 * travel:
+    if displacement > 0.2 * travel:
         # potential energy may pay for the motion
-        share = max(share, 0.0)
-    if backwards and share < 0.02:
+        work_share = max(work_share, 0.0)
+    if accelerates_against_torque and work_share < 0.02:
         raise file.error(
             "the torque has the wrong sign: the drive accelerates against it"
-            + (f" and returns {-100 * share:.0f} % of the work" if share < -0.02 else "")
+            + (f" and returns {-100 * work_share:.0f} % of the work" if work_share < -0.02 else "")
             + "; set sign = -1 in [log] u"
         )
-    # a driven load returns work as well: no error
-    if share < -0.1:
-        text = f"the drive returns {-100 * share:.0f} % of the work"
-        file.warnings.append(f"Doubtful: {text}: the load drives it, or u has the wrong sign or acts late.")
+    # a load that drives the motor returns work as well: no error
+    if work_share < -0.1:
+        returned_text = f"the drive returns {-100 * work_share:.0f} % of the work"
+        file.warnings.append(f"Doubtful: {returned_text}: the load drives it, or u has the wrong sign or acts late.")
         # a lag turns the torque of an inertia against the speed; a wrong sign turns it against the acceleration, too
-        if share < _MAX_RETURNED_WORK and not forwards:
+        if work_share < _MAX_RETURNED_WORK and not accelerates_with_torque:
             file.contradiction = (
-                f"{text}, which only a drive does that its load drives: set sign = -1 in [log] u, or take a log in which "
-                "the motor drives"
+                f"{returned_text}, as only a drive with a driving load does: set sign = -1 in [log] u, or take a log in "
+                "which the motor drives"
             )
-    elif backwards and share < 0.1:
+    elif accelerates_against_torque and work_share < 0.1:
         file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
 
 
-_FAR = 10.0
-"""Factor between an inertia and its nominal value from which on a unit is rather wrong: data sheets and CAD know it within a
-factor of two."""
+_DOUBTFUL_INERTIA = 10.0
+"""Factor between an inertia and its nominal value that makes a unit doubtful: data sheets and CAD are right within 2."""
 
-_SURE = 30.0
-"""Factor from which on it is no longer a rough number: units in place of others make 57 (degrees), 60 or 1000 of it."""
-_SURE_FAST = 100.0
-"""The same of a motion faster than the antiresonance of the nominal drive: the load stands still there, and of a resonance
-the input has to supply only the losses."""
-_FAR_TORQUE = 1000.0
-"""Factor between the torque and what the nominal inertia needs from which on a unit is rather wrong: mN m for N m. A screw
-that turns slowly against dry friction needs six hundred times the torque of its inertia."""
-
-
-_FAR_WORK = 100.0
-"""Factor between the work that friction takes and that of the nominal viscous friction from which on a unit is rather wrong.
-Dry friction that a model lacks takes ten times as much; that a drive takes a tenth is seen only in wrong units."""
+_SURE_FACTOR = 30.0
+"""Factor that only a wrong unit makes: degrees for radians make 57, minutes for seconds 60, milli 1000."""
+_SURE_FACTOR_FAST = 100.0
+"""The same for a motion faster than the antiresonance of the nominal drive: there the load stands still, and at a
+resonance the input supplies only the losses."""
+_DOUBTFUL_TORQUE = 1000.0
+"""Factor between the torque and the torque for the nominal inertia that makes a unit doubtful, as mN m for N m. A screw that
+turns slowly against dry friction needs six hundred times the torque of its inertia."""
+_DOUBTFUL_FRICTION = 100.0
+"""Factor between the friction's work and that of the nominal viscous friction that makes a unit doubtful. Dry
+friction that the model lacks takes ten times as much; a tenth is seen only with wrong units."""
 
 
-def check_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
-    """Say first that inertia, torque or friction are far from the nominal ones, as a wrong unit makes them.
+def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: NominalDrive) -> None:
+    """Warn if inertia, torque or friction are as far from the nominal drive as a wrong unit makes them.
 
-    Where they are so far that no fit is worth its time, `file.contradiction` says so. Friction takes the work
-    <u ω> + J <ω² lost a second> / 2, against f <ω²> of the model: neither noise nor a gap nor a shaft changes that. A model
-    without friction says nothing of it.
+    `file.contradiction` is set if no fit would be worth its time. Friction takes the power <u ω> + J <fall of ω² a second>
+    / 2, the model's f <ω²>; noise, gaps and shafts do not change this. Without nominal friction this part is left out.
     """
-    expected = nominal.inertia(channel)
-    value, error = float(found.values[0]), float(found.errors[0])
-    normal = nominal.viscous(channel) * found.square
-    taken = found.power + 0.5 * expected * found.slowing
-    work = taken / normal if normal > 0.0 and taken > 0.0 else None
-    usual = work is not None and 1.0 / _FAR < work < _FAR_WORK
-    least = _SURE_FAST if _is_fast(found, nominal) else _SURE
-    text, doubtful, surely, ratio = "", False, False, 1.0
+    nominal_inertia = nominal.inertia(channel)
+    inertia, inertia_error = float(rigid_fit.values[0]), float(rigid_fit.errors[0])
+    nominal_power = nominal.viscous(channel) * rigid_fit.square
+    friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
+    power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
+    has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
+    sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
+    text, is_doubtful, is_surely_wrong, ratio = "", False, False, 1.0
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
-    if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0 and found.residual < 0.5:
-        ratio = value / expected
-        text = f"u moves {channel} as an inertia of {value:.3g} would, {ratio:.3g} times the nominal {expected:.3g}"
-        doubtful, surely = not 1.0 / _FAR < ratio < _FAR, not (usual or 1.0 / least < ratio < _SURE)
-    elif value:
-        ratio = found.torque / (expected * found.acceleration)
+    if (
+        inertia > 4.0 * inertia_error
+        and rigid_fit.shares[0] > 0.05
+        and rigid_fit.inflation[0] < 10.0
+        and rigid_fit.residual < 0.5
+    ):
+        ratio = inertia / nominal_inertia
+        text = f"u moves {channel} as an inertia of {inertia:.3g} would, {ratio:.3g} times the nominal {nominal_inertia:.3g}"
+        is_doubtful, is_surely_wrong = (
+            not 1.0 / _DOUBTFUL_INERTIA < ratio < _DOUBTFUL_INERTIA,
+            not (has_usual_friction or 1.0 / sure_factor < ratio < _SURE_FACTOR),
+        )
+    elif inertia:
+        ratio = rigid_fit.torque / (nominal_inertia * rigid_fit.acceleration)
         text = (
-            f"u is {found.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {expected:.3g} needs for this motion"
+            f"u is {rigid_fit.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {nominal_inertia:.3g} needs for "
+            "this motion"
         )
-        doubtful = not 1.0 / _FAR < ratio < _FAR_TORQUE
-        surely = not (usual or 1.0 / least < ratio < _SURE * _FAR_TORQUE)
-    if work is not None and not usual and not doubtful:
-        text = f"friction takes {taken:.3g} W, {work:.3g} times what the nominal viscous friction would"
-        # a data sheet may say a friction that the machine does not have
-        doubtful, surely, ratio = True, False, 1.0 / work
-    if doubtful:
+        is_doubtful = not 1.0 / _DOUBTFUL_INERTIA < ratio < _DOUBTFUL_TORQUE
+        is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < _SURE_FACTOR * _DOUBTFUL_TORQUE)
+    if power_ratio is not None and not has_usual_friction and not is_doubtful:
+        text = f"friction takes {friction_power:.3g} W, {power_ratio:.3g} times what the nominal viscous friction would"
+        # the nominal friction may be wrong, so this alone is not sure
+        is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio
+    if is_doubtful:
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
-    # two of them that are off in the same direction are no chance
-    alike = work is not None and not usual and (work > 1.0) == (ratio > 1.0)
-    against, about = float(found.values[1]), nominal.viscous(channel)
-    if against < -8.0 * float(found.errors[1]) and found.inflation[1] < 10.0 and -3.0 * about < against < -about / 3.0:
+    # friction and inertia that are off in the same direction are no coincidence
+    same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
+    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous(channel)
+    if (
+        viscous < -8.0 * float(rigid_fit.errors[1])
+        and rigid_fit.inflation[1] < 10.0
+        and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
+    ):
         file.contradiction = (
-            f"u falls with the speed as a viscous friction of {against:.3g} would make it, the model's is {about:.3g}: set "
-            "sign = -1 in [log] u"
+            f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "
+            f"{nominal_viscous:.3g}: set sign = -1 in [log] u"
         )
-    if doubtful and (surely or alike):
+    if is_doubtful and (is_surely_wrong or same_direction):
         file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's number is"
 
 
-def _is_fast(found: RigidFit, nominal: NominalDrive) -> bool:
-    """Whether the motion is faster than that at which the load stands still on its spring, by the nominal drive."""
-    load = nominal.load_inertia / nominal.gear_ratio**2
-    # of a rigid drive, or a load that is not known, there is no such motion
-    if not (load > 0.0 and found.square > 0.0 and math.isfinite(nominal.stiffness)):
+def _is_fast(rigid_fit: RigidFit, nominal: NominalDrive) -> bool:
+    """Return True if the motion is faster than the antiresonance of the nominal drive."""
+    load_inertia = nominal.load_inertia / nominal.gear_ratio**2
+    # a rigid drive, or one without a load, has no antiresonance
+    if not (load_inertia > 0.0 and rigid_fit.square > 0.0 and math.isfinite(nominal.stiffness)):
         return False
-    return found.acceleration**2 / found.square > nominal.stiffness / load
+    return rigid_fit.acceleration**2 / rigid_fit.square > nominal.stiffness / load_inertia
 
 
 # remarks
 
 
-def note_channel(file: LogFile, name: str, figures: ChannelStatistics, fastest: float) -> None:
-    """Remark on jumps, saturation and improbable speeds of a channel; `fastest` is its rate of change, unit/s."""
-    if figures.jumps:
+def note_channel_faults(file: LogFile, name: str, statistics: ChannelStatistics, rate: float) -> None:
+    """Remark on jumps, saturation and improbable speeds of a channel; `rate` is its rate of change, unit/s."""
+    if statistics.jumps:
         file.notes.append(
-            f"{name}: {figures.jumps} jump{'s' * (figures.jumps > 1)} that the motion does not explain: "
+            f"{name}: {statistics.jumps} jump{'s' * (statistics.jumps > 1)} that the motion does not explain: "
             "dropped counts or disturbed readings."
         )
-    if figures.saturated:
-        file.notes.append(f"{name} is saturated in {100 * figures.saturated:.2g} % of the samples.")
+    if statistics.saturated:
+        file.notes.append(f"{name} is saturated in {100 * statistics.saturated:.2g} % of the samples.")
     # 1e4 rad/s, about 100 000 rpm, is beyond drives
-    if figures.unit == "rad" and fastest > 1e4:
-        rpm = fastest * 30.0 / math.pi
-        file.warnings.append(f"Doubtful: {name} reaches {fastest:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
+    if statistics.unit == "rad" and rate > 1e4:
+        rpm = rate * 30.0 / math.pi
+        file.warnings.append(f"Doubtful: {name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
 
 
-def note_skew(file: LogFile, found: Gearing, period: float) -> None:
-    """Remark on a skew between both encoders that is significant and no tiny part of the period, s."""
-    if found.skew is None or found.skew_error is None:
+def note_skew(file: LogFile, gearing: Gearing, period: float) -> None:
+    """Remark on a skew between both encoders that is significant and more than 5 % of the `period`, s."""
+    if gearing.skew is None or gearing.skew_error is None:
         return
-    if abs(found.skew) > 6.0 * found.skew_error and abs(found.skew) > 0.05 * period:
-        how = "lags" if found.skew > 0.0 else "leads"
+    if abs(gearing.skew) > 6.0 * gearing.skew_error and abs(gearing.skew) > 0.05 * period:
+        direction = "lags" if gearing.skew > 0.0 else "leads"
         file.notes.append(
-            f"theta_s {how} theta_e by {1e3 * abs(found.skew):.3g} ± {1e3 * found.skew_error:.2g} ms: a skew of the stamps, "
-            "or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
+            f"theta_s {direction} theta_e by {1e3 * abs(gearing.skew):.3g} ± {1e3 * gearing.skew_error:.2g} ms: a skew of "
+            "the stamps, or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
         )
 
 
-def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelStatistics]) -> None:
-    """Remark on the lost motion where it stands out of the noise of both encoders."""
-    unit = figures["theta_e"].unit
-    text = f"Lost motion at the motor: {found.describe_lost_motion(unit)}"
-    if found.flank == "load":
-        times = ", ".join(f"{t:.3g}" for t in found.flank_times[:6]) + (", ..." if len(found.flank_times) > 6 else "")
-        low, high = found.lost_motion_range
-        one = " With one change only, a slipped coupling or lost counts would look the same."
+def note_lost_motion(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelStatistics]) -> None:
+    """Remark on the lost motion if it exceeds the noise of both encoders."""
+    unit = statistics["theta_e"].unit
+    text = f"Lost motion at the motor: {gearing.describe_lost_motion(unit)}"
+    if gearing.flank == "load":
+        times = ", ".join(f"{t:.3g}" for t in gearing.flank_times[:6]) + (", ..." if len(gearing.flank_times) > 6 else "")
+        low, high = gearing.lost_motion_range
+        single_change = " With one change only, a slipped coupling or lost counts would look the same."
         file.notes.append(
             f"{text}, from positions passed in the same direction before and after the load torque changed its sign, at "
-            f"{times} s; {low:.2g} to {high:.2g} {unit} by position." + (one if len(found.flank_times) == 1 else "")
+            f"{times} s; {low:.2g} to {high:.2g} {unit} by position."
+            + (single_change if len(gearing.flank_times) == 1 else "")
         )
-    elif found.exceeds_noise(twist_noise(found.ratio, figures["theta_e"], figures["theta_s"])) and not found.is_loose:
-        file.notes.append(f"{text}, from {found.flank_changes} changes of the flank by the direction of motion.")
+    elif (
+        gearing.exceeds_noise(twist_noise(gearing.ratio, statistics["theta_e"], statistics["theta_s"]))
+        and not gearing.is_loose
+    ):
+        file.notes.append(f"{text}, from {gearing.flank_changes} changes of the flank by the direction of motion.")

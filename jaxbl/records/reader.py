@@ -18,15 +18,15 @@ from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
 from .plausibility import (
-    check_distinct,
+    check_channels_differ,
     check_gear_ratio,
-    check_motion,
-    check_torque,
-    check_units,
-    note_channel,
+    check_position_moves,
+    check_torque_sign,
+    flag_wrong_units,
+    note_channel_faults,
     note_lost_motion,
     note_skew,
-    note_standing,
+    note_standstill,
 )
 from .resampling import Delay, Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
@@ -149,7 +149,7 @@ def read_record(
     # from columns to SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
-    check_distinct(file, channels)
+    check_channels_differ(file, channels)
     segmented = split_at_gaps(file, stamps)
     channels = {name: raw._replace(values=raw.values[segmented.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
@@ -158,9 +158,9 @@ def read_record(
     # the sides of an element move on their own, if they move
     drive = table.kind == "drive"
     for name in encoders if drive else encoders[:1]:
-        check_motion(file, name, channels[name].values)
+        check_position_moves(file, name, channels[name].values)
     if drive and len(encoders) == 2:
-        note_standing(file, segmented, channels)
+        note_standstill(file, segmented, channels)
     # from there to evenly spaced samples
     two = drive and len(encoders) == 2
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None
@@ -173,9 +173,9 @@ def read_record(
     position, driven = grid.values[encoders[0]], drive and "u" in channels
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if driven else None
     if dynamics is not None:
-        check_torque(file, dynamics, grid, position)
+        check_torque_sign(file, dynamics, grid, position)
         if nominal is not None:
-            check_units(file, dynamics, encoders[0], nominal)
+            flag_wrong_units(file, dynamics, encoders[0], nominal)
     # uneven stamps would pass for noise of what moves between them
     source = Grid(segmented.times, {n: raw.values for n, raw in channels.items()}, segmented.segments, grid.period)
     figures = {
@@ -381,7 +381,7 @@ def _measure_channel(
         is_position=name.startswith("theta"),
         saturated=raw.saturated,
     )
-    note_channel(file, name, figures, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
+    note_channel_faults(file, name, figures, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
     return figures
 
 
