@@ -18,6 +18,7 @@ os.environ |= {
 
 import jax
 import pytest
+from figure_kinds import every_figure, figures_by_kind
 from hypothesis import settings
 from progress_lines import without_progress
 
@@ -46,6 +47,20 @@ def _few_programs():
     """Over many files, compiled programs would use up what the system lets a process map into memory."""
     yield
     clear_programs_if_needed()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _figures_by_kind():
+    """To draw figures takes longer than most of what they show."""
+    with figures_by_kind():
+        yield
+
+
+@pytest.fixture
+def every_figure_drawn():
+    """For tests that look at files of figures, or at places that are known once a figure is drawn."""
+    with every_figure():
+        yield
 
 
 @pytest.fixture(scope="module")

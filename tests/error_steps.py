@@ -1,5 +1,7 @@
 """The error of a super-twisting observer sample by sample, by the observer's own step."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,23 @@ import numpy as np
 from jaxbl.observer.super_twisting import DISCRETISATIONS
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _observed(implicit, lambda_, alpha, reading, nominal):
+    """Position and velocity that the observer expects after one sample, and its estimate of the velocity."""
+    observer = DISCRETISATIONS["implicit" if implicit else "explicit"](lambda_, alpha)
+    zero = jnp.zeros_like(reading)
+    state, estimate = observer.step(observer.start(zero, zero, lambda v: 0.0 * v, 1.0), reading, lambda _: nominal, 1.0)
+    return state.position, state.velocity, estimate.velocity
+
+
 def stepped(system, e, g, noise, mean, moment, nominal):
     """One sample of the observer's own step on a double integrator: e, g of the next sample, and the estimate's error."""
-    observer = DISCRETISATIONS["implicit" if system.implicit else "explicit"](system.lambda_, system.alpha)
+    reading, nominal = np.broadcast_arrays(np.asarray(e, float) + noise, nominal)
+    count = len(reading)
+    # few lengths, as each is compiled
+    length = next(size for size in (1, 4096, 65536, 2**18) if size >= count)
     with jax.enable_x64(True):
-        zero = jnp.zeros_like(jnp.asarray(e))
-        start = observer.start(zero, zero, lambda v: 0.0 * v, 1.0)
-        state, estimate = observer.step(start, jnp.asarray(e) + noise, lambda _: jnp.asarray(nominal), 1.0)
-    e_next = e + g + moment + 0.5 * nominal - np.asarray(state.position)
-    return e_next, g + mean + nominal - np.asarray(state.velocity), np.abs(np.asarray(estimate.velocity) - g)
+        gains = jnp.asarray(system.lambda_), jnp.asarray(system.alpha)
+        padded = (np.resize(values, length) for values in (reading, nominal))
+        position, velocity, estimate = (np.asarray(x)[:count] for x in _observed(system.implicit, *gains, *padded))
+    return e + g + moment + 0.5 * nominal - position, g + mean + nominal - velocity, np.abs(estimate - g)

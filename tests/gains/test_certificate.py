@@ -1,6 +1,7 @@
 """Certificates in a drive's units: what is proven and asked for, what is refused, and those of tuned gains."""
 
 import dataclasses
+import functools
 import json
 import math
 import re
@@ -22,6 +23,14 @@ from jaxbl.report.tune import write_tune_report
 
 GAINS = 2.2, 9.2
 BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "runs": 1}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _proofs_once(compiled_once):
+    """Searches of this file prove the same gains again and again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(certificate, "prove", functools.cache(certificate.prove))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -86,6 +86,7 @@ STUDIES = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("every_figure_drawn")
 @pytest.mark.parametrize("kind", STUDIES)
 def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
     rng = np.random.default_rng(0)

@@ -8,6 +8,8 @@ import pytest
 
 from jaxbl.report.figures import limits, literal, outline, save, subplots
 
+pytestmark = pytest.mark.usefixtures("every_figure_drawn")
+
 
 def test_the_base_and_the_report_of_inspect_need_no_jax():
     modules = ["page", "figures", "inspect"]

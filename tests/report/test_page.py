@@ -120,6 +120,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
 
 
 @needs_chromium
+@pytest.mark.usefixtures("every_figure_drawn")
 def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
     result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
@@ -195,6 +196,7 @@ GONE = {
 
 
 @needs_chromium
+@pytest.mark.usefixtures("every_figure_drawn")
 def test_pages_of_studies_that_nobody_expects(tmp_path):
     """Markup and letters from right to left in texts, ten thousand values of an axis, nothing but runs that diverged."""
     title = f"{HOSTILE} $\\frac{{$ {{0}} %s \u202e"

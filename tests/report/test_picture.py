@@ -8,6 +8,8 @@ import pytest
 from jaxbl.report.figures import Drawn, save, subplots
 from jaxbl.report.picture import picture
 
+pytestmark = pytest.mark.usefixtures("every_figure_drawn")
+
 
 def unpacked(text):
     return np.frombuffer(base64.b64decode(text), "<f4")

@@ -73,6 +73,7 @@ def test_numbers_figures_and_page(folder, tuned):
     assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
 
 
+@pytest.mark.usefixtures("every_figure_drawn")
 def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned, tmp_path):
     drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_motor")
     ax = drawing.figure.axes[0]
