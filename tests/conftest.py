@@ -2,7 +2,6 @@
 
 import os
 import sys
-from collections import Counter
 from pathlib import Path
 
 # what one worker, command or run has compiled serves the others of this Python; another one packs programs otherwise
@@ -24,6 +23,8 @@ from progress_lines import without_progress
 
 from jaxbl.workers import clear_programs_if_needed, collect_garbage_rarely
 
+pytest_plugins = ["shared_results"]
+
 collect_garbage_rarely()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -34,12 +35,6 @@ settings.load_profile("patient")
 
 # benchmarks are scripts beside the package; the tests' bench of hidden effects is one of them
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with many slow tests first, each as a whole: workers end together."""
-    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,43 +1,38 @@
 """Figures in tests: one of each kind is drawn in a process, and its picture stands for the others of that kind."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 _draw = Figure.savefig
 _pictures: dict[tuple[str, Any], bytes] = {}
 
 
-def figure_kind(figure: Figure) -> Any:
-    """Axes with their scales, kinds of artists and texts; texts are compared without their numbers."""
+def _texts(ax: Axes) -> Iterator[str]:
+    yield from (ax.get_xlabel(), ax.get_ylabel(), *(ax.get_title(place) for place in ("left", "center", "right")))
+    yield from (text.get_text() for text in ax.texts)
+    yield from ax.get_legend_handles_labels()[1]
 
-    def words(text: str) -> str:
-        return re.sub(r"[-+−]?\d[\d.]*(e[-+]?\d+)?", "0", text)
 
-    def texts(legend: Any) -> frozenset[str]:
-        return frozenset(words(text.get_text()) for text in legend.get_texts())
-
-    axes = (
-        (
-            *(ax.get_visible(), ax.get_xscale(), ax.get_yscale(), words(ax.get_xlabel()), words(ax.get_ylabel())),
-            *(words(ax.get_title(place)) for place in ("left", "center", "right")),
-            frozenset(type(artist).__name__ for artist in ax.get_children()),
-            frozenset(words(text.get_text()) for text in ax.texts),
-            texts(ax.get_legend()) if ax.get_legend() else None,
-        )
-        for ax in figure.axes
-    )
-    return tuple(axes), tuple(map(texts, figure.legends))
+def figure_kind(figure: Figure, format: str) -> Any:
+    """Kinds of artists and of texts on each of the axes, with their scales; as SVG, of a page, kinds of artists alone."""
+    artists = [frozenset(type(artist).__name__ for artist in ax.get_children()) for ax in figure.axes]
+    if format == "svg":
+        return frozenset().union(*artists)
+    # what is to be set as mathematics is read by a parser
+    mathematics = (any("$" in text for text in _texts(ax)) for ax in figure.axes)
+    axes = ((ax.get_visible(), ax.get_xscale(), ax.get_yscale()) for ax in figure.axes)
+    return tuple(zip(artists, mathematics, axes, strict=True)), len(figure.legends)
 
 
 def _save_kind(figure: Figure, file: Any, *, format: str, **how: Any) -> None:
     """`Figure.savefig` in tests."""
-    kind = format, figure_kind(figure)
+    kind = format, figure_kind(figure, format)
     if kind not in _pictures:
         drawn = BytesIO()
         _draw(figure, drawn, format=format, **how)

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
+from shared_results import ATLAS, GAINS, INPUTS, VERIFIED
 from small_study import ALPHA, LAMBDA, listed, rigid
 
 from jaxbl.config import read_config
@@ -19,26 +20,7 @@ from jaxbl.gains.verify import verify
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.sweep import open_study, sweep
 
-ATLAS = {
-    "q": 0.3,
-    "alpha_ratio": {"start": 1.05, "stop": 12.0, "num": 7},
-    "lambda_ratio": {"start": 0.05, "stop": 12.0, "num": 9},
-    "damping": [],
-}
-GAINS = [listed(LAMBDA, 0.05, 5.0, 12.0), listed(ALPHA, 1.8, 8.0)]
 AMPLITUDE, FREQUENCY, PERIOD = "excitation.amplitude", "excitation.frequency", "run.sample_period"
-INPUTS = [listed(AMPLITUDE, 0.02, 0.1, zip="input"), listed(FREQUENCY, 2.0, 5.0, zip="input")]
-STUDY = rigid(
-    {
-        "observer.discretisation": "explicit",
-        "observer.motor.velocity_error": 0.5,
-        "encoders.noise": 3e-5,
-        "run.duration": 0.192,
-    },
-    axes=[*INPUTS, *GAINS, listed(PERIOD, 1e-3, 16e-3)],
-    sweep={"seeds": 2},
-    verify=ATLAS,
-)
 KEYS = {
     "drive": [AMPLITUDE, FREQUENCY, LAMBDA, ALPHA, "seed"],
     "sampled": [AMPLITUDE, FREQUENCY, LAMBDA, ALPHA, PERIOD, "seed"],
@@ -46,12 +28,6 @@ KEYS = {
 BOUNDS = {"true": "motor.f_plus", "claimed": "motor.f_plus_acceleration"}
 CAUSES = {"run too short", "period too long", "noise", "quantisation", "explicit discretisation"}
 WHOLE = {"several", "f_plus underestimated", "unexplained"}
-
-
-@pytest.fixture(scope="module")
-def checked(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("verified")
-    return verify(STUDY, folder), folder
 
 
 def exact(ratio):
@@ -90,8 +66,8 @@ def entries(summary, level):
 
 
 @pytest.mark.slow
-def test_normalised_level_counted_again(checked):
-    verdict, _ = checked
+def test_normalised_level_counted_again(verified):
+    verdict, _ = verified
     found, plane = entries(verdict.summary, "normalised"), verdict.normalised
     np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
     np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
@@ -114,9 +90,9 @@ def test_normalised_level_counted_again(checked):
 
 
 @pytest.fixture(scope="module")
-def judged(checked):
+def judged(verified):
     """By level and bound, the rows of the frame as dicts, each with what the conditions demand."""
-    verdict, _ = checked
+    verdict, _ = verified
     return {
         (level, bound): [
             row | {"demanded": demanded(row[ALPHA], row[column])} for row in verdict.levels[level].to_dict("records")
@@ -127,8 +103,8 @@ def judged(checked):
 
 
 @pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
-def test_levels_of_the_drive_counted_again(level, cells, checked, judged):
-    verdict, _ = checked
+def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
+    verdict, _ = verified
     found = entries(verdict.summary, level)
     rows = judged[level, "true"]
     keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
@@ -171,8 +147,8 @@ def test_levels_of_the_drive_counted_again(level, cells, checked, judged):
     assert found["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
 
 
-def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(checked, judged):
-    verdict, _ = checked
+def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified, judged):
+    verdict, _ = verified
     listed_ = verdict.counterexamples
     assert set(listed_["side"]) == {"motor"}
     sizes = []
@@ -193,8 +169,8 @@ def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(checked
     assert np.sum(np.array(sizes) > 0) >= 5
 
 
-def test_every_counterexample_carries_its_point_and_a_cause(checked):
-    listed_ = checked[0].counterexamples
+def test_every_counterexample_carries_its_point_and_a_cause(verified):
+    listed_ = verified[0].counterexamples
     for level, part in listed_.groupby("level"):
         assert part[KEYS[level]].notna().all(axis=None)
     assert listed_.loc[listed_["level"] == "drive", PERIOD].isna().all()
@@ -209,8 +185,8 @@ def test_every_counterexample_carries_its_point_and_a_cause(checked):
     assert (true.groupby(["level", *KEYS["sampled"]], dropna=False)["cause"].nunique() == 1).all()
 
 
-def test_causes_in_the_summary_count_runs(checked):
-    verdict, _ = checked
+def test_causes_in_the_summary_count_runs(verified):
+    verdict, _ = verified
     for level, keys in KEYS.items():
         part = verdict.counterexamples[verdict.counterexamples["level"] == level]
         counted = entries(verdict.summary, level).get("causes", {})
@@ -220,8 +196,8 @@ def test_causes_in_the_summary_count_runs(checked):
             assert sum(causes.values()) == len(runs)
 
 
-def test_verdict_on_disk(checked):
-    verdict, folder = checked
+def test_verdict_on_disk(verified):
+    verdict, folder = verified
     found = json.loads((folder / "verdict.json").read_text())
     assert found == verdict.summary
     assert [level["level"] for level in found["levels"]] == ["normalised", "drive", "sampled"]
@@ -247,13 +223,13 @@ def contents(folder):
     return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_second_call_simulates_nothing_and_says_the_same(checked, monkeypatch):
-    verdict, folder = checked
+def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
+    verdict, folder = verified
     results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
     monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
-    again = verify(STUDY, folder)
+    again = verify(VERIFIED, folder)
     assert again.summary == verdict.summary
     for level, frame in verdict.levels.items():
         pd.testing.assert_frame_equal(again.levels[level], frame)
@@ -262,20 +238,20 @@ def test_second_call_simulates_nothing_and_says_the_same(checked, monkeypatch):
     assert all(after[path] == kept for path, kept in results.items())
 
 
-def test_another_studys_folder_is_left_as_it_is(checked):
-    _, folder = checked
+def test_another_studys_folder_is_left_as_it_is(verified):
+    _, folder = verified
     before = contents(folder)
     with pytest.raises(InputError, match="holds another study"):
         verify(rigid({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
     assert contents(folder) == before
 
 
-def test_another_q_and_other_marks_go_on_with_what_is_there(checked, monkeypatch, tmp_path):
-    verdict, folder = checked
+def test_another_q_and_other_marks_go_on_with_what_is_there(verified, monkeypatch, tmp_path):
+    verdict, folder = verified
     shutil.copytree(folder, tmp_path / "copy")
     monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
     twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
-    again = verify(STUDY | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
+    again = verify(VERIFIED | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
     titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
     assert titles == ["Davila-Fridman (32), q = 0.6"] * 3
     least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (again, verdict))
@@ -285,16 +261,16 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(checked, monkeypatch
     assert one | {"name": "the same"} == same
 
 
-def test_a_verification_keeps_to_its_backend(checked):
-    _, folder = checked
+def test_a_verification_keeps_to_its_backend(verified):
+    _, folder = verified
     with pytest.raises(InputError, match="was begun without --backend; go on without it, or choose another folder"):
-        verify(STUDY, folder, backend="scan")
+        verify(VERIFIED, folder, backend="scan")
 
 
 def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="is not empty and holds no study"):
-        verify(STUDY, tmp_path)
+        verify(VERIFIED, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -353,9 +329,9 @@ def test_without_anything_unknown_there_is_nothing_to_check():
         verify(study)
 
 
-def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(checked):
+def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verified):
     """Forward Euler chatters with period times alpha: a quarter of 16 ms would do, or no Euler."""
-    verdict, folder = checked
+    verdict, folder = verified
     found = verdict.counterexamples
     chosen = found[(found["level"] == "sampled") & (found[ALPHA] == 8.0) & (found[LAMBDA] == 12.0)]
     assert set(chosen[PERIOD]) == {16e-3}

@@ -17,6 +17,7 @@ GAINS = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("every_figure_drawn")
 @pytest.mark.parametrize("case", GAINS)
 def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
     lambda_, alpha, bound, text = GAINS[case]

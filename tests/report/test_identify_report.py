@@ -208,6 +208,7 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
 
 
+@pytest.mark.usefixtures("every_figure_drawn")
 def test_observers_that_diverged_leave_figures(tmp_path):
     found = made(geared(), tmp_path)
     trace = found.trace.copy()

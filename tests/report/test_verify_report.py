@@ -1,33 +1,16 @@
 """The page and figures of a verification."""
 
-import json
-
 import numpy as np
 import pytest
 from browser import check, needs_chromium, opened
-from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
-from jaxbl.gains.verify import verify
 from jaxbl.report.verify import draw_verdict, write_verify_report
-
-ATLAS = {
-    "alpha_ratio": {"start": 1.02, "stop": 20.0, "num": 24},
-    "lambda_ratio": {"start": 0.002, "stop": 25.0, "num": 24},
-    "damping": [0.3],
-    "marks": [{"name": "small gains", "lambda": 0.005, "alpha": 1.8}, {"name": "good gains", "lambda": 6.0, "alpha": 9.0}],
-}
-# forward Euler at so long a period fails with large gains
-STUDY = rigid(
-    {"observer.discretisation": "explicit", "run.sample_period": 0.01, "encoders.noise": 1e-3},
-    axes=[spaced(LAMBDA, 0.1, 30.0, 6), spaced(ALPHA, 1.0, 50.0, 6), listed("excitation.amplitude", 0.02, 0.1)],
-    verify=ATLAS,
-)
 
 
 @pytest.fixture(scope="module")
-def checked(tmp_path_factory):
+def checked(verified, tmp_path_factory):
+    verdict, _ = verified
     folder = tmp_path_factory.mktemp("verdict")
-    verdict = verify(STUDY, folder)
     return verdict, folder, write_verify_report(verdict, folder)
 
 
@@ -66,9 +49,8 @@ def test_crosses_are_the_counterexamples_to_the_exact_condition(checked):
 
 
 def test_page_and_lines(checked):
-    verdict, folder, lines = checked
+    _, folder, lines = checked
     page = (folder / "report.html").read_text()
-    assert json.loads((folder / "verdict.json").read_text()) == verdict.summary
     for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
         assert text in page
     assert any("no counterexample to any condition" in line for line in lines)
