@@ -21,19 +21,34 @@ def free(velocity):
     return 0.0 * velocity
 
 
-@partial(jax.jit, static_argnames="acceleration")
-def observe(observer, measured, h, acceleration=free, velocity=0.0, further=None):
-    """Estimates, and states predicted from them, along measured positions; `further` states at the start."""
+@jax.jit
+def observe_block(observer, state, measured, known, h):
+    """The state after a block, and for each sample the estimate and the state predicted from it."""
 
-    def step(state, y):
-        state, estimate = observer.step(state, y, acceleration, h)
+    def step(state, sample):
+        state, estimate = observer.step(state, sample[0], lambda _: sample[1], h)
         return state, (estimate, state)
 
-    dtype = measured.dtype
-    start = observer.start(measured[0], jnp.asarray(velocity, dtype), acceleration, jnp.asarray(h, dtype))
-    if further is not None:
-        start = start._replace(further=tuple(jnp.asarray(x, dtype) for x in further))
-    return jax.lax.scan(step, start, measured)[1]
+    return jax.lax.scan(step, state, (measured, known))
+
+
+BLOCK = 8000
+"""Samples that the one program observes which all signals share: to compile it takes longer than to run it."""
+
+
+def observe(observer, measured, h, known=0.0, velocity=0.0, further=None):
+    """Estimates, and states predicted from them, along measured positions and known accelerations; `further` states at the
+    start."""
+    dtype, count = measured.dtype, len(measured)
+    further = [0.0] * (observer.order - 1) if further is None else further
+    state = ObserverState(*(np.asarray(x, dtype) for x in (measured[0], velocity)), tuple(np.asarray(further, dtype)))
+    length = -(-count // BLOCK) * BLOCK
+    signals = (np.resize(np.broadcast_to(x, count).astype(dtype), length).reshape(-1, BLOCK) for x in (measured, known))
+    blocks = []
+    for signals_of_block in zip(*signals, strict=True):
+        state, along = observe_block(observer, state, *signals_of_block, np.asarray(h, dtype))
+        blocks.append(along)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
 
 
 @pytest.mark.parametrize(("dtype", "few"), [(np.float64, 1e-14), (np.float32, 5e-6)])
@@ -123,7 +138,7 @@ def test_the_scheme_is_backward_euler_with_exact_outputs(order):
     noise = np.where(t > 3.0, 1e-2 * np.random.default_rng(0).normal(size=t.size), 0.0)
     y = np.sin(3.0 * t) + noise
     lipschitz = 3.0 ** (order + 1)
-    estimate, _ = observe(DIFFERENTIATORS[order](lipschitz), y, h)
+    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(lipschitz)), y, h)
     expected = backward_euler(order, lipschitz, h, y)
     estimates = [estimate.position, estimate.velocity, *([estimate.control] if order >= 2 else [])]
     # the roots of order 5 differ by rounding, which its gains magnify
@@ -143,13 +158,7 @@ def test_known_accelerations_leave_it_exact(order):
     polynomial = np.polynomial.Polynomial(0.5 ** np.arange(order + 1) / [factorial(i) for i in range(order + 1)])
     # acceleration of polynomials of degree 1 is zero: all of it is known
     y = polynomial(t) + place
-    observer = DIFFERENTIATORS[order](40.0)
-
-    def step(state, inputs):
-        return observer.step(state, inputs[0], lambda _: inputs[1], h)
-
-    start = observer.start(jnp.asarray(y[0]), jnp.asarray(0.3), free, jnp.asarray(h))
-    estimate = jax.lax.scan(step, start, (jnp.asarray(y), jnp.asarray(added)))[1]
+    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(40.0)), y, h, added, velocity=0.3)
     late = slice(-300, None)
     rounding = np.finfo(float).eps * np.abs(y).max()
     velocity = polynomial.deriv()(t) + speed
@@ -176,7 +185,7 @@ def test_any_start_leads_into_the_sliding_set(order):
         # the error is observed: true states zero, but for what the highest derivative does over the period
         new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
         position, velocity, *further = (
-            x - p * top for x, p in zip([new.position, new.velocity, *new.further], push, strict=True)
+            x - p * top for x, p in zip([new.position, new.velocity, *new.extra_states], push, strict=True)
         )
         return ObserverState(position, velocity, tuple(further)), estimate.position
 
@@ -195,7 +204,7 @@ def test_polynomials_are_differentiated_exactly_and_without_chatter(order):
     coefficients = 0.5**powers / np.array([1.0, *np.cumprod(powers[1:])])
     polynomial = np.polynomial.Polynomial(coefficients)
     y = polynomial(t)
-    estimate, _ = observe(DIFFERENTIATORS[order](40.0), y, h, velocity=0.3)
+    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(40.0)), y, h, velocity=0.3)
     late = slice(-300, None)
     rounding = np.finfo(float).eps * np.abs(y).max()
     np.testing.assert_allclose(estimate.position[late], y[late], atol=8.0 * rounding)
@@ -212,7 +221,7 @@ def test_a_smooth_signal_never_leaves_the_sliding_set_again(order, dtype, h):
     """|y^(n+1)| <= L: the position has no error at all, and the velocity that of interpolation, h^n L / (n + 1)."""
     t = h * np.arange(8000)
     rounding = float(np.finfo(dtype).eps)
-    estimate, _ = observe(DIFFERENTIATORS[order](dtype(1.0)), np.sin(t).astype(dtype), h, velocity=1.0)
+    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(1.0, dtype)), np.sin(t).astype(dtype), h, velocity=1.0)
     assert estimate.velocity.dtype == dtype
     late = slice(-2000, None)
     assert np.abs(estimate.position - np.sin(t))[late].max() <= 9.0 * rounding
@@ -228,7 +237,7 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     Noise is scaled with time as the differentiator is homogeneous: the worst of many signs of noise that changes slowly
     enough for the sampling period to play no part.
     """
-    n, observer = order, DIFFERENTIATORS[order](1.0)
+    n, observer = order, DIFFERENTIATORS[order](np.asarray(1.0))
     sizes = 10.0 ** np.linspace(-8.0, -3.0, 6)
     pace = sizes ** (1.0 / (n + 1))
     h = pace / 400.0
@@ -237,10 +246,9 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     waves = np.sign(np.sin(2.0 * np.pi * t / (pace[:, None] * 6.0) + np.random.default_rng(5).uniform(0.0, 6.0)))
     true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
 
-    def step(y, h, *further):
-        return observe(observer, y, h, velocity=0.9, further=further)
-
-    estimate, state = jax.vmap(step)(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]))
+    lanes = zip(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]), strict=True)
+    runs = [observe(observer, y, period, velocity=0.9, further=further) for y, period, *further in lanes]
+    estimate, state = jax.tree.map(lambda *lanes: np.stack(lanes), *runs)
     estimates = [estimate.position, estimate.velocity]
     if n >= 2:
         estimates.append(estimate.control)
