@@ -8,7 +8,7 @@ import numpy as np
 from .linear_filters import butterworth_coefficients, filter_both_ways, welch_spectrum
 
 MIN_SAMPLES = 64
-"""Samples that a log needs, and a segment to be filtered and regressed: ten samples for each of six terms of a regression.
+"""Samples that a log needs, and a segment that is filtered and regressed: ten for each of six terms of a regression.
 
 Other segments need half as many.
 """
@@ -16,20 +16,20 @@ Other segments need half as many.
 
 @dataclass(frozen=True)
 class ChannelStatistics:
-    """Figures on one measured channel, in SI units.
+    """Statistics of one measured channel, in SI units.
 
     Attributes:
         unit: rad, m, N m or N.
         least: smallest value.
         largest: largest value.
         resolution: step between neighbouring values; 0 where they are continuous.
-        noise: rms of a white noise with the spectral density found above a third of the sampling rate; of uneven stamps
-            that of the resampled signal, which is a little less.
-        bandwidth: frequency in Hz below which 95 % of the power lies (of a position: of its velocity's), noise left out.
-        saturated: share of samples at the saturation level, or in stays at an extreme value.
-        jumps: isolated outliers and steps, as of dropped counts.
-        skew: by how much the stamps are later than the readings, s: of theta_s against theta_e, of u against the motion
-            that it makes; None where the log does not show it.
+        noise: rms of white noise with the spectral density above a third of the sampling rate; with uneven stamps that of
+            the resampled signal, which is a little less.
+        bandwidth: frequency, Hz, below which 95 % of the power without noise lies; of the velocity, if it is a position.
+        saturated: share of samples at the saturation level, or in flat runs at an extreme value.
+        jumps: number of isolated outliers and steps, as dropped counts make them.
+        skew: delay of the stamps against the readings, s: theta_s against theta_e, u against the motion that it causes;
+            None if the log does not show it.
         skew_error: standard error of `skew`, s.
     """
 
@@ -48,55 +48,69 @@ class ChannelStatistics:
 def measure_channel(
     values: np.ndarray,
     period: float,
-    parts: Sequence[np.ndarray],
+    segments: Sequence[np.ndarray],
     stamps: Sequence[np.ndarray] | None,
     *,
     unit: str,
     is_position: bool,
     saturated: float,
 ) -> ChannelStatistics:
-    """Figures on a channel.
+    """Compute the statistics of a channel.
 
-    Noise and bandwidth are those of `values`, its longest segment at even spacing; all else is that of the `parts` between
-    gaps, with `stamps` (s) where these are uneven. `saturated` is the share of samples at a known saturation level.
+    Args:
+        values: its longest segment at even spacing, for noise and bandwidth, shape (samples,).
+        period: of `values`, s.
+        segments: readings of each segment as recorded, for all other statistics.
+        stamps: times of each segment if these are uneven, s.
+        unit: rad, m, N m or N.
+        is_position: whether it is a position.
+        saturated: share of samples at the saturation level, if that is specified; else 0.
     """
-    every = np.concatenate(parts)
-    step = find_resolution(every)
+    all_values = np.concatenate(segments)
+    step = find_resolution(all_values)
     frequency, density = power_spectrum(values, period)
-    found = sum(map(count_jumps, parts, [step] * len(parts), stamps or [None] * len(parts))) if is_position else 0
+    jump_count = (
+        sum(map(count_jumps, segments, [step] * len(segments), stamps or [None] * len(segments))) if is_position else 0
+    )
     return ChannelStatistics(
         unit=unit,
-        least=float(every.min()),
-        largest=float(every.max()),
+        least=float(all_values.min()),
+        largest=float(all_values.max()),
         resolution=step,
         noise=float(np.sqrt(noise_floor(frequency, density) * 0.5 / period)),
         bandwidth=find_bandwidth(values, period, differentiate=is_position) if np.ptp(values) else 0.0,
-        saturated=saturated or (0.0 if is_position else saturated_share(every, step)),
-        jumps=found,
+        saturated=saturated or (0.0 if is_position else saturated_share(all_values, step)),
+        jumps=jump_count,
     )
 
 
 def find_resolution(values: np.ndarray) -> float:
-    """Step of which all differences between values are multiples; 0 where there is none."""
+    """Return the step of which all differences between values are multiples; 0 if there is none."""
     span = float(np.ptp(values)) if len(values) else 0.0
     steps = np.diff(np.unique(values))
-    # what is left of arithmetic in floating point is no step
+    # rounding errors of floating-point arithmetic are not steps
     steps = steps[steps > max(1e-9 * span, 1e-13 * float(np.abs(values).max(initial=0.0)))]
     if len(steps) == 0 or len(steps) > 0.98 * (len(values) - 1):
         return 0.0
     step = float(np.quantile(steps, 0.02)) if len(steps) > 200 else float(steps.min())
     # the smallest steps first, so that the rounding of large ones is not taken for a remainder
-    for most in (1.5, 10.5, 100.5):
-        few = steps[steps < most * step]
-        step = float(few.sum() / max(np.round(few / step).sum(), 1.0))
+    for limit in (1.5, 10.5, 100.5):
+        small_steps = steps[steps < limit * step]
+        step = float(small_steps.sum() / max(np.round(small_steps / step).sum(), 1.0))
     remainder = np.abs(steps / step - np.round(steps / step))
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
 def power_spectrum(values: np.ndarray, period: float, *, differentiate: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided power spectral density of evenly spaced values, or of their slope, by Welch's method.
+    """Return the one-sided power spectral density of evenly spaced values, by Welch's method.
 
-    Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
+    Args:
+        values: shape (samples,).
+        period: s.
+        differentiate: whether the density is that of the slope of the values.
+
+    Returns:
+        Frequencies, Hz, without 0, and densities, unit²/Hz ((unit/s)²/Hz of the slope).
     """
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
@@ -109,7 +123,7 @@ def power_spectrum(values: np.ndarray, period: float, *, differentiate: bool = F
 
 
 def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
-    """Median density above a third of the sampling rate, unit²/Hz, from :func:`power_spectrum`."""
+    """Return the median density above a third of the sampling rate, unit²/Hz, of a :func:`power_spectrum`."""
     return float(np.median(density[frequency >= 2.0 / 3.0 * frequency[-1]]))
 
 
@@ -123,37 +137,40 @@ def estimate_white_noise(parts: Sequence[np.ndarray]) -> float:
 
 
 def find_bandwidth(values: np.ndarray, period: float, *, differentiate: bool) -> float:
-    """Frequency in Hz below which 95 % of the power lies that stands out of the noise, of values or their slope; 0: none."""
+    """Return the frequency, Hz, below which 95 % of the power above the noise lies; 0 if there is none.
+
+    The power is that of the values, or of their slope (`differentiate`).
+    """
     frequency, density = power_spectrum(values, period)
     # steps of the resolution make noise of their own, and not always up to the end of the band
-    floor = max(noise_floor(frequency, density), find_resolution(values) ** 2 / 6.0 * period)
+    noise_density = max(noise_floor(frequency, density), find_resolution(values) ** 2 / 6.0 * period)
     # differences of noise leak into the first two frequencies
-    clear = np.where(np.arange(len(density)) < 2, 24.0, 6.0) * floor
-    power = np.where(density > clear, density - floor, 0.0) * (frequency**2 if differentiate else 1.0)
+    threshold = np.where(np.arange(len(density)) < 2, 24.0, 6.0) * noise_density
+    power = np.where(density > threshold, density - noise_density, 0.0) * (frequency**2 if differentiate else 1.0)
     if not power.any():
         return 0.0
-    total = np.cumsum(power)
-    return float(frequency[np.searchsorted(total, 0.95 * total[-1])])
+    cumulative = np.cumsum(power)
+    return float(frequency[np.searchsorted(cumulative, 0.95 * cumulative[-1])])
 
 
 def saturated_share(values: np.ndarray, step: float) -> float:
-    """Share of samples in stays of five or more at the least or the largest value (within half a `step`)."""
+    """Return the share of samples in runs of five or more at the least or largest value (within half a `step`)."""
     if np.ptp(values) == 0.0:
         return 0.0
-    share = 0
+    saturated = 0
     for extreme in (values.min(), values.max()):
-        at = np.concatenate([[False], np.abs(values - extreme) <= 0.5 * step, [False]])
-        lengths = np.diff(np.flatnonzero(np.diff(at)))[::2]
-        # one stay may be a rest; a signal that is cut off comes back to the same value
+        is_extreme = np.concatenate([[False], np.abs(values - extreme) <= 0.5 * step, [False]])
+        lengths = np.diff(np.flatnonzero(np.diff(is_extreme)))[::2]
+        # a single run may be a rest; a clipped signal comes back to the same value
         if np.count_nonzero(lengths >= 5) >= 2:
-            share += int(lengths[lengths >= 5].sum())
-    return share / len(values)
+            saturated += int(lengths[lengths >= 5].sum())
+    return saturated / len(values)
 
 
 def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) -> int:
-    """Isolated outliers and steps of a position: differences far off those around them, and more than a few steps.
+    """Count isolated outliers and steps of a position: differences far off their neighbours, and more than 4.5 `step`.
 
-    Positions without time stamps (s) are evenly spaced.
+    Positions without `stamps` (s) are evenly spaced.
     """
     from scipy.ndimage import median_filter, percentile_filter
 
@@ -161,19 +178,23 @@ def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = 
     if stamps is not None:
         intervals = np.diff(stamps)
         differences = differences * (np.median(intervals) / intervals)
-    odd = np.abs(differences - median_filter(differences, 7, mode="nearest"))
-    # what the motion itself does nearby, an outlier or two left out
-    nearby = percentile_filter(differences, 90, 31, mode="nearest") - percentile_filter(differences, 10, 31, mode="nearest")
-    usual = 1.4826 * float(np.median(odd))
-    at = np.flatnonzero(odd > np.maximum(2.0 * nearby, max(12.0 * usual, 4.5 * step, 1e-9 * float(np.ptp(positions)))))
-    # an outlier makes two differences odd
-    return int(np.count_nonzero(np.diff(at, prepend=-10) > 2))
+    deviation = np.abs(differences - median_filter(differences, 7, mode="nearest"))
+    # spread of the motion nearby; the quantiles leave out an outlier or two
+    local_spread = percentile_filter(differences, 90, 31, mode="nearest") - percentile_filter(
+        differences, 10, 31, mode="nearest"
+    )
+    typical = 1.4826 * float(np.median(deviation))
+    outliers = np.flatnonzero(
+        deviation > np.maximum(2.0 * local_spread, max(12.0 * typical, 4.5 * step, 1e-9 * float(np.ptp(positions))))
+    )
+    # an outlier spoils two differences
+    return int(np.count_nonzero(np.diff(outliers, prepend=-10) > 2))
 
 
 def low_pass(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
-    """Values without what is above a frequency (Hz), without delay: 2nd-order Butterworth forwards and backwards.
+    """Low-pass values without delay: a second-order Butterworth filter forwards and backwards, `cutoff` in Hz.
 
-    Samples run along the first axis. Where the cutoff is near the end of the band, values stay as they are.
+    Samples run along the first axis. With a cutoff near the end of the band the values are returned unchanged.
     """
     if 2.0 * cutoff * period > 0.8:
         return values
@@ -183,18 +204,18 @@ def low_pass(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
 
 
 def trim_filter_ends(samples: int, cutoff: float, period: float) -> slice:
-    """The samples of a segment without its ends, where :func:`low_pass` and differences have not settled."""
-    edge = min(round(1.0 / (cutoff * period)), samples // 8) + 2
-    return slice(edge, samples - edge)
+    """Return the samples of a segment without its ends, at which :func:`low_pass` and differences have not settled."""
+    margin = min(round(1.0 / (cutoff * period)), samples // 8) + 2
+    return slice(margin, samples - margin)
 
 
-def interpolate_spline(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values at other times by a cubic spline; beyond the ends the value at the end."""
+def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndarray) -> np.ndarray:
+    """Interpolate values to new times by a cubic spline; beyond an end the end's value is returned."""
     from scipy.interpolate import CubicSpline
 
-    return CubicSpline(times, values)(np.clip(at, times[0], times[-1]))
+    return CubicSpline(times, values)(np.clip(new_times, times[0], times[-1]))
 
 
 def longest_segment(segments: Sequence[slice]) -> slice:
-    """The longest segment."""
-    return max(segments, key=lambda s: s.stop - s.start)
+    """Return the longest segment."""
+    return max(segments, key=lambda segment: segment.stop - segment.start)

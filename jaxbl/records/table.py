@@ -40,7 +40,7 @@ _SECONDS: Any = {"unit": "s"}
 
 
 class _ColumnTable(StrictTable):
-    """What time and channels have in common; a column's name or number alone stands for a table with nothing else in it."""
+    """Keys common to time and channels; a column's name or number alone stands for a table with only that key."""
 
     column: _Column | None = Field(
         default=None, description="name of the column, or its number counted from 0; left out: the channel's own name"
@@ -58,7 +58,7 @@ class _ColumnTable(StrictTable):
         return {"anyOf": [{"type": ["string", "integer"]}, handler(schema)], "description": (cls.__doc__ or "").strip()}
 
     def column_or(self, name: str) -> str | int:
-        """The column that is given, else the one with a channel's own name."""
+        """Return the `column` key, or `name` if it is left out."""
         return name if self.column is None else self.column
 
 
@@ -78,7 +78,7 @@ class TimeTable(_ColumnTable):
 
 
 class _ChannelTable(_ColumnTable):
-    """What measured channels have in common."""
+    """Keys common to measured channels."""
 
     sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
     signed_bits: int | None = Field(
@@ -144,7 +144,7 @@ class SpeedTable(_ChannelTable):
 
     @property
     def si_unit(self) -> str:
-        """Of its integral: m on a linear axis, else rad."""
+        """Unit of the integral: m on a linear axis, else rad."""
         return "m" if self.unit in ("m/s", "mm/s") else "rad"
 
 
@@ -182,13 +182,13 @@ SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
 """Channel of a position -> that of the speed which may stand in its place."""
 
 ELEMENT_NEEDS = "an element is found from its displacement theta_e and the torque u; both are needed"
-"""Why a log of a transmission on a test rig is refused."""
+"""Message that refuses a log of a transmission on a test rig."""
 
 _Scalar = Annotated[bool | int | float | str, BeforeValidator(_check_scalar)]
 
 
 class LogTable(StrictTable):
-    """How a measured log is to be read; `theta_e = "x"` is short for `theta_e = { column = "x" }`.
+    """Table that says how a measured log is read; `theta_e = "x"` is short for `theta_e = { column = "x" }`.
 
     Accepted in every study; simulate and sweep do not use it.
     """
@@ -260,17 +260,17 @@ class LogTable(StrictTable):
         return self
 
     def list_columns(self) -> set[str | int]:
-        """Names and numbers of all columns that may be read."""
-        found: set[str | int] = {*(self.where or {})}
+        """Return names and numbers of all columns that may be read."""
+        columns: set[str | int] = {*(self.where or {})}
         for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
             channel = getattr(self, name)
-            found.add(name if channel is None else channel.column_or(name))
+            columns.add(name if channel is None else channel.column_or(name))
             if isinstance(channel, PositionTable) and channel.minus is not None:
-                found.add(channel.minus)
-        return found
+                columns.add(channel.minus)
+        return columns
 
     def position_source(self, name: str) -> tuple[str, PositionTable | SpeedTable]:
-        """What the position theta_e or theta_s is read from, itself or the speed in its place: channel and table."""
+        """Return channel and table that theta_e or theta_s is read from: itself, or the speed in its place."""
         omega = SPEED_CHANNELS[name]
         speed = getattr(self, omega)
         return (omega, speed) if speed is not None else (name, getattr(self, name) or PositionTable())

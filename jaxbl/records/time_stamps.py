@@ -1,4 +1,4 @@
-"""Time stamps of a log: the rows that are read, gaps between them, and whether they lie on an even grid."""
+"""Time stamps of a log: the selected rows, gaps between them, and whether the stamps are even."""
 
 import itertools
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
 from .table import LogTable, TimeTable
 
 GAP_PERIODS = 3.5
-"""Intervals longer than this many periods are gaps: up to two lost samples in a row are interpolated."""
+"""Periods beyond which an interval is a gap: up to two lost samples in a row are interpolated."""
 SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
-_SLOW = 0.5
-"""Period in s from which a remark asks for the unit of the stamps: drives are sampled much faster."""
+_DOUBTFUL_PERIOD = 0.5
+"""Period, s, from which the unit of the stamps is doubtful: drives are sampled much faster."""
 _SHORTEST_PERIOD, _LONGEST_PERIOD = 1e-9, 1e10
-"""Periods in s that are possible at all; the longest are seconds in stamps of nanoseconds that pass for seconds."""
+"""Possible periods, s; the longest are seconds in nanoseconds that were read as seconds."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Figures on the time stamps of a log.
+    """Statistics of the time stamps of a log.
 
     Attributes:
         samples: rows that were read.
@@ -30,7 +30,7 @@ class Sampling:
         jitter: rms deviation of the intervals from their mean, without gaps, s.
         longest_interval: s; gaps included.
         gaps: intervals longer than three and a half periods.
-        repeated: rows whose stamp is that of the row before.
+        repeated: rows with the stamp of the row before.
         even: whether the stamps lie on an even grid, apart from their rounding.
     """
 
@@ -44,15 +44,15 @@ class Sampling:
 
 
 class TimeStamps(NamedTuple):
-    """The rows that are read, and their times.
+    """The selected rows and their times.
 
     Attributes:
         times: s from the first stamp of the file, shape (rows,).
         start: first stamp of the file, s.
-        rows: their numbers in the file, counted from 0, shape (rows,).
+        rows: row numbers in the file, counted from 0, shape (rows,).
         file_rows: rows of the file.
         median_interval: median interval of the file, s.
-        max_interval: longest interval that is no gap, s.
+        max_interval: longest interval without a gap, s.
     """
 
     times: np.ndarray
@@ -64,14 +64,14 @@ class TimeStamps(NamedTuple):
 
 
 class SegmentedStamps(NamedTuple):
-    """Parts of a log between its gaps.
+    """Segments of a log: the rows between its gaps.
 
     Attributes:
-        times: s, shape (rows,); where the stamps are even, those of their grid.
-        distinct: False for rows left out as their stamp is that of the row before, shape (rows of the time stamps,).
-        segments: rows of each.
-        period: of the grid where the stamps are even, else their median interval, s.
-        sampling: figures on the stamps.
+        times: s, shape (rows,); the times of the even grid if the stamps lie on one.
+        distinct: False for rows that repeat the stamp of the row before, shape (rows of the time stamps,).
+        segments: rows of each segment.
+        period: of the even grid, or the median interval of uneven stamps, s.
+        sampling: statistics of the stamps.
     """
 
     times: np.ndarray
@@ -82,7 +82,11 @@ class SegmentedStamps(NamedTuple):
 
 
 def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
-    """The rows that `[log]` selects, and their times; InputError where time does not increase, or too few are left."""
+    """Read the times of the rows that `[log]` selects.
+
+    Raises:
+        InputError: time does not increase, or too few rows remain.
+    """
     stamps = _read_stamps(file, table)
     start = float(stamps[0])
     stamps = stamps - start
@@ -90,51 +94,53 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     intervals = np.diff(stamps)
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups
-    group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
+    group_interval = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
     if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
         raise file.error(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
-    if median >= _SLOW:
+    if median >= _DOUBTFUL_PERIOD:
         file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
-    return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group))
+    return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group_interval))
 
 
 def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
-    """Of all rows, s, shape (rows of the file,)."""
-    time = table.t or TimeTable()
-    if time.period is not None:
+    """Read the time stamps of all rows of the file, s, shape (rows of the file,)."""
+    time_table = table.t or TimeTable()
+    if time_table.period is not None:
         # other vectors of the file may be longer
-        read = (table.list_columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
-        length = max(file.count_values(file.find_column(one)) for one in read or file.columns)
-        stamps = np.arange(length, dtype=float) * time.period
+        channel_columns = (table.list_columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
+        length = max(file.count_values(file.find_column(column)) for column in channel_columns or file.columns)
+        stamps = np.arange(length, dtype=float) * time_table.period
     else:
-        stamps = file.load_seconds(time.column_or("t"), SECONDS_PER_UNIT[time.unit], "t.column")
+        stamps = file.load_seconds(time_table.column_or("t"), SECONDS_PER_UNIT[time_table.unit], "t.column")
     if len(stamps) < MIN_SAMPLES:
         raise file.error(f"has {len(stamps)} rows; a log needs at least {MIN_SAMPLES}")
-    back = np.diff(stamps) < 0.0
-    if back.any() or stamps[0] == stamps[-1]:
-        wrong = f" is {stamps[0]:g} s in all rows"
-        if back.any():
-            row = int(np.argmax(back)) + 1
-            wrong = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
-        raise file.error(f"column {file.find_column(time.column_or('t'))!r}{wrong}; stamps should increase")
+    goes_back = np.diff(stamps) < 0.0
+    if goes_back.any() or stamps[0] == stamps[-1]:
+        fault = f" is {stamps[0]:g} s in all rows"
+        if goes_back.any():
+            row = int(np.argmax(goes_back)) + 1
+            fault = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
+        raise file.error(f"column {file.find_column(time_table.column_or('t'))!r}{fault}; stamps should increase")
     return stamps
 
 
 def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarray:
-    """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
-    keep = np.ones(len(stamps), dtype=bool)
-    for column, value in (table.where or {}).items():
+    """Return the numbers of the rows that `where`, `start` and `stop` select; `stamps` are s from the first one."""
+    is_selected = np.ones(len(stamps), dtype=bool)
+    for column, required in (table.where or {}).items():
         file.check_length(file.find_column(column), len(stamps))
-        given = file.load_values(file.find_column(column))
-        keep &= given == value
-        if not keep.any():
-            found = ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in np.unique(given.astype(object))[:6])
-            raise file.error(f"[log] where leaves no row: '{column}' is never {value!r}; values: {found}")
-    for limit, outside in ((table.start, np.less), (table.stop, np.greater)):
+        column_values = file.load_values(file.find_column(column))
+        is_selected &= column_values == required
+        if not is_selected.any():
+            examples = ", ".join(
+                repr(v.item() if hasattr(v, "item") else v) for v in np.unique(column_values.astype(object))[:6]
+            )
+            raise file.error(f"[log] where leaves no row: '{column}' is never {required!r}; values: {examples}")
+    for limit, is_outside in ((table.start, np.less), (table.stop, np.greater)):
         if limit is not None:
-            keep &= ~outside(stamps, limit)
-    rows = np.flatnonzero(keep)
+            is_selected &= ~is_outside(stamps, limit)
+    rows = np.flatnonzero(is_selected)
     if len(rows) < MIN_SAMPLES:
         raise file.error(
             f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
@@ -145,68 +151,75 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarr
 
 
 def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
-    """Parts between gaps, without those that are too short and without repeated stamps; InputError where few are left."""
+    """Split a log at its gaps; segments that are too short and repeated stamps are left out.
+
+    Raises:
+        InputError: too few samples remain.
+    """
     times, rows = stamps.times, stamps.rows
-    parts = _split_at_intervals(times, stamps.max_interval)
-    grids = [fit_even_stamps(times[p]) for p in parts if _is_long_enough(p)]
-    even = bool(grids) and all(grid.is_even for grid in grids)
+    pieces = _split_at_intervals(times, stamps.max_interval)
+    fits = [fit_even_stamps(times[piece]) for piece in pieces if _is_long_enough(piece)]
+    is_even = bool(fits) and all(fit.is_even for fit in fits)
     distinct = np.ones(len(times), dtype=bool)
-    if not even:
-        # no spline takes a stamp twice
+    if not is_even:
+        # a spline needs increasing stamps
         distinct = np.diff(times, prepend=-1.0) != 0.0
     repeated = len(times) - int(distinct.sum())
     if repeated:
         row = rows[int(np.argmin(distinct))] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
         times, rows = times[distinct], rows[distinct]
-        parts = _split_at_intervals(times, stamps.max_interval)
-    kept = [p for p in parts if _is_long_enough(p)]
-    samples = sum(map(_count_samples, kept))
+        pieces = _split_at_intervals(times, stamps.max_interval)
+    segments = [piece for piece in pieces if _is_long_enough(piece)]
+    samples = sum(map(_count_samples, segments))
     if samples < MIN_SAMPLES:
-        most = max(map(_count_samples, parts))
-        raise file.error(f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {most}); a log needs them")
+        longest_piece = max(map(_count_samples, pieces))
+        raise file.error(
+            f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {longest_piece}); a log needs them"
+        )
     intervals = np.diff(times)
-    if len(parts) > 1:
-        widest = int(np.argmax(intervals))
+    if len(pieces) > 1:
+        longest_gap = int(np.argmax(intervals))
         left_out = len(times) - samples
         file.notes.append(
-            f"Gaps: {len(parts) - 1}; segments: {len(kept)}; the longest gap is {intervals[widest]:.4g} s, "
-            f"after data row {rows[widest] + 1}" + (f"; {left_out} samples between gaps were left out." if left_out else ".")
+            f"Gaps: {len(pieces) - 1}; segments: {len(segments)}; the longest gap is {intervals[longest_gap]:.4g} s, "
+            f"after data row {rows[longest_gap] + 1}"
+            + (f"; {left_out} samples between gaps were left out." if left_out else ".")
         )
-    inside = intervals[intervals <= stamps.max_interval]
+    intervals_within = intervals[intervals <= stamps.max_interval]
     period = stamps.median_interval
-    if even:
+    if is_even:
         times = times.copy()
-        for p, grid in zip(kept, grids, strict=True):
-            times[p] = grid.first + grid.period * np.arange(_count_samples(p))
-        period = grids[kept.index(longest_segment(kept))].period
+        for piece, fit in zip(segments, fits, strict=True):
+            times[piece] = fit.first + fit.period * np.arange(_count_samples(piece))
+        period = fits[segments.index(longest_segment(segments))].period
     sampling = Sampling(
         samples=len(stamps.times),
         median_period=stamps.median_interval,
-        jitter=float(np.std(inside)) if len(inside) else 0.0,
+        jitter=float(np.std(intervals_within)) if len(intervals_within) else 0.0,
         longest_interval=float(intervals.max()),
-        gaps=len(parts) - 1,
+        gaps=len(pieces) - 1,
         repeated=repeated,
-        even=even,
+        even=is_even,
     )
-    return SegmentedStamps(times, distinct, kept, period, sampling)
+    return SegmentedStamps(times, distinct, segments, period, sampling)
 
 
-def _count_samples(part: slice) -> int:
-    return part.stop - part.start
+def _count_samples(segment: slice) -> int:
+    return segment.stop - segment.start
 
 
-def _is_long_enough(part: slice) -> bool:
-    return _count_samples(part) >= MIN_SAMPLES // 2
+def _is_long_enough(segment: slice) -> bool:
+    return _count_samples(segment) >= MIN_SAMPLES // 2
 
 
-def _split_at_intervals(stamps: np.ndarray, gap: float) -> list[slice]:
-    ends = np.flatnonzero(np.diff(stamps) > gap) + 1
-    return [slice(a, b) for a, b in itertools.pairwise([0, *ends.tolist(), len(stamps)])]
+def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> list[slice]:
+    starts = np.flatnonzero(np.diff(stamps) > max_interval) + 1
+    return [slice(start, stop) for start, stop in itertools.pairwise([0, *starts.tolist(), len(stamps)])]
 
 
 class StampFit(NamedTuple):
-    """The even grid that fits stamps best: whether they lie on it, its period and its first time, s."""
+    """Even grid that fits stamps best: whether they lie on it, its period and its first time, s."""
 
     is_even: bool
     period: float
@@ -214,12 +227,12 @@ class StampFit(NamedTuple):
 
 
 def fit_even_stamps(stamps: np.ndarray) -> StampFit:
-    """The even grid that fits increasing stamps best, in s, shape (samples,), by least squares."""
+    """Fit an even grid to increasing stamps, s, shape (samples,), by least squares."""
     index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     middle = stamps.mean()
     period = float(index @ (stamps - middle) / (index @ index))
-    largest = float(np.abs(stamps - middle - period * index).max())
+    deviation = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
     rounding = find_resolution(np.diff(stamps))
-    even = period > 0.0 and (largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period))
-    return StampFit(even, period, float(middle + period * index[0]))
+    is_even = period > 0.0 and (deviation <= 0.02 * period or deviation <= 0.55 * min(rounding, 20.0 * period))
+    return StampFit(is_even, period, float(middle + period * index[0]))
