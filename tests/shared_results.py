@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid
 
-SHARED = "verified", "tuned"
+SHARED = ("verified",)
 """Names of the fixtures; a file of tests reads one of them at most."""
 
 

@@ -185,7 +185,7 @@ def test_any_start_leads_into_the_sliding_set(order):
         # the error is observed: true states zero, but for what the highest derivative does over the period
         new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
         position, velocity, *further = (
-            x - p * top for x, p in zip([new.position, new.velocity, *new.extra_states], push, strict=True)
+            x - p * top for x, p in zip([new.position, new.velocity, *new.further], push, strict=True)
         )
         return ObserverState(position, velocity, tuple(further)), estimate.position
 
