@@ -112,11 +112,11 @@ def harmonic(
     doc: str,
     trials: Callable[[Scales], Sequence[float]],
     *,
-    sought: Callable[[Scales], int] | None = None,
+    trial_count: Callable[[Scales], int] | None = None,
     **limits: Any,
 ) -> Any:
     """Declare a number of periods a turn, which is chosen among the values of `trials`."""
-    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=sought), **limits)
+    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=trial_count), **limits)
 
 
 def frequency(doc: str) -> Any:

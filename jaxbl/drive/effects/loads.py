@@ -1,6 +1,7 @@
-"""Torques on a side that are no friction: constant, of position, of time, of the input; and the error of the inertia."""
+"""Torques on a side other than friction: constant, over position, over time, over the input; and errors of the inertia."""
 
 import math
+from collections.abc import Iterable
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -9,35 +10,39 @@ import numpy as np
 from ..parameters import Scalar
 from .base import EFFECTS, Numbers, Scales, SideEffect, angle, frequency, harmonic, shape, size
 
-_MOST_COGGING = 40
-"""Periods a turn up to which cogging is tried: of slots and magnets, the common ones have at most 36 or so."""
-_ARC = 0.5 * np.pi
-"""Of a wave of cogging, rad, that the motion must cover for it to be tried."""
-
-
-_POLE_PAIRS = 1, 2, 3, 4, 5, 7
-"""Of common servo motors. A current sensor's offset makes one period of ripple a pole pair, unequal gains of two make two,
-and commutation or windings that are not sinusoidal make six."""
-
-
+_COGGING_HARMONICS = range(1, 41)
+"""Trial values of cogging, periods a turn: common numbers of slots and magnets are at most about 36."""
+_POLE_PAIRS, _RIPPLE_HARMONICS = (1, 2, 3, 4, 5, 7), (1, 2, 6)
+"""Pole pairs of common servo motors, and periods of ripple a pole pair: 1 from the offset of a current sensor, 2 from
+unequal gains of two sensors, 6 from commutation or windings that are not sinusoidal."""
+_TRIAL_ARC = 0.5 * np.pi
+"""Part of a wave that the motion must cover for its harmonic to be tried, rad."""
 MAX_DAMPING_RATIO = 0.95
-"""Damping ratio from which on an inertia behind a spring hardly swings, and its frequency says nothing."""
+"""Damping ratio above which an inertia behind a spring hardly swings, so that its frequency has no meaning."""
 
 
-def _ripple(log: Scales) -> list[float]:
-    if log.torque == 0.0:
-        return []
-    waves = sorted({float(n * pairs) for n in (1, 2, 6) for pairs in _POLE_PAIRS})
-    return [n for n in waves if n * log.travel > _ARC]
+def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
+    """The harmonics of which the motion covers enough, in increasing order."""
+    return [float(n) for n in sorted(harmonics) if n * log.travel > _TRIAL_ARC]
 
 
-def _cogging(log: Scales) -> list[float]:
-    return [float(n) for n in range(1, _MOST_COGGING + 1) if n * log.travel > _ARC]
+def _cogging_harmonics(log: Scales) -> list[float]:
+    return _select_covered(_COGGING_HARMONICS, log)
+
+
+def _ripple_harmonics(log: Scales) -> list[float]:
+    return _select_covered({n * pairs for n in _RIPPLE_HARMONICS for pairs in _POLE_PAIRS}, log) if log.torque else []
+
+
+def _base_harmonics(log: Scales) -> list[float]:
+    """Whole harmonics of which a wave in the model may be the first, second or third multiple."""
+    bases = {n / k for n in log.harmonics for k in (1, 2, 3)}
+    return _select_covered((n for n in bases if n == round(n)), log)
 
 
 @EFFECTS.add
 class ConstantTorque(SideEffect):
-    """A constant resisting torque (an offset of the amplifier, a weight on a drum)."""
+    """Constant resisting torque, e.g. an offset of the amplifier or a weight on a drum."""
 
     kind: ClassVar[str] = "constant_torque"
     torque: Scalar = size("N m", "resisting torque; may be negative")
@@ -48,7 +53,7 @@ class ConstantTorque(SideEffect):
 
 @EFFECTS.add
 class Inertia(SideEffect):
-    """Error of the nominal inertia."""
+    """Error of the nominal inertia, which is added to it."""
 
     kind: ClassVar[str] = "inertia"
     corrects: ClassVar[str | None] = "inertia"
@@ -60,12 +65,14 @@ class Inertia(SideEffect):
 
 @EFFECTS.add
 class Gravity(SideEffect):
-    """An eccentric mass: m g l sin(theta - phase)."""
+    """Eccentric mass: torque m g l sin(theta - phase)."""
 
     kind: ClassVar[str] = "gravity"
     places: ClassVar[tuple[str, ...]] = ("load",)
-    # over a small angle: the torque at position 0
-    special_cases: ClassVar = {"constant_torque": lambda one: {"torque": -one["torque"] * np.sin(one["phase"])}}
+    # over a small angle it is the torque at position 0
+    special_cases: ClassVar = {
+        "constant_torque": lambda numbers: {"torque": -numbers["torque"] * np.sin(numbers["phase"])}
+    }
     torque: Scalar = size("N m", "largest gravity torque m g l")
     phase: Scalar = angle("position at which the mass hangs down")
 
@@ -75,13 +82,15 @@ class Gravity(SideEffect):
 
 @EFFECTS.add
 class PeriodicDisturbance(SideEffect):
-    """A torque periodic in time: A sin(2 pi f t + phase)."""
+    """Torque that is periodic in time: A sin(2 pi f t + phase)."""
 
     kind: ClassVar[str] = "periodic_disturbance"
     in_time: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("load",)
-    # of vanishing frequency
-    special_cases: ClassVar = {"constant_torque": lambda one: {"torque": one["amplitude"] * np.sin(one["phase"])}}
+    # at frequency 0
+    special_cases: ClassVar = {
+        "constant_torque": lambda numbers: {"torque": numbers["amplitude"] * np.sin(numbers["phase"])}
+    }
     amplitude: Scalar = size("N m", "amplitude A")
     frequency: Scalar = frequency("frequency f")
     phase: Scalar = angle("phase at t = 0")
@@ -92,26 +101,20 @@ class PeriodicDisturbance(SideEffect):
 
 @EFFECTS.add
 class Cogging(SideEffect):
-    """Cogging of the motor: A sin(n theta + phase)."""
+    """Cogging of the motor: torque A sin(n theta + phase)."""
 
     kind: ClassVar[str] = "cogging"
     places: ClassVar[tuple[str, ...]] = ("motor",)
     amplitude: Scalar = size("N m", "amplitude A")
-    harmonic: Scalar = harmonic("periods n a turn", _cogging)
+    harmonic: Scalar = harmonic("periods n a turn", _cogging_harmonics)
     phase: Scalar = angle("phase at theta = 0")
 
     def resist(self, state, motion):
         return self.amplitude * jnp.sin(self.harmonic * motion.position + self.phase)
 
 
-def _multiples(log: Scales) -> list[float]:
-    """Bases of the waves that are known: each may be the first, second or third multiple."""
-    bases = {n / k for n in log.harmonics for k in (1, 2, 3)}
-    return sorted(n for n in bases if n == round(n) and n * log.travel > _ARC)
-
-
-def _largest(numbers: Numbers) -> Numbers:
-    """The largest of three waves on its own."""
+def _largest_wave(numbers: Numbers) -> Numbers:
+    """Numbers of the largest of the three waves, as cogging."""
     waves = [(numbers[f"sine{k}"], numbers[f"cosine{k}"]) for k in ("", "_2", "_3")]
     k, (sine, cosine) = max(enumerate(waves, 1), key=lambda wave: math.hypot(*wave[1]))
     return {"amplitude": math.hypot(sine, cosine), "harmonic": k * numbers["harmonic"], "phase": math.atan2(cosine, sine)}
@@ -119,13 +122,15 @@ def _largest(numbers: Numbers) -> Numbers:
 
 @EFFECTS.add
 class CoggingHarmonics(SideEffect):
-    """Cogging that is no pure wave, with its multiples: the sum of s_k sin(k n theta) + c_k cos(k n theta), k = 1, 2, 3."""
+    """Cogging with multiples: torque sum_k s_k sin(k n theta) + c_k cos(k n theta), k = 1, 2, 3."""
 
     kind: ClassVar[str] = "cogging_harmonics"
     places: ClassVar[tuple[str, ...]] = ("motor",)
-    special_cases: ClassVar = {"cogging": _largest}
-    # a diagnosis comes from one wave that it has found
-    harmonic: Scalar = harmonic("periods n a turn", _multiples, sought=lambda log: len(_cogging(log)))
+    special_cases: ClassVar = {"cogging": _largest_wave}
+    # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
+    harmonic: Scalar = harmonic(
+        "periods n a turn", _base_harmonics, trial_count=lambda log: len(_cogging_harmonics(log))
+    )
     sine: Scalar = size("N m", "s_1", default=0.0)
     cosine: Scalar = size("N m", "c_1", default=0.0)
     sine_2: Scalar = size("N m", "s_2", default=0.0)
@@ -134,25 +139,25 @@ class CoggingHarmonics(SideEffect):
     cosine_3: Scalar = size("N m", "c_3", default=0.0)
 
     def resist(self, state, motion):
-        turn = self.harmonic * motion.position
+        angle = self.harmonic * motion.position
         return (
-            self.sine * jnp.sin(turn)
-            + self.cosine * jnp.cos(turn)
-            + self.sine_2 * jnp.sin(2.0 * turn)
-            + self.cosine_2 * jnp.cos(2.0 * turn)
-            + self.sine_3 * jnp.sin(3.0 * turn)
-            + self.cosine_3 * jnp.cos(3.0 * turn)
+            self.sine * jnp.sin(angle)
+            + self.cosine * jnp.cos(angle)
+            + self.sine_2 * jnp.sin(2.0 * angle)
+            + self.cosine_2 * jnp.cos(2.0 * angle)
+            + self.sine_3 * jnp.sin(3.0 * angle)
+            + self.cosine_3 * jnp.cos(3.0 * angle)
         )
 
 
 @EFFECTS.add
 class TorqueRipple(SideEffect):
-    """Ripple of the motor's torque, in proportion to it: u (1 + a sin(n theta + phase))."""
+    """Ripple in proportion to the motor's torque: u (1 + a sin(n theta + phase))."""
 
     kind: ClassVar[str] = "torque_ripple"
     places: ClassVar[tuple[str, ...]] = ("motor",)
     amplitude: Scalar = size("", "relative amplitude a")
-    harmonic: Scalar = harmonic("periods n a turn", _ripple)
+    harmonic: Scalar = harmonic("periods n a turn", _ripple_harmonics)
     phase: Scalar = angle("phase at theta = 0")
 
     def resist(self, state, motion):
@@ -161,15 +166,15 @@ class TorqueRipple(SideEffect):
 
 @EFFECTS.add
 class Flexibility(SideEffect):
-    """A further inertia J behind a spring and a damper, J d²phi/dt² = -J (w² q + 2 D w dq/dt) with q = phi - theta and
-    w = 2 pi f, which acts back on its side; at t = 0 it stands still, the spring relaxed."""
+    """Further inertia J behind a spring and a damper: J d²phi/dt² = -J (w² q + 2 D w dq/dt) with q = phi - theta and
+    w = 2 pi f. The opposite torque acts on its side. At t = 0 it stands still, and the spring is relaxed."""
 
     kind: ClassVar[str] = "flexibility"
     places: ClassVar[tuple[str, ...]] = ("load",)
     velocity_dependent: ClassVar[bool] = True
     state_from_measurement: ClassVar[bool] = True
     # behind a stiff spring
-    special_cases: ClassVar = {"inertia": lambda one: {"inertia": one["inertia"]}}
+    special_cases: ClassVar = {"inertia": lambda numbers: {"inertia": numbers["inertia"]}}
     inertia: Scalar = size("kg m²", "inertia J behind the spring", minimum=0.0)
     frequency: Scalar = frequency("frequency f at which it swings while the side stands still")
     # from a welded frame to a belt
@@ -179,12 +184,12 @@ class Flexibility(SideEffect):
 
     @property
     def _rates(self):
-        """w, and D w."""
+        """Undamped rate w and decay rate D w, rad/s."""
         rate = 2.0 * jnp.pi * self.frequency
         return rate, jnp.minimum(self.damping_ratio, MAX_DAMPING_RATIO) * rate
 
     def init(self):
-        # twist of the spring, rad, and velocity of the inertia, rad/s
+        # twist q of the spring, rad, and velocity of the inertia, rad/s
         return (jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency))
 
     def set_in_motion(self, state, velocity):
@@ -195,16 +200,16 @@ class Flexibility(SideEffect):
         twist, velocity = state
         rate, decay = self._rates
         swing = jnp.sqrt(rate**2 - decay**2)
-        # sin(swing * step) / swing, and its limit; not by `jnp.sinc`, whose primitives not every loop knows
-        turns = jnp.where(swing == 0.0, 1.0, swing)
-        cosine, sine = jnp.cos(swing * step), jnp.where(swing == 0.0, step, jnp.sin(turns * step) / turns)
-        slip = velocity - motion.velocity
-        left = jnp.exp(-decay * step)
-        twist, slip = (
-            left * (cosine * twist + sine * (slip + decay * twist)),
-            left * (cosine * slip - sine * (rate**2 * twist + decay * slip)),
+        # sin(swing * step) / swing and its limit; not every compiled loop has the primitives of `jnp.sinc`
+        safe_swing = jnp.where(swing == 0.0, 1.0, swing)
+        cosine, sine = jnp.cos(swing * step), jnp.where(swing == 0.0, step, jnp.sin(safe_swing * step) / safe_swing)
+        twist_rate = velocity - motion.velocity
+        damping = jnp.exp(-decay * step)
+        twist, twist_rate = (
+            damping * (cosine * twist + sine * (twist_rate + decay * twist)),
+            damping * (cosine * twist_rate - sine * (rate**2 * twist + decay * twist_rate)),
         )
-        return twist, slip + motion.velocity
+        return twist, twist_rate + motion.velocity
 
     def resist(self, state, motion):
         twist, velocity = state
