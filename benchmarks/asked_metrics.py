@@ -54,23 +54,25 @@ def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> 
             ", ".join(names): asked,
             f"{', '.join(names)}, none may leave": asked._replace(done=None),
         }
-        passages = {
+        simulators = {
             name: HostSimulator(experiment, (one,), tuple(columns), len(chosen), threads) for name, one in reducers.items()
         }
-        found = {name: passage(columns, 0) for name, passage in passages.items()}
+        found = {name: simulator(columns, 0) for name, simulator in simulators.items()}
         whole = found["all metrics"]
         for figures in found.values():
             assert all(np.array_equal(whole[name], figures[name], equal_nan=True) for name in figures if name != "finite")
-        best = dict.fromkeys(passages, np.inf)
+        best = dict.fromkeys(simulators, np.inf)
         for _ in range(rounds):
-            for name, passage in passages.items():
+            for name, simulator in simulators.items():
                 begun = time.perf_counter()
-                passage(columns, 0)
+                simulator(columns, 0)
                 best[name] = min(best[name], time.perf_counter() - begun)
     shares = ", ".join(f"{side} {whole[f'{side}.converged'].mean():.2f}" for side in experiment.sides)
     print(f"{len(chosen)} lanes of {config.run.steps} samples, {threads} threads; converged: {shares}")
     for name, took in best.items():
-        print(f"{name:36s} {took:8.3f} s   {took / best['all metrics']:.2f}   carried a lane: {passages[name].carried}")
+        print(
+            f"{name:36s} {took:8.3f} s   {took / best['all metrics']:.2f}   carried a lane: {simulators[name].carry_count}"
+        )
 
 
 def size(config: Config, names: list[str] | None) -> float:

@@ -63,10 +63,10 @@ LASTED = Reducer(
 
 def limit(whole: Experiment, steps: int) -> float:
     """The least stiffness at which a lane is done before so many samples."""
-    passage, low, high = HostSimulator(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
+    simulator, low, high = HostSimulator(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
     for _ in range(4):
         tried = np.linspace(low, high, 256)
-        last = int(np.flatnonzero(passage({PATH: tried}, 0)["samples"] >= steps)[-1])
+        last = int(np.flatnonzero(simulator({PATH: tried}, 0)["samples"] >= steps)[-1])
         low, high = tried[last], tried[last + 1]
     return float(high)
 
@@ -98,13 +98,13 @@ def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
         "nine of ten, mixed, none may leave": (staying, np.where(mixed, least, sane)),
     }
     best = dict.fromkeys(cases, np.inf)
-    for passage, values in cases.values():
-        found, expected = passage({PATH: values}, 0), staying({PATH: values}, 0)
+    for simulator, values in cases.values():
+        found, expected = simulator({PATH: values}, 0), staying({PATH: values}, 0)
         assert all(np.array_equal(found[name], expected[name], equal_nan=True) for name in expected)
     for _ in range(rounds):
-        for name, (passage, values) in cases.items():
+        for name, (simulator, values) in cases.items():
             start = time.perf_counter()
-            passage({PATH: values}, 0)
+            simulator({PATH: values}, 0)
             best[name] = min(best[name], time.perf_counter() - start)
     print(f"{lanes} lanes of {steps} samples, {dtype}, {threads} threads; stiffness {least:.4g} and more diverge")
     for name, seconds in best.items():

@@ -30,7 +30,7 @@ class Kept(FusedChain):
     """The same lanes of one seed again."""
 
     def __call__(self):
-        return self._passage(self._values, SEED)
+        return self._simulator(self._values, SEED)
 
 
 def main() -> None:

@@ -77,16 +77,16 @@ def chain_scanned(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 
 def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The chain by the fused kernel."""
-    passage, values = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
-    return lambda: passage(values, SEED)
+    simulator, values = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
+    return lambda: simulator(values, SEED)
 
 
 def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
-    passage = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
-    given = jax.device_put((passage.filled_up(work.values()), passage.inputs(passage.stretches(SEED))))
+    simulator = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
+    given = jax.device_put((simulator.pad_lanes(work.values()), simulator.join_spans(simulator.compute_inputs(SEED))))
     names = sorted(NAMES)
-    return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, passage.kernel(*given), strict=True)}
+    return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, simulator.kernel(*given), strict=True)}
 
 
 def _lorenz_rates(x: Any, y: Any, z: Any, rho: Any) -> tuple[Any, Any, Any]:

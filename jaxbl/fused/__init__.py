@@ -1,9 +1,10 @@
-"""Fused runs: the loop over time inside, a lane's state in registers, from the same step function as the scan.
+"""The fused backend: one compiled loop over time that keeps a lane's state in registers, made from the step of the scan.
 
 XLA makes several kernels of a time step and passes the state through memory between them. Here the traced step is split
-(`split`) into what all lanes share, which is computed once, `ahead` of them, and what each lane does, which one loop does in
-registers: on CPUs compiled by LLVM (`llvm`), on a GPU as one kernel (`pallas`). `passage` takes lanes through a whole run by
-either; `single_plant` does what a log asks for, one plant's path and the derivatives of its steps.
+(`dependence`) into what all lanes share, which is computed once, ahead of them (`shared_part`), and what each lane does,
+which one loop does in registers: on CPUs compiled by LLVM (`llvm`), on a GPU as one kernel (`pallas`). `lane_simulator`
+takes lanes through a whole run by either. `single_plant` does what a log asks for: the trajectory of one plant, and the
+derivatives of its steps.
 """
 
 import logging
@@ -14,7 +15,7 @@ from functools import cache
 import jax
 
 SCAN_MESSAGE = "The fused loop does not support %s; the slower scan is used."
-"""Said of what is left to XLA."""
+"""Message for the user; takes what is not supported."""
 
 
 class Unsupported(Exception):
@@ -22,18 +23,18 @@ class Unsupported(Exception):
 
 
 @contextmanager
-def raising_unsupported(what: str = f"compilation with JAX {jax.__version__}") -> Iterator[None]:
-    """Around the making of a loop: whatever goes wrong is `Unsupported`, as JAX and LLVM change from version to version."""
+def raising_unsupported(task: str = f"compilation with JAX {jax.__version__}") -> Iterator[None]:
+    """Turn every error of compiling a loop into `Unsupported`: JAX and LLVM change from version to version."""
     try:
         yield
     except Unsupported:
         raise
     except Exception as error:  # of any kind: imports, tracing, lowering and assemblers have their own
-        said = str(error).strip().partition("\n")[0]
-        raise Unsupported(f"{what} ({type(error).__name__}: {said:.200})") from error
+        first_line = str(error).strip().partition("\n")[0]
+        raise Unsupported(f"{task} ({type(error).__name__}: {first_line:.200})") from error
 
 
 @cache
-def warn_of_scan(why: str) -> None:
-    """On stderr, once; for what has no report that could say it."""
-    logging.getLogger(__name__).warning(SCAN_MESSAGE, why)
+def warn_of_scan(reason: str) -> None:
+    """Warn once on stderr that the scan is used; for computations without a report that could say it."""
+    logging.getLogger(__name__).warning(SCAN_MESSAGE, reason)

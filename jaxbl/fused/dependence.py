@@ -1,7 +1,7 @@
-"""Split a traced function of one lane into what all lanes share and what each has to do by itself.
+"""Split a traced function by what its values depend on: the lane, time, and the state of the sample before.
 
 `vmap` leaves what no axis touches unbatched, and computes it once; so does this. A value is *fixed* if it depends on
-neither lane nor time, *shared* if it depends on time alone, a *lane's* otherwise.
+neither lane nor time, *shared* if it depends on time alone, and a *lane's* otherwise.
 """
 
 import enum
@@ -16,12 +16,12 @@ import numpy as np
 from . import Unsupported
 from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate_equations, jaxpr_as_fun, read_variable, trace_inlined
 
-NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
-"""Types that lanes may read."""
+LANE_DTYPES = ("float32", "float64", "int32", "uint32", "int64", "bool")
+"""Types of numbers that lanes may read."""
 
 
 class Dependence(enum.IntFlag):
-    """What a value depends on."""
+    """The kind of a value, by what it depends on."""
 
     FIXED = 0
     SHARED = 1
@@ -29,168 +29,214 @@ class Dependence(enum.IntFlag):
 
 
 class LaneSplit(NamedTuple):
-    """A function `f(values, carry, given) -> results` of one lane in two parts, and which results are the lanes'.
+    """A function `f(values, carry, inputs) -> results` of one lane in two parts.
 
-    `shared`: its part of the carry, `given` -> its results, and what the lanes' part reads of it.
-    `lane`: values, its part of the carry, what it reads -> its results. Fixed numbers stand in it, for compilers to see.
+    Attributes:
+        shared: takes its part of the carry and `inputs`; returns its results, and what the lanes' part reads of it.
+        lane: takes values, its part of the carry, and what it reads; returns its results. Fixed numbers stand in it as
+            literals, for compilers to see.
+        is_lane_result: for each result, True if the lanes' part makes it.
     """
 
     shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
     lane: ClosedJaxpr
-    of_lane: list[bool]
+    is_lane_result: list[bool]
 
 
 class LoopHooks(NamedTuple):
-    """What is done around the loop over a block of samples, jaxprs of scalars of one lane: before the first block (values ->
-    carry), after each (values, carry, inputs -> carry, and marks that are kept of each block), and to finish (values, carry,
-    inputs -> results)."""
+    """Jaxprs of scalars of one lane that run around the loop over the samples of a block.
 
-    before: ClosedJaxpr
-    after: ClosedJaxpr
+    Attributes:
+        start: before the first block, values -> carry.
+        after_block: after each block, values, carry, inputs -> carry, and flags that are stored for each block.
+        finish: after the last block, values, carry, inputs -> results.
+    """
+
+    start: ClosedJaxpr
+    after_block: ClosedJaxpr
     finish: ClosedJaxpr
 
 
-def carry_dependences(
+def find_carry_dependences(
     start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any
 ) -> list[Dependence]:
-    """Kinds of the leaves of a carry that `start(values)` begins and `functions`, each with an example of what it is given,
-    take further: `f(values, carry, given)`."""
-    made = trace_inlined(start, values)
-    kinds = _kinds(made.jaxpr, [Dependence.LANE] * len(made.jaxpr.invars))
-    found = [_kind(kinds, out) for out in made.jaxpr.outvars]
+    """Find what each leaf of a carry depends on.
+
+    Args:
+        start: makes the carry from a lane's values.
+        functions: `f(values, carry, inputs)` that take the carry further, each with an example of its inputs.
+        values: an example of a lane's values.
+
+    Returns:
+        `SHARED` or `LANE` for each leaf of the carry.
+    """
+    start_jaxpr = trace_inlined(start, values).jaxpr
+    dependences = _propagate_dependences(start_jaxpr, [Dependence.LANE] * len(start_jaxpr.invars))
+    carried = [_read_dependence(dependences, out) for out in start_jaxpr.outvars]
     count = len(jax.tree.leaves(values))
     example = jax.eval_shape(start, values)
-    traced = [(trace_inlined(f, values, example, given), len(jax.tree.leaves(given))) for f, given in functions]
+    traced = [(trace_inlined(f, values, example, inputs), len(jax.tree.leaves(inputs))) for f, inputs in functions]
     while True:
-        before = list(found)
-        for closed, shared in traced:
+        before = list(carried)
+        for closed, input_count in traced:
             jaxpr = closed.jaxpr
-            kinds = _kinds(jaxpr, [Dependence.LANE] * count + found + [Dependence.SHARED] * shared)
+            arguments = [Dependence.LANE] * count + carried + [Dependence.SHARED] * input_count
+            dependences = _propagate_dependences(jaxpr, arguments)
             for i, (old, new) in enumerate(zip(jaxpr.invars[count:], jaxpr.outvars, strict=False)):
                 if new is not old:
-                    found[i] |= _kind(kinds, new) | Dependence.SHARED
-        if found == before:
-            return [Dependence.LANE if kind & Dependence.LANE else Dependence.SHARED for kind in found]
+                    carried[i] |= _read_dependence(dependences, new) | Dependence.SHARED
+        if carried == before:
+            return [Dependence.LANE if leaf & Dependence.LANE else Dependence.SHARED for leaf in carried]
 
 
 def split_by_lane(
     function: Callable[..., Any],
     values: Any,
     carry: Any,
-    given: Any,
-    kinds: Sequence[Dependence],
-    results: Sequence[Dependence] | None = None,
+    inputs: Any,
+    carry_dependences: Sequence[Dependence],
+    result_dependences: Sequence[Dependence] | None = None,
 ) -> LaneSplit:
-    """The two parts of a function of one lane, from examples of its arguments and the kinds of the carry's leaves.
+    """Split a function `f(values, carry, inputs)` of one lane into what all lanes share and what each lane does.
 
-    `results` are the kinds that the results are to have; left out, those that they come to have. `Unsupported` where lanes
-    read something that is no number: an array, or the state of a random number generator.
+    Args:
+        function: to be split.
+        values, carry, inputs: examples of its arguments.
+        carry_dependences: of the carry's leaves.
+        result_dependences: that the results are to have; left out, those that follow.
+
+    Raises:
+        Unsupported: lanes read something that is no number: an array, or the state of a random number generator.
     """
-    closed = trace_inlined(function, values, carry, given)
+    closed = trace_inlined(function, values, carry, inputs)
     jaxpr = closed.jaxpr
     count = len(jax.tree.leaves(values))
-    carried, rest = jaxpr.invars[count : count + len(kinds)], jaxpr.invars[count + len(kinds) :]
-    carried_by_lane = [kind == Dependence.LANE for kind in kinds]
-    known = _kinds(jaxpr, [Dependence.LANE] * count + list(kinds) + [Dependence.SHARED] * len(rest))
-    live = _live(jaxpr)
-    lanes = [eqn for eqn in live if any(known[out] & Dependence.LANE for out in eqn.outvars)]
-    others = [eqn for eqn in live if not any(known[out] & Dependence.LANE for out in eqn.outvars)]
+    carry_end = count + len(carry_dependences)
+    carry_vars, input_vars = jaxpr.invars[count:carry_end], jaxpr.invars[carry_end:]
+    is_lane_carry = [dependence == Dependence.LANE for dependence in carry_dependences]
+    arguments = [Dependence.LANE] * count + list(carry_dependences) + [Dependence.SHARED] * len(input_vars)
+    dependences = _propagate_dependences(jaxpr, arguments)
+    live = _live_equations(jaxpr)
+    lane_equations = [eqn for eqn in live if any(dependences[out] & Dependence.LANE for out in eqn.outvars)]
+    shared_equations = [eqn for eqn in live if not any(dependences[out] & Dependence.LANE for out in eqn.outvars)]
     constants = dict(zip(jaxpr.constvars, closed.consts, strict=True))
 
-    of_lane = [bool(kind & Dependence.LANE) for kind in results or [_kind(known, out) for out in jaxpr.outvars]]
-    own = [out for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if lane]
-    read = dict.fromkeys(v for eqn in lanes for v in eqn.invars if isinstance(v, Var))
-    read |= dict.fromkeys(v for v in own if isinstance(v, Var))
-    outside = [v for v in read if not known[v] & Dependence.LANE]
-    fixed = [v for v in outside if known[v] == Dependence.FIXED]
-    crossing = [v for v in outside if known[v] == Dependence.SHARED]
-    lane_in = [*jaxpr.invars[:count], *(v for v, lane in zip(carried, carried_by_lane, strict=True) if lane)]
-    shared_in = [v for v, lane in zip(carried, carried_by_lane, strict=True) if not lane]
+    result_dependences = result_dependences or [_read_dependence(dependences, out) for out in jaxpr.outvars]
+    is_lane_result = [bool(dependence & Dependence.LANE) for dependence in result_dependences]
+    lane_results = [out for out, is_lane in zip(jaxpr.outvars, is_lane_result, strict=True) if is_lane]
+    read = dict.fromkeys(v for eqn in lane_equations for v in eqn.invars if isinstance(v, Var))
+    read |= dict.fromkeys(v for v in lane_results if isinstance(v, Var))
+    from_outside = [v for v in read if not dependences[v] & Dependence.LANE]
+    fixed = [v for v in from_outside if dependences[v] == Dependence.FIXED]
+    handed_over = [v for v in from_outside if dependences[v] == Dependence.SHARED]
+    lane_vars = [*jaxpr.invars[:count], *(v for v, is_lane in zip(carry_vars, is_lane_carry, strict=True) if is_lane)]
+    shared_vars = [v for v, is_lane in zip(carry_vars, is_lane_carry, strict=True) if not is_lane]
 
-    def shared(state: Sequence[Any], given: Any) -> tuple[list[Any], list[Any]]:
-        env = constants | dict(zip(shared_in, state, strict=True))
-        env |= dict(zip(rest, jax.tree.leaves(given), strict=True))
-        evaluate_equations(others, env)
-        new = [read_variable(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
-        return new, [env[v] for v in crossing]
+    def compute_shared(state: Sequence[Any], inputs: Any) -> tuple[list[Any], list[Any]]:
+        env = constants | dict(zip(shared_vars, state, strict=True))
+        env |= dict(zip(input_vars, jax.tree.leaves(inputs), strict=True))
+        evaluate_equations(shared_equations, env)
+        results = [
+            read_variable(env, out) for out, is_lane in zip(jaxpr.outvars, is_lane_result, strict=True) if not is_lane
+        ]
+        return results, [env[v] for v in handed_over]
 
-    def once() -> list[Any]:
+    def compute_fixed() -> list[Any]:
         env = dict(constants)
-        evaluate_equations([eqn for eqn in others if all(known[out] == Dependence.FIXED for out in eqn.outvars)], env)
+        fixed_equations = [
+            eqn for eqn in shared_equations if all(dependences[out] == Dependence.FIXED for out in eqn.outvars)
+        ]
+        evaluate_equations(fixed_equations, env)
         return [env[v] for v in fixed]
 
-    for v in [*lane_in, *fixed, *crossing]:
-        if v.aval.shape or str(v.aval.dtype) not in NUMBERS:
+    for v in [*lane_vars, *fixed, *handed_over]:
+        if v.aval.shape or str(v.aval.dtype) not in LANE_DTYPES:
             raise Unsupported(f"lanes that read {v.aval.dtype}{list(v.aval.shape) or ''}")
-    numbers = [np.asarray(value)[()] for value in (jax.jit(once)() if fixed else [])]
+    fixed_numbers = [np.asarray(number)[()] for number in (jax.jit(compute_fixed)() if fixed else [])]
 
-    def lane(*arguments: Any) -> list[Any]:
-        env = dict(zip([*fixed, *lane_in, *crossing], [*numbers, *arguments], strict=True))
-        evaluate_equations(lanes, env)
-        return [read_variable(env, out) for out in own]
+    def compute_lane(*arguments: Any) -> list[Any]:
+        env = dict(zip([*fixed, *lane_vars, *handed_over], [*fixed_numbers, *arguments], strict=True))
+        evaluate_equations(lane_equations, env)
+        return [read_variable(env, out) for out in lane_results]
 
-    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *crossing]]
-    return LaneSplit(shared, jax.make_jaxpr(lane)(*examples), of_lane)
+    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_vars, *handed_over]]
+    return LaneSplit(compute_shared, jax.make_jaxpr(compute_lane)(*examples), is_lane_result)
 
 
 class StateSplit(NamedTuple):
-    """A function `f(state, given) -> (state, handed)` of one sample in two parts.
+    """A function `f(state, inputs) -> (state, outputs)` of one sample in two parts.
 
-    `direct` says of each number handed over whether it needs no state. `ahead`: `given` -> these, and what `step` reads.
-    `step`: state, what it reads -> state, and the rest of what is handed over.
+    Attributes:
+        is_stateless: for each output, True if it needs no state.
+        compute_stateless: takes `inputs`; returns the outputs that need no state, and what `step` reads.
+        step: takes the state and what it reads; returns the state, and the outputs that need it.
     """
 
-    direct: list[bool]
-    ahead: Callable[[Any], tuple[list[Any], list[Any]]]
+    is_stateless: list[bool]
+    compute_stateless: Callable[[Any], tuple[list[Any], list[Any]]]
     step: ClosedJaxpr
 
 
-def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> StateSplit:
-    """What needs the state of the sample before, and what may be computed for all samples at once. `Unsupported` where the
-    former reads something that is no number."""
+def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], inputs: Any) -> StateSplit:
+    """Split `f(state, inputs)` into what needs the state of the sample before, and what all samples can compute at once.
+
+    Args:
+        function: to be split.
+        state, inputs: examples of its arguments.
+
+    Raises:
+        Unsupported: the part that needs the state reads something that is no number.
+    """
     count = len(state)
-    jaxpr = trace_inlined(function, list(state), given).jaxpr
-    known = _kinds(jaxpr, [Dependence.LANE] * count + [Dependence.SHARED] * (len(jaxpr.invars) - count))
-    direct = [not _kind(known, out) & Dependence.LANE for out in jaxpr.outvars[count:]]
-    kinds = [Dependence.LANE] * count + [Dependence.SHARED if one else Dependence.LANE for one in direct]
+    jaxpr = trace_inlined(function, list(state), inputs).jaxpr
+    arguments = [Dependence.LANE] * count + [Dependence.SHARED] * (len(jaxpr.invars) - count)
+    dependences = _propagate_dependences(jaxpr, arguments)
+    is_stateless = [not _read_dependence(dependences, out) & Dependence.LANE for out in jaxpr.outvars[count:]]
+    output_dependences = [Dependence.SHARED if stateless else Dependence.LANE for stateless in is_stateless]
+    carry_dependences = [Dependence.LANE] * count + output_dependences
 
-    def joined(values: Any, carry: list[Any], given: Any) -> list[Any]:
-        new, handed = function(carry[:count], given)
-        return [*new, *handed]
+    def combine(values: Any, carry: list[Any], inputs: Any) -> list[Any]:
+        state, outputs = function(carry[:count], inputs)
+        return [*state, *outputs]
 
-    # what is handed over stands among the carry, which nothing reads it from
-    spare = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
-    parts = split_by_lane(joined, [], [*state, *spare], given, kinds, kinds)
-    unread = [jnp.zeros(one.shape, one.dtype) for one, alone in zip(spare, direct, strict=True) if not alone]
+    # outputs stand in the carry, from which nothing reads them
+    slots = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
+    parts = split_by_lane(combine, [], [*state, *slots], inputs, carry_dependences, carry_dependences)
+    unread = [
+        jnp.zeros(slot.shape, slot.dtype) for slot, stateless in zip(slots, is_stateless, strict=True) if not stateless
+    ]
 
     def step(state: list[Any], read: list[Any]) -> list[Any]:
         return jaxpr_as_fun(parts.lane)(*state, *unread, *read)
 
     read = parts.lane.jaxpr.invars[count + len(unread) :]
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
-    return StateSplit(direct, partial(parts.shared, [None] * sum(direct)), trace_inlined(step, list(state), examples))
+    compute_stateless = partial(parts.shared, [None] * sum(is_stateless))
+    return StateSplit(is_stateless, compute_stateless, trace_inlined(step, list(state), examples))
 
 
-def _kind(kinds: dict[Var, Dependence], v: Var | Literal) -> Dependence:
-    return Dependence.FIXED if isinstance(v, Literal) else kinds[v]
+def _read_dependence(dependences: dict[Var, Dependence], v: Var | Literal) -> Dependence:
+    return Dependence.FIXED if isinstance(v, Literal) else dependences[v]
 
 
-def _kinds(jaxpr: Any, given: Sequence[Dependence]) -> dict[Var, Dependence]:
-    kinds = dict.fromkeys(jaxpr.constvars, Dependence.FIXED) | dict(zip(jaxpr.invars, given, strict=True))
+def _propagate_dependences(jaxpr: Any, arguments: Sequence[Dependence]) -> dict[Var, Dependence]:
+    """Dependence of every variable, from those of the arguments."""
+    dependences = dict.fromkeys(jaxpr.constvars, Dependence.FIXED) | dict(zip(jaxpr.invars, arguments, strict=True))
     for eqn in jaxpr.eqns:
-        kind = Dependence.FIXED
+        dependence = Dependence.FIXED
         for v in eqn.invars:
-            kind |= _kind(kinds, v)
-        kinds |= dict.fromkeys(eqn.outvars, Dependence.LANE if kind & Dependence.LANE else kind)
-    return kinds
+            dependence |= _read_dependence(dependences, v)
+        dependence = Dependence.LANE if dependence & Dependence.LANE else dependence
+        dependences |= dict.fromkeys(eqn.outvars, dependence)
+    return dependences
 
 
-def _live(jaxpr: Any) -> list[JaxprEqn]:
-    """Equations that an output needs."""
+def _live_equations(jaxpr: Any) -> list[JaxprEqn]:
+    """The equations that an output needs, in their order."""
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
-    kept = []
+    live = []
     for eqn in reversed(jaxpr.eqns):
         if any(out in needed for out in eqn.outvars):
-            kept.append(eqn)
+            live.append(eqn)
             needed |= {v for v in eqn.invars if isinstance(v, Var)}
-    return kept[::-1]
+    return live[::-1]

@@ -1,7 +1,7 @@
 """Elementary functions from arithmetic alone, for a compiler of vectors that has no others.
 
-Accurate to a few units in the last place: within `LIMIT` of them against NumPy (tests). Minimax coefficients are those of
-S. L. Moshier's Cephes library; of tanh in float32 those that XLA has as well; of the exponential function in float64 our own
+They are accurate to a few units in the last place: within `LIMIT` of them against NumPy (tests). Minimax coefficients are
+from S. L. Moshier's Cephes library, for tanh in float32 from XLA, and for the exponential function in float64 our own
 (relative error 1.8e-17 of e^r - 1 for |r| <= ln 2 / 2).
 """
 
@@ -31,12 +31,12 @@ def _is_double(x: Number) -> bool:
 
 def _power_of_two(n: Number) -> Number:
     """2^n for an integer n within the exponent's range."""
-    kind, bias, bits = (jnp.int64, 1023, 52) if _is_double(n) else (jnp.int32, 127, 23)
-    exponent = lax.shift_left(lax.convert_element_type(n, kind) + kind(bias), kind(bits))
+    integer, bias, bits = (jnp.int64, 1023, 52) if _is_double(n) else (jnp.int32, 127, 23)
+    exponent = lax.shift_left(lax.convert_element_type(n, integer) + integer(bias), integer(bits))
     return lax.bitcast_convert_type(exponent, n.dtype)
 
 
-def _exponential(x: Number) -> tuple[Number, Number]:
+def _expm1_and_power(x: Number) -> tuple[Number, Number]:
     """e^r - 1 and 2^n with x = r + n ln 2."""
     n = lax.round(x * 1.4426950408889634, lax.RoundingMethod.TO_NEAREST_EVEN)
     if _is_double(x):
@@ -50,27 +50,27 @@ def _exponential(x: Number) -> tuple[Number, Number]:
     return _polynomial(r, series) * r * r + r, _power_of_two(n)
 
 
-def _within(x: Number) -> tuple[Number, float, float]:
-    """x within the range in which e^x is a normal number, and that range."""
+def _clamp_to_range(x: Number) -> tuple[Number, float, float]:
+    """x clamped to the range in which e^x is a normal number, and that range."""
     low, high = (-708.0, 709.0) if _is_double(x) else (-87.0, 88.0)
     return lax.clamp(jnp.full_like(x, low), x, jnp.full_like(x, high)), low, high
 
 
 def exp(x: Number) -> Number:
     """e^x; infinite above 88 (float32) or 709, zero below -87 or -708, a little before it has to be."""
-    inside, low, high = _within(x)
-    beyond, power = _exponential(inside)
-    value = beyond * power + power
-    value = lax.select(x > high, jnp.full_like(x, jnp.inf), lax.select(x < low, jnp.zeros_like(x), value))
-    return lax.select(x != x, x, value)
+    clamped, low, high = _clamp_to_range(x)
+    expm1_r, power = _expm1_and_power(clamped)
+    result = expm1_r * power + power
+    result = lax.select(x > high, jnp.full_like(x, jnp.inf), lax.select(x < low, jnp.zeros_like(x), result))
+    return lax.select(x != x, x, result)
 
 
 def expm1(x: Number) -> Number:
     """e^x - 1."""
-    inside, _, high = _within(x)
-    beyond, power = _exponential(inside)
-    value = lax.select(x > high, jnp.full_like(x, jnp.inf), beyond * power + (power - 1.0))
-    return lax.select(x != x, x, value)
+    clamped, _, high = _clamp_to_range(x)
+    expm1_r, power = _expm1_and_power(clamped)
+    result = lax.select(x > high, jnp.full_like(x, jnp.inf), expm1_r * power + (power - 1.0))
+    return lax.select(x != x, x, result)
 
 
 def tanh(x: Number) -> Number:
@@ -79,18 +79,18 @@ def tanh(x: Number) -> Number:
         edge = jnp.full_like(x, 7.90531110763549805)
         a = lax.clamp(-edge, x, edge)
         z = a * a
-        up = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08,
+        numerator = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08,
               1.48572235717979e-05, 6.37261928875436e-04, 4.89352455891786e-03)  # fmt: skip
-        down = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
-        return a * _polynomial(z, up) / _polynomial(z, down)
-    beyond, power = _exponential(2.0 * lax.min(lax.abs(x), jnp.full_like(x, 22.0)))
-    less_one = beyond * power + (power - 1.0)
-    value = less_one / (less_one + 2.0)
-    return lax.select(x != x, x, lax.select(x < 0.0, -value, value))
+        denominator = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
+        return a * _polynomial(z, numerator) / _polynomial(z, denominator)
+    expm1_r, power = _expm1_and_power(2.0 * lax.min(lax.abs(x), jnp.full_like(x, 22.0)))
+    expm1_2x = expm1_r * power + (power - 1.0)
+    result = expm1_2x / (expm1_2x + 2.0)
+    return lax.select(x != x, x, lax.select(x < 0.0, -result, result))
 
 
-def _reduced(x: Number) -> tuple[Number, Number]:
-    """x less the nearest multiple of pi / 2, and that multiple modulo 4. For |x| up to 1e4 (float32), 1e8 (float64)."""
+def _reduce_to_quadrant(x: Number) -> tuple[Number, Number]:
+    """x minus the nearest n pi / 2, and n modulo 4; for |x| up to 1e4 (float32), 1e8 (float64)."""
     n = lax.round(x * 0.6366197723675814, lax.RoundingMethod.TO_NEAREST_EVEN)
     # pi / 2 in parts of few digits: their products with n are exact
     if _is_double(x):
@@ -102,7 +102,8 @@ def _reduced(x: Number) -> tuple[Number, Number]:
     return x, n - 4.0 * lax.floor(n * 0.25)
 
 
-def _sine(x: Number) -> Number:
+def _sine_of_remainder(x: Number) -> Number:
+    """sin x for |x| <= pi / 4."""
     z = x * x
     if _is_double(x):
         series = (1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6,
@@ -112,7 +113,8 @@ def _sine(x: Number) -> Number:
     return x + x * z * _polynomial(z, series)
 
 
-def _cosine(x: Number) -> Number:
+def _cosine_of_remainder(x: Number) -> Number:
+    """cos x for |x| <= pi / 4."""
     z = x * x
     if _is_double(x):
         series = (-1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
@@ -122,23 +124,24 @@ def _cosine(x: Number) -> Number:
     return 1.0 - 0.5 * z + z * z * _polynomial(z, series)
 
 
-def _turned(x: Number, quarters: float) -> Number:
-    r, n = _reduced(x)
+def _sine_after_quarters(x: Number, quarters: float) -> Number:
+    """sin(x + quarters pi / 2)."""
+    r, n = _reduce_to_quadrant(x)
     n = n + quarters
     n = lax.select(n > 3.5, n - 4.0, n)
-    odd = (n == 1.0) | (n == 3.0)
-    value = lax.select(odd, _cosine(r), _sine(r))
-    return lax.select(n > 1.5, -value, value)
+    is_cosine = (n == 1.0) | (n == 3.0)
+    result = lax.select(is_cosine, _cosine_of_remainder(r), _sine_of_remainder(r))
+    return lax.select(n > 1.5, -result, result)
 
 
 def sin(x: Number) -> Number:
     """sin x."""
-    return _turned(x, 0.0)
+    return _sine_after_quarters(x, 0.0)
 
 
 def cos(x: Number) -> Number:
     """cos x."""
-    return _turned(x, 1.0)
+    return _sine_after_quarters(x, 1.0)
 
 
 def logistic(x: Number) -> Number:
@@ -147,13 +150,15 @@ def logistic(x: Number) -> Number:
 
 
 def round_half_even(x: Number) -> Number:
-    """The nearest integer, the even one of two."""
+    """The nearest integer; of two that are equally near, the even."""
     below = lax.floor(x)
-    odd = below - 2.0 * lax.floor(0.5 * below)
+    is_odd = below - 2.0 * lax.floor(0.5 * below)
     # every difference is exact; adding and subtracting a large number is not safe from compilers
-    rest = x - below
-    return below + lax.select(rest == 0.5, odd, lax.convert_element_type(rest > 0.5, x.dtype))
+    remainder = x - below
+    return below + lax.select(remainder == 0.5, is_odd, lax.convert_element_type(remainder > 0.5, x.dtype))
 
 
-FUNCTIONS: dict[str, Callable[[Number], Number]] = {one.__name__: one for one in (exp, expm1, tanh, sin, cos, logistic)}
-"""By the name of the primitive that they stand for."""
+FUNCTIONS: dict[str, Callable[[Number], Number]] = {
+    function.__name__: function for function in (exp, expm1, tanh, sin, cos, logistic)
+}
+"""The functions by the names of the primitives that they replace."""

@@ -1,4 +1,4 @@
-"""Lanes through time by a fused loop: what :func:`jaxbl.simulate.scan` computes, for many lanes at once."""
+"""Simulate many lanes at once by a compiled loop; the numbers are those of :func:`jaxbl.simulate.scan`."""
 
 import abc
 from collections import deque
@@ -23,297 +23,354 @@ from jaxbl.simulate import (
     initial_carry,
 )
 
-from .dependence import Dependence, LoopHooks, carry_dependences, split_by_lane
+from .dependence import Dependence, LoopHooks, find_carry_dependences, split_by_lane
 from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
 from .noise import host_device
 from .shared_part import SharedPart, compile_shared_part
 
-_KEPT = 2**24
-"""Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""
-_WORTH = 0.875
-"""Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
-_SHARE = 2**18
+_CACHE_BYTES = 2**24
+"""Bytes of shared inputs, of some seeds, that a simulator keeps for the next lanes."""
+_COMPACTION_SHARE = 0.875
+"""Lanes that are done are removed when at most this share of the lanes is left: to move the others costs as much as some
+samples."""
+_THREAD_WORK = 2**18
 """Samples of lanes times their bytes, some 0.1 ms, that are worth a thread."""
-_CALL = 2**20
-"""Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
+_CALL_WORK = 2**20
+"""Samples of lanes that one call of the loop takes, some 1 ms; after the call, lanes that are done may leave."""
 
 
 class SharedInputs(NamedTuple):
-    """What lanes need for a stretch of samples, in whole blocks: inputs of each sample `(samples,)` and of what follows each
-    block `(blocks,)`; of the last stretch those of a lane's figures `()`, and the figures that lanes share `()`."""
+    """What all lanes read in a span: some whole blocks of samples.
+
+    Attributes:
+        length: samples of the span.
+        sample_inputs: inputs of each sample, `(samples,)` each.
+        block_inputs: inputs of what follows each block, `(blocks,)` each.
+        final_inputs: inputs of a lane's metrics, `()` each; None before the last span.
+        shared_metrics: metrics that are the same for all lanes, `()` each; none before the last span.
+    """
 
     length: int
-    handed: AddressedArrays
-    last: AddressedArrays
-    ends: list[np.ndarray] | None
-    figures: list[np.ndarray]
+    sample_inputs: AddressedArrays
+    block_inputs: AddressedArrays
+    final_inputs: list[np.ndarray] | None
+    shared_metrics: list[np.ndarray]
 
     @property
-    def size(self) -> int:
-        """Bytes."""
-        return sum(one.nbytes for part in (self.handed, self.last) for one in part.arrays)
+    def nbytes(self) -> int:
+        """Bytes of the inputs of samples and blocks."""
+        return sum(array.nbytes for inputs in (self.sample_inputs, self.block_inputs) for array in inputs.arrays)
 
 
 class LaneSimulator(abc.ABC):
-    """Simulates lanes of an experiment; made and called in its precision (`jax.enable_x64`).
+    """Simulates lanes of an experiment. It is made and called in the experiment's precision (`jax.enable_x64`).
 
     Args:
-        experiment, reducers: as of :func:`jaxbl.simulate.scan`.
+        experiment, reducers: as for :func:`jaxbl.simulate.scan`.
         paths: of the leaves that differ from lane to lane.
-        lanes: how many there are; compiled for this number, filled up to a multiple of those computed `together`.
+        lanes: number of lanes that the code is compiled for.
+        multiple: the lanes are padded to a multiple of this number.
+
+    Attributes:
+        carry_count: how many numbers each lane carries from sample to sample, beside those that all lanes share.
 
     Raises:
-        Unsupported: a step does something that a fused loop cannot do.
+        Unsupported: a step does something that a compiled loop cannot do.
     """
 
     def __init__(
-        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, together: int
+        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, multiple: int
     ):
         self._paths, self._steps = paths, experiment.run.steps
-        self._lanes, self._filled = lanes, -(-lanes // together) * together
-        self._length = block_length(self._steps)
+        self._lanes, self._padded_lanes = lanes, -(-lanes // multiple) * multiple
+        self._block_length = block_length(self._steps)
         dtype = jnp.result_type(experiment.run.sample_period)
         self._dtype = np.dtype(dtype)
 
-        def own(values: list[Any]) -> Experiment:
+        def place_values(values: list[Any]) -> Experiment:
             return set_leaves(experiment, dict(zip(paths, values, strict=True)))
 
         def start(values: list[Any], *_: Any) -> Any:
-            return initial_carry(own(values), reducers)
+            return initial_carry(place_values(values), reducers)
 
-        def sample(values: list[Any], carry: Any, given: Any) -> Any:
-            return advance_sample(own(values), reducers, carry, *given)[0]
+        def step(values: list[Any], carry: Any, sample_inputs: Any) -> Any:
+            return advance_sample(place_values(values), reducers, carry, *sample_inputs)[0]
 
-        def settle(values: list[Any], carry: Any, given: Any) -> Any:
-            carry = end_block(own(values), carry)
-            return carry, all_done(own(values), reducers, carry)
+        def finish_block(values: list[Any], carry: Any, _: Any) -> Any:
+            carry = end_block(place_values(values), carry)
+            return carry, all_done(place_values(values), reducers, carry)
 
-        def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
-            return compute_metrics(own(values), reducers, carry)
+        def finish(values: list[Any], carry: Any, _: Any) -> dict[str, Any]:
+            return compute_metrics(place_values(values), reducers, carry)
 
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
-        given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
+        noise = dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
+        sample_inputs = jax.ShapeDtypeStruct((), jnp.int32), noise
         carry = jax.eval_shape(start, values)
-        kinds = carry_dependences(start, ((sample, given), (settle, ())), values)
-        one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Dependence.LANE]
-        # by each lane; what all share is not among them
-        self.carried = len(kinds) - len(one)
-        begins, inner = (
-            split_by_lane(start, values, (), (), [], kinds),
-            split_by_lane(sample, values, carry, given, kinds, kinds),
-        )
-        # whether a lane is done, where that can be known
-        marks = [Dependence.LANE] * (len(jax.tree.leaves(jax.eval_shape(settle, values, carry, ()))) - len(kinds))
-        outer, ends = (
-            split_by_lane(settle, values, carry, (), kinds, [*kinds, *marks]),
-            split_by_lane(result, values, carry, (), kinds),
-        )
-        self._body, self._around = inner.lane, LoopHooks(begins.lane, outer.lane, ends.lane)
+        dependences = find_carry_dependences(start, ((step, sample_inputs), (finish_block, ())), values)
+        leaves = zip(jax.tree.leaves(carry), dependences, strict=True)
+        shared_state = [leaf for leaf, dependence in leaves if dependence != Dependence.LANE]
+        self.carry_count = len(dependences) - len(shared_state)
+        start_split = split_by_lane(start, values, (), (), [], dependences)
+        step_split = split_by_lane(step, values, carry, sample_inputs, dependences, dependences)
+        # after a block it is known whether a lane is done, if the reducers can tell
+        flag_count = len(jax.tree.leaves(jax.eval_shape(finish_block, values, carry, ()))) - len(dependences)
+        result_dependences = [*dependences, *[Dependence.LANE] * flag_count]
+        block_split = split_by_lane(finish_block, values, carry, (), dependences, result_dependences)
+        finish_split = split_by_lane(finish, values, carry, (), dependences)
+        self._step, self._hooks = step_split.lane, LoopHooks(start_split.lane, block_split.lane, finish_split.lane)
         # compiled now, so that a call only runs
-        shared = SharedPart(inner.shared, outer.shared, one, experiment.sides, self._steps, self._length)
-        self._ahead, self._stretch = compile_shared_part(shared), shared.stretch
-        self._kept: dict[int, list[SharedInputs]] = {}
-        self._first = [np.asarray(leaf) for leaf in jax.jit(lambda: begins.shared([], ())[0])()]
-        self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
-        names = sorted(jax.eval_shape(result, values, carry, ()))
-        self._of_lane = dict(zip(names, ends.of_lane, strict=True))
-        self._figure_dtypes = [np.dtype(aval.dtype) for aval in ends.lane.out_avals]
+        part = SharedPart(
+            step_split.shared, block_split.shared, shared_state, experiment.sides, self._steps, self._block_length
+        )
+        self._run_shared_part, self._span_length = compile_shared_part(part), part.span_length
+        self._cached_inputs: dict[int, list[SharedInputs]] = {}
+        self._initial_state = [np.asarray(leaf) for leaf in jax.jit(lambda: start_split.shared([], ())[0])()]
+        self._finish_shared_part = jax.jit(lambda state: finish_split.shared(state, ())).lower(shared_state).compile()
+        names = sorted(jax.eval_shape(finish, values, carry, ()))
+        self._is_lane_metric = dict(zip(names, finish_split.is_lane_result, strict=True))
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
-        """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
-        found, shared = self._march(self.filled_up(values), self._run(seed))
-        lanes, others = iter(found), iter(shared)
+        """Simulate the lanes with one seed.
+
+        Args:
+            values: of the lanes, `(lanes,)` by path, in SI units.
+            seed: of the encoders' noise.
+
+        Returns:
+            Metrics of the lanes, `(lanes,)` by name.
+        """
+        lane_metrics, shared_metrics = self._simulate(self.pad_lanes(values), self._iterate_inputs(seed))
+        next_lane_metric, next_shared_metric = iter(lane_metrics), iter(shared_metrics)
         return {
-            name: next(lanes)[: self._lanes] if own else np.full(self._lanes, next(others))
-            for name, own in self._of_lane.items()
+            name: next(next_lane_metric)[: self._lanes] if is_lane else np.full(self._lanes, next(next_shared_metric))
+            for name, is_lane in self._is_lane_metric.items()
         }
 
-    def keep(self, seeds: Collection[int]) -> None:
-        """What lanes share is kept for the next lanes of these seeds, as far as there is room, and of no others."""
-        self._kept = {seed: run for seed, run in self._kept.items() if seed in seeds}
+    def keep_seeds(self, seeds: Collection[int]) -> None:
+        """Keep the shared inputs of these seeds for the next lanes, as far as there is room, and drop all others."""
+        self._cached_inputs = {seed: inputs for seed, inputs in self._cached_inputs.items() if seed in seeds}
 
-    def _run(self, seed: int) -> Iterator[SharedInputs]:
-        if seed in self._kept:
-            yield from self._kept[seed]
+    def _iterate_inputs(self, seed: int) -> Iterator[SharedInputs]:
+        """Shared inputs of a run, span after span: from the cache, or computed and then cached if there is room."""
+        if seed in self._cached_inputs:
+            yield from self._cached_inputs[seed]
             return
-        made, room = [], _KEPT - sum(one.size for run in self._kept.values() for one in run)
-        for stretch in self.stretches(seed):
-            room -= stretch.size
-            made = [*made, stretch] if room >= 0 else []
-            yield stretch
+        computed: list[SharedInputs] = []
+        room = _CACHE_BYTES - sum(inputs.nbytes for spans in self._cached_inputs.values() for inputs in spans)
+        for inputs in self.compute_inputs(seed):
+            room -= inputs.nbytes
+            computed = [*computed, inputs] if room >= 0 else []
+            yield inputs
         if room >= 0:
-            self._kept[seed] = made
+            self._cached_inputs[seed] = computed
 
-    def filled_up(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """Values of as many lanes as are computed."""
-        given = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
-        for path, one in zip(self._paths, given, strict=True):
-            if one.shape != (self._lanes,):
-                raise ValueError(f"{path}: {self._lanes} lanes need as many values, not an array of shape {one.shape}")
-        more = (0, self._filled - self._lanes)
-        return [np.pad(one, more, "edge") for one in given] if any(more) else given
+    def pad_lanes(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Values of the lanes in the order of the paths, the last lane repeated: `(padded lanes,)` each."""
+        columns = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
+        for path, column in zip(self._paths, columns, strict=True):
+            if column.shape != (self._lanes,):
+                raise ValueError(f"{path}: {self._lanes} lanes need as many values, not an array of shape {column.shape}")
+        padding = (0, self._padded_lanes - self._lanes)
+        return [np.pad(column, padding, "edge") for column in columns] if any(padding) else columns
 
-    def stretches(self, seed: int) -> Iterator[SharedInputs]:
-        """Stretch after stretch of a run."""
-        state = self._first
-        for first in range(0, self._steps, self._stretch):
-            length = min(self._stretch, self._steps - first)
-            state, last, handed = self._ahead(state, seed, first, length)
-            ends, figures = None, []
+    def compute_inputs(self, seed: int) -> Iterator[SharedInputs]:
+        """Compute the shared inputs of a run, span after span."""
+        state = self._initial_state
+        for first in range(0, self._steps, self._span_length):
+            length = min(self._span_length, self._steps - first)
+            state, block_outputs, sample_outputs = self._run_shared_part(state, seed, first, length)
+            final_inputs, shared_metrics = None, []
             if first + length == self._steps:
-                figures, ends = ([np.asarray(x) for x in some] for some in self._closing(state))
-            each, blocks = (AddressedArrays([np.asarray(x) for x in part]) for part in (handed, last))
-            yield SharedInputs(length, each, blocks, ends, figures)
+                shared_metrics, final_inputs = ([np.asarray(x) for x in part] for part in self._finish_shared_part(state))
+            sample_inputs, block_inputs = (
+                AddressedArrays([np.asarray(x) for x in outputs]) for outputs in (sample_outputs, block_outputs)
+            )
+            yield SharedInputs(length, sample_inputs, block_inputs, final_inputs, shared_metrics)
 
     @abc.abstractmethod
-    def _march(
-        self, given: list[np.ndarray], stretches: Iterator[SharedInputs]
+    def _simulate(
+        self, values: list[np.ndarray], spans: Iterator[SharedInputs]
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """The lanes' figures `(lanes,)` each, and those that they share `()`."""
+        """Take the lanes through all spans; returns metrics of lanes `(padded lanes,)`, and metrics that they share `()`."""
 
 
 class HostSimulator(LaneSimulator):
-    """By code for this machine's processor; threads share the lanes."""
+    """Simulates lanes by code for this machine's processor; `threads` share the lanes."""
 
     def __init__(
         self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, threads: int
     ):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
-        self._together = vector_lanes(dtype)
-        super().__init__(experiment, reducers, paths, lanes, self._together)
-        if any(eqn.primitive.name == "scan" for eqn in self._body.jaxpr.eqns):
+        self._vector_lanes = vector_lanes(dtype)
+        super().__init__(experiment, reducers, paths, lanes, self._vector_lanes)
+        if any(eqn.primitive.name == "scan" for eqn in self._step.jaxpr.eqns):
             # plant steps of a sample: few numbers, each of which waits for the one before
-            self._together *= 2
-            self._filled = -(-lanes // self._together) * self._together
+            self._vector_lanes *= 2
+            self._padded_lanes = -(-lanes // self._vector_lanes) * self._vector_lanes
         self._loop = Loop(
-            self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around, lanes=self._together
+            self._step, self._dtype, values=len(paths), carry=self.carry_count, hooks=self._hooks, lanes=self._vector_lanes
         )
-        self._of = {
-            name: [one.dtype for one in self._loop.signature if one.name.startswith(name)]
-            for name in ("input at the end", "mark of a block", "result")
+        self._dtypes = {
+            name: [spec.dtype for spec in self._loop.signature if spec.name.startswith(name)]
+            for name in ("final input", "block flag", "result")
         }
-        # a thread a share: its stretches come one after the other, whatever the others do
-        shares = min(threads, self._filled // self._together, max(self._filled * self._steps * dtype.itemsize // _SHARE, 1))
-        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
+        # each pool has one thread, so that its lanes take span after span, whatever the other threads do
+        work = self._padded_lanes * self._steps * dtype.itemsize
+        count = min(threads, self._padded_lanes // self._vector_lanes, max(work // _THREAD_WORK, 1))
+        self._pools = [ThreadPoolExecutor(1) for _ in range(count)]
 
-    def _march(self, given, stretches):
-        # dealt in turns: lanes that are done together, as neighbours often are, are then missed by all threads
-        count = len(self._threads)
-        rows = np.stack(given) if given else np.empty((0, self._filled), self._dtype)
-        dealt = [rows.reshape(len(given), -1, self._together)[:, i::count].reshape(len(given), -1) for i in range(count)]
-        shares = [_ThreadLanes(self._loop, self._of, values, self.carried, self._length) for values in dealt]
+    def _simulate(self, values, spans):
+        # vectors of lanes are dealt in turns: lanes that are done together are often neighbours, and then leave all threads
+        count = len(self._pools)
+        rows = np.stack(values) if values else np.empty((0, self._padded_lanes), self._dtype)
+        vectors = rows.reshape(len(values), -1, self._vector_lanes)
+        threads = [
+            _ThreadLanes(
+                self._loop, self._dtypes, vectors[:, i::count].reshape(len(values), -1), self.carry_count, self._block_length
+            )
+            for i in range(count)
+        ]
         running: deque[list[Future[None]]] = deque()
-        stretch = None
-        for stretch in stretches:
-            # what lanes share is computed meanwhile, a stretch or two ahead of them
-            own = int(stretch.ends is not None)
+        inputs = None
+        for inputs in spans:
+            # what lanes share is computed meanwhile, a span or two ahead of them
+            is_last = inputs.final_inputs is not None
             if not running:
                 # threads do nothing then but compute: they would wait for the interpreter
-                for share in shares:
-                    share.prepare(stretch)
-            running.append([t.submit(s.run, stretch) for t, s in zip(self._threads[own:], shares[own:], strict=True)])
+                for thread in threads:
+                    thread.prepare_arrays(inputs)
+            # nothing is left to do here during the last span, so that this thread takes the first lanes itself
+            submitted = zip(self._pools[int(is_last) :], threads[int(is_last) :], strict=True)
+            running.append([pool.submit(thread.simulate_span, inputs) for pool, thread in submitted])
             while len(running) > 2:
-                _wait(running.popleft())
-            if own:
-                # nothing is left to do here
-                _wait(one[0] for one in list(running)[:-1])
-                shares[0].run(stretch)
-            while own and running:
-                _wait(running.popleft())
-        assert stretch is not None
-        found = [np.empty((len(rows), self._filled), rows.dtype) for rows in shares[0].results]
-        for i, share in enumerate(shares):
-            for whole, part in zip(found, share.results, strict=True):
-                dealt = whole.reshape(len(whole), -1, self._together)
-                dealt[:, i::count] = part.reshape(len(part), -1, self._together)
-        return [one for rows in found for one in rows], stretch.figures
+                _wait_for(running.popleft())
+            if is_last:
+                _wait_for(futures[0] for futures in list(running)[:-1])
+                threads[0].simulate_span(inputs)
+            while is_last and running:
+                _wait_for(running.popleft())
+        assert inputs is not None
+        results = [np.empty((len(rows), self._padded_lanes), rows.dtype) for rows in threads[0].results]
+        for i, thread in enumerate(threads):
+            for all_lanes, part in zip(results, thread.results, strict=True):
+                vectors = all_lanes.reshape(len(all_lanes), -1, self._vector_lanes)
+                vectors[:, i::count] = part.reshape(len(part), -1, self._vector_lanes)
+        return [metric for rows in results for metric in rows], inputs.shared_metrics
 
 
-def _wait(futures: Iterable[Future[None]]) -> None:
-    for one in futures:
-        one.result()
+def _wait_for(futures: Iterable[Future[None]]) -> None:
+    for future in futures:
+        future.result()
 
 
 class _ThreadLanes:
-    """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with what they carry
-    then, and the others move together."""
+    """The lanes of one thread. Lanes that are done leave with what they then carry, and the others move together.
 
-    def __init__(self, loop: Loop, of: dict[str, list[np.dtype]], values: np.ndarray, carried: int, block: int):
-        self._loop, self._of, self._block, self._begun = loop, of, block, False
-        # of the lanes that are computed: their places, values and carry; behind them others only fill up
+    Args:
+        loop: the compiled loop.
+        dtypes: of the loop's arrays, by the name of their group.
+        values: `(paths, lanes)`.
+        carry_count: how many numbers a lane carries.
+        block_length: samples of a block.
+    """
+
+    def __init__(
+        self, loop: Loop, dtypes: dict[str, list[np.dtype]], values: np.ndarray, carry_count: int, block_length: int
+    ):
+        self._loop, self._dtypes, self._block_length, self._has_begun = loop, dtypes, block_length, False
+        # places of the lanes that are computed, and their values and carry; further columns are padding
         self._lanes = np.arange(values.shape[1])
-        self._own = np.empty((len(values) + carried, values.shape[1]), values.dtype)
-        self._own[: len(values)] = values
-        self._given: tuple[list[np.ndarray], list[np.ndarray], LoopArrays] | None = None
-        self._left: list[tuple[np.ndarray, np.ndarray]] = []
+        self._values_and_carry = np.empty((len(values) + carry_count, values.shape[1]), values.dtype)
+        self._values_and_carry[: len(values)] = values
+        self._prepared: tuple[list[np.ndarray], list[np.ndarray], LoopArrays] | None = None
+        self._done: list[tuple[np.ndarray, np.ndarray]] = []
         self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
-    def run(self, stretch: SharedInputs) -> None:
-        """Take lanes through a stretch, in calls of so many blocks as are worth one."""
-        at = 0
-        while at < stretch.length and len(self._lanes):
-            marks, results, arrays = self._given or self.prepare(stretch)
-            size = self._own.shape[1]
-            upto = min(at + max(_CALL // (size * self._block), 1) * self._block, stretch.length)
-            ends = stretch.ends is not None and upto == stretch.length
-            self._loop(arrays, upto, 0, size, start=at, block=self._block, begins=not self._begun, ends=ends)
-            self._begun, at = True, upto
-            if ends:
+    def simulate_span(self, inputs: SharedInputs) -> None:
+        """Take the lanes through a span, in calls of as many blocks as are worth one."""
+        start = 0
+        while start < inputs.length and len(self._lanes):
+            flags, results, arrays = self._prepared or self.prepare_arrays(inputs)
+            width = self._values_and_carry.shape[1]
+            blocks = max(_CALL_WORK // (width * self._block_length), 1)
+            end = min(start + blocks * self._block_length, inputs.length)
+            is_end = inputs.final_inputs is not None and end == inputs.length
+            self._loop(
+                arrays, end, 0, width, start=start, block_length=self._block_length, begins=not self._has_begun, ends=is_end
+            )
+            self._has_begun, start = True, end
+            if is_end:
                 self._results.append((self._lanes, results))
-            elif len(marks):
-                self._leave(marks[0][(upto - 1) // self._block])
-        self._given = None
-        if stretch.ends is not None and self._left:
-            self._lanes, self._own = (np.concatenate(one, axis=-1) for one in zip(*self._left, strict=True))
-            self._move(np.arange(len(self._lanes)))
-            _, results, arrays = self.prepare(stretch)
-            self._loop(arrays, 0, 0, self._own.shape[1], block=self._block, ends=True)
+            elif len(flags):
+                self._remove_done_lanes(flags[0][(end - 1) // self._block_length])
+        self._prepared = None
+        if inputs.final_inputs is not None and self._done:
+            # metrics of the lanes that have left
+            self._lanes, self._values_and_carry = (np.concatenate(parts, axis=-1) for parts in zip(*self._done, strict=True))
+            self._select_lanes(np.arange(len(self._lanes)))
+            _, results, arrays = self.prepare_arrays(inputs)
+            self._loop(arrays, 0, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
             self._results.append((self._lanes, results))
 
-    def prepare(self, stretch: SharedInputs) -> tuple[list[np.ndarray], list[np.ndarray], LoopArrays]:
-        """Marks of a stretch, results `(figures of one type, lanes)`, and all that the loop is given."""
-        size = self._own.shape[1]
-        marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
-        found = [np.empty((len(list(some)), size), dtype) for dtype, some in groupby(self._of["result"])]
-        unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
-        ends = unread if stretch.ends is None else stretch.ends
-        every = [ArrayRows(self._own), stretch.handed, stretch.last, *ends, *marks, *map(ArrayRows, found)]
-        arrays = LoopArrays(self._loop.signature, every, stretch.length, size, self._block)
-        self._given = marks, found, arrays
-        return self._given
+    def prepare_arrays(self, inputs: SharedInputs) -> tuple[list[np.ndarray], list[np.ndarray], LoopArrays]:
+        """Make the loop's arrays for a span.
+
+        Returns:
+            Flags of lanes that are done `(blocks, lanes)`, results `(metrics of one type, lanes)`, and all arrays together.
+        """
+        width = self._values_and_carry.shape[1]
+        blocks = -(-inputs.length // self._block_length)
+        flags = [np.empty((blocks, width), dtype) for dtype in self._dtypes["block flag"]]
+        results = [np.empty((len(list(group)), width), dtype) for dtype, group in groupby(self._dtypes["result"])]
+        unread = [np.zeros((), dtype) for dtype in self._dtypes["final input"]]
+        final_inputs = unread if inputs.final_inputs is None else inputs.final_inputs
+        lane_rows = ArrayRows(self._values_and_carry)
+        groups = [lane_rows, inputs.sample_inputs, inputs.block_inputs, *final_inputs, *flags, *map(ArrayRows, results)]
+        arrays = LoopArrays(self._loop.signature, groups, inputs.length, width, self._block_length)
+        self._prepared = flags, results, arrays
+        return self._prepared
 
     @property
     def results(self) -> list[np.ndarray]:
-        """Of all lanes, `(figures of one type, lanes)` each."""
-        if not self._left:
+        """Results of all lanes, an array `(metrics of one type, lanes)` for each type."""
+        if not self._done:
             return self._results[0][1]
         count = sum(len(lanes) for lanes, _ in self._results)
         merged = [np.empty((len(rows), count), rows.dtype) for rows in self._results[0][1]]
-        for lanes, found in self._results:
-            for one, own in zip(merged, found, strict=True):
-                one[:, lanes] = own[:, : len(lanes)]
+        for lanes, results in self._results:
+            for all_lanes, part in zip(merged, results, strict=True):
+                all_lanes[:, lanes] = part[:, : len(lanes)]
         return merged
 
-    def _leave(self, marks: np.ndarray) -> None:
-        """Lanes that are done, if so many are that the move is worth while."""
-        done = marks[: len(self._lanes)]
-        others = np.flatnonzero(~done)
-        if -(-len(others) // self._loop.lanes) * self._loop.lanes <= _WORTH * self._own.shape[1]:
-            gone = np.flatnonzero(done)
-            self._left.append((self._lanes[gone], self._own[:, gone]))
-            self._move(others)
+    def _remove_done_lanes(self, flags: np.ndarray) -> None:
+        """Remove the lanes that are done, if they are enough to be worth the move."""
+        is_done = flags[: len(self._lanes)]
+        remaining = np.flatnonzero(~is_done)
+        padded = -(-len(remaining) // self._loop.lanes) * self._loop.lanes
+        if padded <= _COMPACTION_SHARE * self._values_and_carry.shape[1]:
+            done = np.flatnonzero(is_done)
+            self._done.append((self._lanes[done], self._values_and_carry[:, done]))
+            self._select_lanes(remaining)
 
-    def _move(self, lanes: np.ndarray) -> None:
-        """Only these stay."""
-        whole = -(-len(lanes) // self._loop.lanes) * self._loop.lanes
-        filled = np.pad(lanes, (0, whole - len(lanes)), "edge") if len(lanes) else lanes
-        self._lanes, self._own, self._given = self._lanes[lanes], np.take(self._own, filled, axis=1), None
+    def _select_lanes(self, places: np.ndarray) -> None:
+        """Keep only the lanes at these places, padded to whole vectors."""
+        padded = -(-len(places) // self._loop.lanes) * self._loop.lanes
+        columns = np.pad(places, (0, padded - len(places)), "edge") if len(places) else places
+        self._lanes, self._values_and_carry = self._lanes[places], np.take(self._values_and_carry, columns, axis=1)
+        self._prepared = None
 
 
 class DeviceSimulator(LaneSimulator):
-    """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly.
+    """Simulates lanes by one kernel of an accelerator, which takes them through the whole run.
 
-    `kernel`, compiled, gives the lanes' figures from values `(lanes,)`, lanes filled up, and :meth:`inputs`.
+    Args:
+        experiment, reducers, paths, lanes: as for :class:`LaneSimulator`.
+        interpret: run the kernel anywhere, slowly.
+
+    Attributes:
+        kernel: the compiled code; it takes the padded values of the lanes and :meth:`join_spans`, and returns the lanes'
+            metrics.
     """
 
     def __init__(
@@ -325,23 +382,27 @@ class DeviceSimulator(LaneSimulator):
         *,
         interpret: bool = False,
     ):
-        # here, as no processor needs it, and it takes a quarter of a second
+        # imported here, as no processor needs it, and it takes a quarter of a second
         from .pallas import LANES, Kernel
 
-        # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
+        # the shared part runs as a loop of scalars on a processor; a GPU would start a kernel for each of its steps
         with jax.default_device(host_device()):
             super().__init__(experiment, reducers, paths, lanes, LANES)
-        kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
-        self.kernel = kernel.compiled()
+        kernel = Kernel(
+            self._step, self._hooks, len(paths), self._padded_lanes, self._steps, self._block_length, interpret=interpret
+        )
+        self.kernel = kernel.compile()
 
-    def _march(self, given, stretches):
-        every = list(stretches)
-        return [np.asarray(figure) for figure in self.kernel(given, self.inputs(every))], every[-1].figures
+    def _simulate(self, values, spans):
+        all_spans = list(spans)
+        metrics = self.kernel(values, self.join_spans(all_spans))
+        return [np.asarray(metric) for metric in metrics], all_spans[-1].shared_metrics
 
     @staticmethod
-    def inputs(stretches: Iterable[SharedInputs]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-        """What the kernel reads of all stretches: each sample's, each block's, and the figures' own."""
-        every = list(stretches)
-        handed = [np.concatenate(column) for column in zip(*(one.handed.arrays for one in every), strict=True)]
-        last = [np.concatenate(column) for column in zip(*(one.last.arrays for one in every), strict=True)]
-        return handed, last, every[-1].ends or []
+    def join_spans(spans: Iterable[SharedInputs]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+        """Shared inputs of a whole run: of its samples, of its blocks, and of the metrics at the end."""
+        all_spans = list(spans)
+        samples = zip(*(inputs.sample_inputs.arrays for inputs in all_spans), strict=True)
+        blocks = zip(*(inputs.block_inputs.arrays for inputs in all_spans), strict=True)
+        sample_inputs, block_inputs = ([np.concatenate(column) for column in columns] for columns in (samples, blocks))
+        return sample_inputs, block_inputs, all_spans[-1].final_inputs or []

@@ -2,7 +2,7 @@
 
     d_{k+1} = A_k (d_k + K e_k) + w_k,   e_k = y_k - C d_k,
 
-with d the change of a state whose first numbers are read (C), y what is read in the first column (0 in all others), and w
+with d the change of a state whose first numbers are read (C), y the readings in the first column (0 in all others), and w
 what drives each column.
 """
 
@@ -15,116 +15,114 @@ import numpy as np
 
 from jaxbl.workers import map_in_threads
 
-from . import Unsupported, program_cache, raising_unsupported, warn_of_scan
+from . import program_cache
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
-_NOTHING = 1e-60
-"""What a change has shrunk to when nothing is left of it: added and taken away again, so that what decays becomes 0.
-Processors take many times as long for numbers below 1e-308, which squares are from 1e-154 on."""
+_NEGLIGIBLE = 1e-60
+"""Size below which a change counts as zero: it is added and taken away again, so that what decays becomes 0. Processors take
+many times as long for numbers below 1e-308, which squares are from 1e-154 on."""
 
 
 class LinearPredictor:
-    """The recursion for so many states, sides that are read, and columns."""
+    """The recursion above, for a number of states, of sides that are read, and of columns."""
 
     def __init__(self, states: int, sides: int, width: int):
         self.states, self.sides, self.width = states, sides, width
-        self.loop = _loop(states, sides)
+        self.loop = _compile_loop(states, sides)
         lanes = 1 if self.loop is None else self.loop.lanes
-        self.whole = -(-width // lanes) * lanes
+        self.padded_width = -(-width // lanes) * lanes
 
     @classmethod
     @lru_cache(maxsize=256)
     def of(cls, states: int, sides: int, width: int) -> "LinearPredictor":
+        """The predictor of these sizes, made once."""
         return cls(states, sides, width)
 
     def __call__(
         self,
         changes: Sequence[np.ndarray],
         gains: Sequence[np.ndarray],
-        step: np.ndarray,
-        known: np.ndarray,
+        transition: np.ndarray,
+        forcing: np.ndarray,
         readings: np.ndarray,
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Take columns along some samples, once for each gain.
 
         Args:
-            changes: where each begins, shape (states, columns).
+            changes: d at the first sample for each gain, shape (states, columns).
             gains: on position (1) and velocity (1/s) of each side, shape (sides, 2).
-            step: A, shape (samples, states, states).
-            known: w, shape (states, samples, columns).
+            transition: A, shape (samples, states, states).
+            forcing: w, shape (states, samples, columns).
             readings: y of the first column, shape (samples, sides).
 
         Returns:
-            Where each ends, and its errors e, shape (sides, samples, columns).
+            For each gain, d after the last sample, and the errors e, shape (sides, samples, columns).
         """
-        count, spare = len(step), self.whole - self.width
-        steps = np.ascontiguousarray(step.reshape(count, -1).T)
-        driven = np.pad(known, ((0, 0), (0, 0), (0, spare)))
-        read = np.zeros((self.sides, count, self.whole))
-        read[:, :, 0] = readings.T
+        count, padding = len(transition), self.padded_width - self.width
+        transition_columns = np.ascontiguousarray(transition.reshape(count, -1).T)
+        padded_forcing = np.pad(forcing, ((0, 0), (0, 0), (0, padding)))
+        padded_readings = np.zeros((self.sides, count, self.padded_width))
+        padded_readings[:, :, 0] = readings.T
 
-        def one(change: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            carry, errors = np.pad(change, ((0, 0), (0, spare))), np.empty((self.sides, count, self.whole))
+        def predict(change: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            carry = np.pad(change, ((0, 0), (0, padding)))
+            errors = np.empty((self.sides, count, self.padded_width))
             # positions first, then velocities
-            gains = [np.asarray(value, float) for value in np.ravel(np.transpose(gain))]
+            ordered = [np.asarray(number, float) for number in np.ravel(np.transpose(gain))]
             if self.loop is None:
-                _slowly(carry, gains, step, driven, read, errors)
+                _predict_slowly(carry, ordered, transition, padded_forcing, padded_readings, errors)
             else:
                 from .llvm import ArrayRows
 
-                given = carry, np.array(gains), steps, driven, read, errors
-                self.loop([ArrayRows(one) for one in given], count, 0, self.whole)
+                arrays = carry, np.array(ordered), transition_columns, padded_forcing, padded_readings, errors
+                self.loop([ArrayRows(array) for array in arrays], count, 0, self.padded_width)
             return carry[:, : self.width], errors[:, :, : self.width]
 
-        found = [one(changes[0], gains[0])] if len(gains) == 1 else map_in_threads(one, changes, gains)
-        return [change for change, _ in found], [errors for _, errors in found]
+        predictions = [predict(changes[0], gains[0])] if len(gains) == 1 else map_in_threads(predict, changes, gains)
+        return [change for change, _ in predictions], [errors for _, errors in predictions]
 
 
-def _sample(states: int, sides: int) -> Any:
-    """One sample of the recursion, by scalars."""
+def _sample_function(states: int, sides: int) -> Any:
+    """One sample of the recursion, as a function of scalars."""
 
-    def sample(change: list[Any], gains: list[Any], step: list[Any], known: list[Any], read: list[Any]) -> Any:
-        errors, seen = [read[i] - change[i] for i in range(sides)], list(change)
+    def sample(
+        change: list[Any], gains: list[Any], transition: list[Any], forcing: list[Any], readings: list[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        errors = [readings[i] - change[i] for i in range(sides)]
+        corrected = list(change)
         for i in range(2 * sides):
-            seen[i] = seen[i] + gains[i] * errors[i % sides]
-        new = list(known)
+            corrected[i] = corrected[i] + gains[i] * errors[i % sides]
+        new = list(forcing)
         for i in range(states):
             for k in range(states):
-                new[i] = new[i] + step[i * states + k] * seen[k]
-            new[i] = (new[i] + _NOTHING) - _NOTHING
+                new[i] = new[i] + transition[i * states + k] * corrected[k]
+            new[i] = (new[i] + _NEGLIGIBLE) - _NEGLIGIBLE
         return new, errors
 
     return sample
 
 
 @lru_cache(maxsize=64)
-def _loop(states: int, sides: int) -> Any:
-    key = program_cache.program_key("recursion", states, sides)
-    if (found := program_cache.load(key)) is not None:
-        return found
-    try:
-        with raising_unsupported():
-            from .jaxprs import trace
-            from .llvm import Loop
-
-            sizes = states, 2 * sides, states * states, states, sides
-            with jax.enable_x64(True):
-                body = trace(_sample(states, sides), *([_NUMBER] * size for size in sizes))
-            loop = Loop(body, np.dtype(float), carry=states, fixed=2 * sides, beside=states + sides)
-            program_cache.save(key, loop)
-            return loop
-    except Unsupported as why:
-        warn_of_scan(str(why))
-        return None
+def _compile_loop(states: int, sides: int) -> Any:
+    """The recursion as a compiled loop; None if it is not supported."""
+    key = program_cache.program_key("linear predictor", states, sides)
+    examples = [[_NUMBER] * size for size in (states, 2 * sides, states * states, states, sides)]
+    options = {"carry": states, "constants": 2 * sides, "lane_inputs": states + sides}
+    return program_cache.load_or_compile_loop(key, lambda: (_sample_function(states, sides), examples, options))
 
 
-def _slowly(
-    change: np.ndarray, gains: Sequence[Any], step: np.ndarray, known: np.ndarray, read: np.ndarray, errors: np.ndarray
+def _predict_slowly(
+    change: np.ndarray,
+    gains: Sequence[Any],
+    transition: np.ndarray,
+    forcing: np.ndarray,
+    readings: np.ndarray,
+    errors: np.ndarray,
 ) -> None:
-    """As the loop, which overwrites the change and the errors."""
-    sample = _sample(len(change), len(read))
-    for i in range(len(step)):
+    """The recursion in Python; like the loop, it overwrites the change and the errors."""
+    sample = _sample_function(len(change), len(readings))
+    for i in range(len(transition)):
         new, errors[:, i] = sample(
-            list(change.copy()), list(gains), list(step[i].ravel()), list(known[:, i]), list(read[:, i])
+            list(change.copy()), list(gains), list(transition[i].ravel()), list(forcing[:, i]), list(readings[:, i])
         )
         change[:] = new

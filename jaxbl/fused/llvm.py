@@ -18,10 +18,19 @@ from llvmlite import binding, ir
 from . import Unsupported
 from .dependence import LoopHooks
 from .elementary import FUNCTIONS
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, callee, equation_parameter, scan_parameters, trace_scalar_function
+from .jaxprs import (
+    ClosedJaxpr,
+    JaxprEqn,
+    Literal,
+    Var,
+    callee,
+    equation_parameter,
+    scan_parameters,
+    trace_scalar_function,
+)
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
-_KINDS = {
+_MEMORY_TYPES = {
     "float32": ir.FloatType(),
     "float64": ir.DoubleType(),
     "int32": ir.IntType(32),
@@ -29,9 +38,9 @@ _KINDS = {
     "int64": ir.IntType(64),
     "bool": ir.IntType(8),
 }
-"""How numbers lie in memory."""
-_NUMBERS = 7
-"""That a loop is given beside its arrays."""
+"""Types of numbers in memory."""
+_SCALAR_ARGUMENTS = 7
+"""Integers that the code takes beside the table of its arrays."""
 Vector = Any
 """A value of LLVM (which has no types that a checker could use): a number in all lanes, or an index."""
 _FLAGS = ("contract",)
@@ -40,14 +49,14 @@ _BOOL = np.dtype(bool)
 
 
 def _dtype(v: Any) -> np.dtype:
-    """Of a variable or literal of a jaxpr."""
-    if str(v.aval.dtype) not in _KINDS:
+    """The type of a variable or literal of a jaxpr."""
+    if str(v.aval.dtype) not in _MEMORY_TYPES:
         raise Unsupported(f"numbers of type {v.aval.dtype}")
     return np.dtype(v.aval.dtype)
 
 
-def _machine() -> Any:
-    """The machine at hand; a new one each time, as an engine owns its own."""
+def _target_machine() -> Any:
+    """The machine at hand; a new object each time, as an engine owns its own."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     features = binding.get_host_cpu_features()
@@ -67,18 +76,23 @@ def vector_lanes(dtype: np.dtype) -> int:
 
 
 class ArraySpec(NamedTuple):
-    """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
-    it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
-    lane; "marks": for each block of each lane. So many, from this one on, are of one type and hold as many."""
+    """An array that a loop reads or writes in place.
+
+    Attributes:
+        name: its group, and its place in the group (`sample input 2`).
+        dtype: type of its numbers.
+        extent: what it has a number for: "lanes", "samples", "blocks", "samples and lanes", "blocks and lanes"; or "scalar".
+        alike: number of arrays, from this one on, of the same type and extent.
+    """
 
     name: str
     dtype: np.dtype
-    holds: str
+    extent: str
     alike: int
 
     def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
-        """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
-        count = counts[self.holds]
+        """Raise `ValueError` for an array of wrong type or length, or with gaps; `counts` are numbers by extent."""
+        count = counts[self.extent]
         if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
             wrong = f"not {array.size} of {array.dtype}"
             raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
@@ -86,48 +100,53 @@ class ArraySpec(NamedTuple):
 
 def loop_signature(
     body: ClosedJaxpr,
-    after: ClosedJaxpr | None,
+    after_block: ClosedJaxpr | None,
     finish: ClosedJaxpr | None,
     values: int,
     carry: int,
-    fixed: int,
-    beside: int = 0,
+    constants: int,
+    lane_inputs: int = 0,
 ) -> list[ArraySpec]:
-    """The arrays of a loop in their order; arguments as of :class:`Loop` and :class:`LoopHooks`."""
-    own, read = values + carry, body.jaxpr.invars
+    """The arrays of a loop in their order; arguments as for :class:`Loop` and :class:`LoopHooks`."""
+    carry_end, read = values + carry, body.jaxpr.invars
+    inputs_start, inputs_end = carry_end + constants, len(read) - lane_inputs
     groups: list[tuple[str, str, Sequence[Any]]] = [
         ("value", "lanes", read[:values]),
-        ("carry", "lanes", read[values:own]),
-        ("fixed number", "one", read[own : own + fixed]),
-        ("input", "samples", read[own + fixed : len(read) - beside]),
-        ("lane's input", "both", read[len(read) - beside :]),
-        ("input of a block", "blocks", after.jaxpr.invars[own:] if after else []),
-        ("input at the end", "one", finish.jaxpr.invars[own:] if finish else []),
-        ("kept number", "both", body.jaxpr.outvars[carry:]),
-        ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
+        ("carry", "lanes", read[values:carry_end]),
+        ("constant", "scalar", read[carry_end:inputs_start]),
+        ("sample input", "samples", read[inputs_start:inputs_end]),
+        ("lane's sample input", "samples and lanes", read[inputs_end:]),
+        ("block input", "blocks", after_block.jaxpr.invars[carry_end:] if after_block else []),
+        ("final input", "scalar", finish.jaxpr.invars[carry_end:] if finish else []),
+        ("sample output", "samples and lanes", body.jaxpr.outvars[carry:]),
+        ("block flag", "blocks and lanes", after_block.jaxpr.outvars[carry:] if after_block else []),
         ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    found: list[ArraySpec] = []
-    every = [(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
-    for one in reversed(every):
-        found.append(ArraySpec(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
-    return found[::-1]
+    arrays = [(f"{name} {i}", _dtype(v), extent) for name, extent, variables in groups for i, v in enumerate(variables)]
+    specs: list[ArraySpec] = []
+    for name, dtype, extent in reversed(arrays):
+        is_like_next = specs and specs[-1].dtype == dtype and specs[-1].extent == extent
+        specs.append(ArraySpec(name, dtype, extent, 1 + specs[-1].alike if is_like_next else 1))
+    return specs[::-1]
 
 
 class Loop:
-    """A compiled loop over samples, and what is done around it.
+    """A compiled loop over samples, and what runs around it.
 
     Args:
-        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs, the last of them of this
-            lane alone -> carry, and what is kept.
-        dtype: of the lanes' numbers.
-        values, carry, fixed, beside: how many differ from lane to lane, a lane carries, all lanes read unchanged in a call,
-            and a lane alone reads at each sample.
-        around: left out, nothing; or `after` alone, what follows each block.
+        body: jaxpr of one sample, scalars of one lane: values, carry, constants, inputs of the sample, and inputs of the
+            sample for this lane alone -> carry, and outputs of the sample.
+        dtype: type of the lanes' numbers.
+        values: how many numbers differ from lane to lane.
+        carry: how many numbers a lane carries from sample to sample.
+        constants: how many numbers all lanes read unchanged in a call.
+        lane_inputs: how many inputs of a sample each lane has for itself.
+        hooks: what runs before, between and after the blocks; left out, nothing.
+        after_block: what follows each block, where there are no `hooks`.
         lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
-        Unsupported: an operation of theirs is unknown here.
+        Unsupported: an operation of these functions is unknown here.
     """
 
     def __init__(
@@ -137,30 +156,30 @@ class Loop:
         *,
         values: int = 0,
         carry: int = 0,
-        fixed: int = 0,
-        beside: int = 0,
-        around: LoopHooks | None = None,
-        after: ClosedJaxpr | None = None,
+        constants: int = 0,
+        lane_inputs: int = 0,
+        hooks: LoopHooks | None = None,
+        after_block: ClosedJaxpr | None = None,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        after = around.after if around else after
-        self.signature = loop_signature(body, after, around and around.finish, values, carry, fixed, beside)
+        after_block = hooks.after_block if hooks else after_block
+        self.signature = loop_signature(body, after_block, hooks and hooks.finish, values, carry, constants, lane_inputs)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, around, after, self.signature)
+        _LoopWriter(module, self.lanes).write_loop(body, hooks, after_block, self.signature)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
-        passes = binding.create_pass_builder(_machine(), options)
+        passes = binding.create_pass_builder(_target_machine(), options)
         passes.getModulePassManager().run(parsed, passes)
-        self._load(_machine().emit_object(parsed))
+        self._load(_target_machine().emit_object(parsed))
 
     def _load(self, code: bytes) -> None:
         self._code = code
-        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target_machine())
         self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         address = self._engine.get_function_address("loop")
-        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * _NUMBERS)(address)
+        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * _SCALAR_ARGUMENTS)(address)
 
     def __getstate__(self) -> tuple[int, list[ArraySpec], bytes]:
         return self.lanes, self.signature, self._code
@@ -172,371 +191,410 @@ class Loop:
     def __call__(
         self,
         arrays: "LoopArrays | ArrayGroups",
-        steps: int,
-        first: int,
-        last: int,
+        end: int,
+        first_lane: int,
+        end_lane: int,
         *,
         start: int = 0,
-        block: int | None = None,
+        block_length: int | None = None,
         begins: bool = False,
         ends: bool = False,
     ) -> None:
-        """Take lanes from `first` up to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
+        """Take lanes through samples; the carry's arrays are overwritten.
 
-        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in
-        blocks of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to
-        `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place.
-        `ValueError` for arrays that do not fit the signature.
+        Args:
+            arrays: in the order of the signature. Outputs are `(samples, lanes)` and flags `(blocks, lanes)`, with as many
+                lanes as run.
+            end: the sample before which the loop ends.
+            first_lane, end_lane: the lanes from the first up to the end, multiples of `lanes`.
+            start: the first sample, with which a block must begin.
+            block_length: samples of a block; left out, all samples are one block.
+            begins: the run begins here: the carry is made, not read.
+            ends: the run ends here: results are written, not the carry.
+
+        Raises:
+            ValueError: arrays do not fit the signature, or no block begins at `start`.
         """
-        given = arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, steps, last, block)
-        if steps > given.steps or last > given.lanes:
-            raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
-        if start % given.block:
-            raise ValueError(f"no block of {given.block} samples begins at {start}")
-        self._call(given.table, start, steps, given.block, first, last, begins, ends)
+        fitted = (
+            arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, end, end_lane, block_length)
+        )
+        if end > fitted.steps or end_lane > fitted.lanes:
+            made_for = f"arrays were made for {fitted.steps} and {fitted.lanes}"
+            raise ValueError(f"{end} samples of lanes up to {end_lane}: {made_for}")
+        if start % fitted.block_length:
+            raise ValueError(f"no block of {fitted.block_length} samples begins at {start}")
+        self._call(fitted.table, start, end, fitted.block_length, first_lane, end_lane, begins, ends)
 
 
 class ArrayRows(NamedTuple):
-    """In the place of several arrays for a loop: the rows of one, which lie one behind the other."""
+    """The rows of an array, in place of as many arrays of a loop; they lie one behind the other."""
 
     array: np.ndarray
 
 
 class AddressedArrays:
-    """In the place of several arrays for a loop: these, and where they lie, which takes NumPy long to say."""
+    """Several arrays of a loop together with their addresses, which NumPy takes long to find."""
 
     def __init__(self, arrays: Sequence[np.ndarray]):
-        self.arrays, self.addresses = arrays, [_address(one) for one in arrays]
+        self.arrays, self.addresses = arrays, [_address(array) for array in arrays]
 
 
 ArrayGroups = Sequence[np.ndarray | ArrayRows | AddressedArrays]
 
 
 class LoopArrays:
-    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so
-    many, and lanes."""
+    """Arrays that were checked against a loop's signature, for a number of samples and lanes and a length of block."""
 
     def __init__(
-        self, signature: Sequence[ArraySpec], arrays: ArrayGroups, steps: int, lanes: int, block: int | None = None
+        self,
+        signature: Sequence[ArraySpec],
+        groups: ArrayGroups,
+        steps: int,
+        lanes: int,
+        block_length: int | None = None,
     ):
-        self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
-        blocks = -(-steps // self.block)
+        self.steps, self.lanes, self.block_length = steps, lanes, block_length or max(steps, 1)
+        blocks = -(-steps // self.block_length)
         counts = {
-            "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
+            "scalar": 1, "lanes": lanes, "samples": steps, "blocks": blocks,
+            "samples and lanes": steps * lanes, "blocks and lanes": blocks * lanes,
         }  # fmt: skip
-        count = sum(_count(one) for one in arrays)
+        count = sum(_array_count(group) for group in groups)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
         addresses: list[int] = []
-        for one in arrays:
-            each = signature[len(addresses) : len(addresses) + _count(one)]
-            if isinstance(one, AddressedArrays):
-                for argument, own in zip(each, one.arrays, strict=True):
-                    argument.check(own, counts)
-                addresses += one.addresses
-            elif not isinstance(one, ArrayRows):
-                each[0].check(one, counts)
-                addresses.append(_address(one))
-            elif each:
-                each[0].check(one.array[:1], counts)
-                if each[0].alike < len(each) or not one.array.flags.c_contiguous:
-                    odd = each[each[0].alike] if each[0].alike < len(each) else each[0]
-                    raise ValueError(f"{odd.name} of a loop is no row of one array")
-                begin, stride = _address(one.array), one.array.strides[0]
-                addresses += range(begin, begin + len(each) * stride, stride)
+        for group in groups:
+            specs = signature[len(addresses) : len(addresses) + _array_count(group)]
+            if isinstance(group, AddressedArrays):
+                for spec, member in zip(specs, group.arrays, strict=True):
+                    spec.check(member, counts)
+                addresses += group.addresses
+            elif not isinstance(group, ArrayRows):
+                specs[0].check(group, counts)
+                addresses.append(_address(group))
+            elif specs:
+                specs[0].check(group.array[:1], counts)
+                if specs[0].alike < len(specs) or not group.array.flags.c_contiguous:
+                    unlike = specs[specs[0].alike] if specs[0].alike < len(specs) else specs[0]
+                    raise ValueError(f"{unlike.name} of a loop is no row of one array")
+                address, stride = _address(group.array), group.array.strides[0]
+                addresses += range(address, address + len(specs) * stride, stride)
         # an array of ctypes takes twenty times as long to make
-        self._kept, self._table = list(arrays), array("Q", addresses)
+        self._groups, self._table = list(groups), array("Q", addresses)
         self.table = self._table.buffer_info()[0]
 
 
-def _count(one: np.ndarray | ArrayRows | AddressedArrays) -> int:
-    return len(one.array) if isinstance(one, ArrayRows) else len(one.arrays) if isinstance(one, AddressedArrays) else 1
+def _array_count(group: np.ndarray | ArrayRows | AddressedArrays) -> int:
+    if isinstance(group, ArrayRows):
+        return len(group.array)
+    return len(group.arrays) if isinstance(group, AddressedArrays) else 1
 
 
-def _address(one: np.ndarray) -> int:
-    return one.__array_interface__["data"][0]
+def _address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
 
 
-class _Writer:
-    """Writes jaxprs as LLVM assembly, every number a vector of lanes."""
+class _LoopWriter:
+    """Writes jaxprs as LLVM assembly; every number is a vector of lanes."""
 
     def __init__(self, module: ir.Module, lanes: int):
         self.module, self.lanes = module, lanes
-        self.constant: set[Vector] = set()
-        """Those that do not change in the loop over time."""
+        self.invariants: set[Vector] = set()
+        """Vectors that do not change in the loop over time."""
 
-    def loop(
-        self, body: ClosedJaxpr, around: LoopHooks | None, after: ClosedJaxpr | None, signature: Sequence[ArraySpec]
+    def write_loop(
+        self,
+        body: ClosedJaxpr,
+        hooks: LoopHooks | None,
+        after_block: ClosedJaxpr | None,
+        signature: Sequence[ArraySpec],
     ) -> None:
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _NUMBERS]), "loop")
+        function_type = ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _SCALAR_ARGUMENTS])
+        function = ir.Function(self.module, function_type, "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
         function.attributes.add("nounwind")  # without another one it is not written
-        table, start, steps, length, first, last, begins, ends = function.args
+        table, start, steps, block_length, first_lane, end_lane, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
-        group: defaultdict[str, list[int]] = defaultdict(list)
-        for i, one in enumerate(signature):
-            group[one.name.rpartition(" ")[0]].append(i)
-        own, carry = [*group["value"], *group["carry"]], len(group["carry"])
-        dtypes = [one.dtype for one in signature]
-        kinds = [_KINDS[str(dtype)] for dtype in dtypes]
-        if any(not jnp.issubdtype(dtypes[i], jnp.floating) for i in own):
+        places: defaultdict[str, list[int]] = defaultdict(list)
+        for i, spec in enumerate(signature):
+            places[spec.name.rpartition(" ")[0]].append(i)
+        carry_count = len(places["carry"])
+        dtypes = [spec.dtype for spec in signature]
+        types = [_MEMORY_TYPES[str(dtype)] for dtype in dtypes]
+        if any(not jnp.issubdtype(dtypes[i], jnp.floating) for i in (*places["value"], *places["carry"])):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
         arrays = [build.load(build.gep(table, [_INT(i)], source_etype=_POINTER), typ=_POINTER) for i in range(len(dtypes))]
 
-        def scalar(i: int, at: Vector) -> Vector:
+        def broadcast(i: int, index: Vector) -> Vector:
             """Element of an array in all lanes."""
-            value = build.load(build.gep(arrays[i], [at], source_etype=kinds[i]), typ=kinds[i])
+            number = build.load(build.gep(arrays[i], [index], source_etype=types[i]), typ=types[i])
             if dtypes[i] == _BOOL:
-                value = build.trunc(value, _BIT)
-            nothing = ir.Constant(self.vector(value.type), ir.Undefined)
-            one = build.insert_element(nothing, value, ir.IntType(32)(0))
-            return build.shuffle_vector(one, nothing, ir.Constant(self.vector(ir.IntType(32)), None))
+                number = build.trunc(number, _BIT)
+            undefined = ir.Constant(self.vector_type(number.type), ir.Undefined)
+            first = build.insert_element(undefined, number, ir.IntType(32)(0))
+            return build.shuffle_vector(first, undefined, ir.Constant(self.vector_type(ir.IntType(32)), None))
 
-        steady = [scalar(i, _INT(0)) for i in group["fixed number"]]
-        at_end = [scalar(i, _INT(0)) for i in group["input at the end"]]
-        width = build.sub(last, first)
+        constants = [broadcast(i, _INT(0)) for i in places["constant"]]
+        final_inputs = [broadcast(i, _INT(0)) for i in places["final input"]]
+        width = build.sub(end_lane, first_lane)
 
-        def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
-            def read(name: str, place: Vector = lane) -> list[Vector]:
-                places = {i: build.gep(arrays[i], [place], source_etype=kinds[i]) for i in group[name]}
-                return [build.load(at, align=dtypes[i].itemsize, typ=self.vector(kinds[i])) for i, at in places.items()]
+        def write_lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
+            def read(name: str, index: Vector = lane) -> list[Vector]:
+                addresses = {i: build.gep(arrays[i], [index], source_etype=types[i]) for i in places[name]}
+                return [
+                    build.load(address, align=dtypes[i].itemsize, typ=self.vector_type(types[i]))
+                    for i, address in addresses.items()
+                ]
 
-            def write(name: str, values: Sequence[Vector], at: Vector) -> list[Vector]:
-                for i, value in zip(group[name], values, strict=True):
-                    value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
-                    build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=dtypes[i].itemsize)
+            def write(name: str, vectors: Sequence[Vector], index: Vector) -> list[Vector]:
+                for i, vector in zip(places[name], vectors, strict=True):
+                    vector = build.zext(vector, self.vector_type(types[i])) if dtypes[i] == _BOOL else vector
+                    build.store(vector, build.gep(arrays[i], [index], source_etype=types[i]), align=dtypes[i].itemsize)
                 return []
 
-            numbers = read("value")
-            self.constant = {*numbers, *steady}
+            values = read("value")
+            self.invariants = {*values, *constants}
 
-            def sample(index: Vector, state: list[Vector]) -> list[Vector]:
-                place = build.add(build.mul(index, width), build.sub(lane, first))
-                own = read("lane's input", place)
-                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in group["input"]), *own])
-                write("kept number", found[carry:], place)
-                return found[:carry]
+            def write_sample(sample: Vector, carry: list[Vector]) -> list[Vector]:
+                index = build.add(build.mul(sample, width), build.sub(lane, first_lane))
+                lane_inputs = read("lane's sample input", index)
+                inputs = (broadcast(i, sample) for i in places["sample input"])
+                results = self.write_jaxpr(body, [*values, *carry, *constants, *inputs, *lane_inputs])
+                write("sample output", results[carry_count:], index)
+                return results[:carry_count]
 
-            if after is None:
-                return write("carry", self.count(start, steps, read("carry"), sample), lane)
+            if after_block is None:
+                return write("carry", self.write_for(start, steps, read("carry"), write_sample), lane)
 
-            def block(begin: Vector, state: list[Vector]) -> list[Vector]:
-                end = build.add(begin, length)
-                state = self.count(begin, build.select(build.icmp_signed("<", end, steps), end, steps), state, sample)
-                number = build.sdiv(begin, length)
-                found = self.run(after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
-                write("mark of a block", found[carry:], build.add(build.mul(number, width), build.sub(lane, first)))
-                return found[:carry]
+            def write_block(block_start: Vector, carry: list[Vector]) -> list[Vector]:
+                block_end = build.add(block_start, block_length)
+                last = build.select(build.icmp_signed("<", block_end, steps), block_end, steps)
+                carry = self.write_for(block_start, last, carry, write_sample)
+                block = build.sdiv(block_start, block_length)
+                inputs = (broadcast(i, block) for i in places["block input"])
+                results = self.write_jaxpr(after_block, [*values, *carry, *inputs])
+                index = build.add(build.mul(block, width), build.sub(lane, first_lane))
+                write("block flag", results[carry_count:], index)
+                return results[:carry_count]
 
-            if around is None:
-                return write("carry", self.count(start, steps, read("carry"), block, by=length), lane)
-            before, finish = around.before, around.finish
-            state = self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
-            state = self.count(start, steps, state, block, by=length)
-            return self.either(
+            if hooks is None:
+                return write("carry", self.write_for(start, steps, read("carry"), write_block, by=block_length), lane)
+            start_jaxpr, finish = hooks.start, hooks.finish
+            carry = self.write_if(begins, lambda: self.write_jaxpr(start_jaxpr, values), lambda: read("carry"))
+            carry = self.write_for(start, steps, carry, write_block, by=block_length)
+            return self.write_if(
                 ends,
-                lambda: write("result", self.run(finish, [*numbers, *state, *at_end]), lane),
-                lambda: write("carry", state, lane),
+                lambda: write("result", self.write_jaxpr(finish, [*values, *carry, *final_inputs]), lane),
+                lambda: write("carry", carry, lane),
             )
 
-        self.count(first, last, [], lanes, by=self.lanes)
+        self.write_for(first_lane, end_lane, [], write_lanes, by=self.lanes)
         build.ret_void()
 
-    def either(self, which: Vector, yes: Callable[[], list[Vector]], no: Callable[[], list[Vector]]) -> list[Vector]:
-        """yes() if which else no()."""
+    def write_if(self, condition: Vector, yes: Callable[[], list[Vector]], no: Callable[[], list[Vector]]) -> list[Vector]:
+        """yes() if condition else no()."""
         build = self.build
         *cases, behind = (build.append_basic_block(name) for name in ("yes", "no", "behind"))
-        build.cbranch(build.icmp_signed("!=", which, _INT(0)), *cases)
-        ways = []
-        for block, case in zip(cases, (yes, no), strict=True):
+        build.cbranch(build.icmp_signed("!=", condition, _INT(0)), *cases)
+        branches = []
+        for block, write_case in zip(cases, (yes, no), strict=True):
             build.position_at_end(block)
-            ways.append((case(), build.block))
+            branches.append((write_case(), build.block))
             build.branch(behind)
         build.position_at_end(behind)
         merged = []
-        for column in zip(*(found for found, _ in ways), strict=True):
+        for column in zip(*(vectors for vectors, _ in branches), strict=True):
             phi = build.phi(column[0].type)
-            for value, (_, block) in zip(column, ways, strict=True):
-                phi.add_incoming(value, block)
+            for vector, (_, block) in zip(column, branches, strict=True):
+                phi.add_incoming(vector, block)
             merged.append(phi)
         return merged
 
-    def count(
+    def write_for(
         self,
         first: Vector,
-        last: Vector,
+        end: Vector,
         state: list[Vector],
         body: Callable[[Vector, list[Vector]], list[Vector]],
         by: Vector = 1,
     ) -> list[Vector]:
-        """for index in range(first, last, by): state = body(index, state)."""
+        """for index in range(first, end, by): state = body(index, state)."""
         build = self.build
         before = build.block
         head, inside, behind = (build.append_basic_block(name) for name in ("head", "body", "behind"))
         build.branch(head)
         build.position_at_end(head)
-        index, *carried = (build.phi(value.type) for value in (first, *state))
-        for phi, value in zip((index, *carried), (first, *state), strict=True):
-            phi.add_incoming(value, before)
-        build.cbranch(build.icmp_signed("<", index, last), inside, behind)
+        index, *carried = (build.phi(vector.type) for vector in (first, *state))
+        for phi, vector in zip((index, *carried), (first, *state), strict=True):
+            phi.add_incoming(vector, before)
+        build.cbranch(build.icmp_signed("<", index, end), inside, behind)
         build.position_at_end(inside)
         new = body(index, list(carried))
         new = [build.add(index, _INT(by) if isinstance(by, int) else by), *new]
-        for phi, value in zip((index, *carried), new, strict=True):
-            phi.add_incoming(value, build.block)
+        for phi, vector in zip((index, *carried), new, strict=True):
+            phi.add_incoming(vector, build.block)
         build.branch(head)
         build.position_at_end(behind)
         return carried
 
-    def run(self, closed: ClosedJaxpr, arguments: Sequence[Vector]) -> list[Vector]:
-        """The equations of a jaxpr of scalars."""
+    def write_jaxpr(self, closed: ClosedJaxpr, arguments: Sequence[Vector]) -> list[Vector]:
+        """Write the equations of a jaxpr of scalars; returns its results."""
         jaxpr = closed.jaxpr
         env: dict[Var, Vector] = dict(zip(jaxpr.invars, arguments, strict=True))
         if any(v.aval.shape for v in jaxpr.constvars):
             raise Unsupported("steps that read tables")
-        env |= {v: self.number(value, _dtype(v)) for v, value in zip(jaxpr.constvars, closed.consts, strict=True)}
+        env |= {v: self.literal(number, _dtype(v)) for v, number in zip(jaxpr.constvars, closed.consts, strict=True)}
 
         def read(v: Var | Literal) -> Vector:
-            return self.number(v.val, _dtype(v)) if isinstance(v, Literal) else env[v]
+            return self.literal(v.val, _dtype(v)) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
-            made: list[Any] = eqn.outvars
-            if any(v.aval.shape for v in made):
-                raise Unsupported(f"{eqn.primitive.name} of shape {made[0].aval.shape}")
-            given = [read(v) for v in eqn.invars]
-            results = self.equation(eqn, given)
-            if all(self.is_constant(value) for value in given):
-                self.constant |= set(results)
-            env |= dict(zip(made, results, strict=True))
+            out: list[Any] = eqn.outvars
+            if any(v.aval.shape for v in out):
+                raise Unsupported(f"{eqn.primitive.name} of shape {out[0].aval.shape}")
+            operands = [read(v) for v in eqn.invars]
+            results = self.write_equation(eqn, operands)
+            if all(self.is_invariant(operand) for operand in operands):
+                self.invariants |= set(results)
+            env |= dict(zip(out, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
+    def write_equation(self, eqn: JaxprEqn, operands: list[Vector]) -> list[Vector]:
         name = eqn.primitive.name
         if name == "scan":
             # a loop of fixed length that carries a state: the substeps of a plant
-            length, inner, fixed = scan_parameters(eqn)
-            still, state = given[:fixed], given[fixed:]
-            return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*still, *state]))
+            length, body, constant_count = scan_parameters(eqn)
+            constants, state = operands[:constant_count], operands[constant_count:]
+            return self.write_for(
+                _INT(0), _INT(length), state, lambda _, state: self.write_jaxpr(body, [*constants, *state])
+            )
         if (called := callee(eqn)) is not None:
-            return self.run(called, given)
+            return self.write_jaxpr(called, operands)
         dtype = _dtype(eqn.invars[0])
-        if name in FUNCTIONS and jnp.issubdtype(dtype, jnp.floating):
-            return self.run(trace_scalar_function(FUNCTIONS[name], dtype), given)
-        rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
+        is_float = jnp.issubdtype(dtype, jnp.floating)
+        if name in FUNCTIONS and is_float:
+            return self.write_jaxpr(trace_scalar_function(FUNCTIONS[name], dtype), operands)
+        rule = (_FLOAT_RULES if is_float else _INTEGER_RULES).get(name) or _COMMON_RULES.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")
-        return [rule(self, eqn, *given)]
+        return [rule(self, eqn, *operands)]
 
-    def vector(self, kind: ir.Type) -> ir.VectorType:
-        return ir.VectorType(kind, self.lanes)
+    def vector_type(self, element: ir.Type) -> ir.VectorType:
+        return ir.VectorType(element, self.lanes)
 
-    def number(self, value: Any, dtype: np.dtype) -> Vector:
-        """A literal in all lanes."""
-        kind = _BIT if dtype == _BOOL else _KINDS[str(dtype)]
-        plain = np.asarray(value, dtype).item()
-        return ir.Constant(self.vector(kind), [ir.Constant(kind, plain)] * self.lanes)
+    def literal(self, number: Any, dtype: np.dtype) -> Vector:
+        """A number of a type in all lanes."""
+        element = _BIT if dtype == _BOOL else _MEMORY_TYPES[str(dtype)]
+        python_number = np.asarray(number, dtype).item()
+        return ir.Constant(self.vector_type(element), [ir.Constant(element, python_number)] * self.lanes)
 
-    def like(self, vector: Vector, value: float) -> Vector:
-        """A number of a vector's type."""
-        return ir.Constant(vector.type, [ir.Constant(vector.type.element, value)] * self.lanes)
+    def literal_like(self, vector: Vector, number: float) -> Vector:
+        """A number of a vector's type in all lanes."""
+        return ir.Constant(vector.type, [ir.Constant(vector.type.element, number)] * self.lanes)
 
-    def is_constant(self, value: Vector) -> bool:
-        return isinstance(value, ir.Constant) or value in self.constant
+    def is_invariant(self, vector: Vector) -> bool:
+        return isinstance(vector, ir.Constant) or vector in self.invariants
 
-    def intrinsic(self, name: str, *given: Vector) -> Vector:
-        kind = given[0].type
-        declared = f"llvm.{name}.v{self.lanes}{'f32' if kind.element == ir.FloatType() else 'f64'}"
-        function = self.module.globals.get(declared)
+    def call_intrinsic(self, name: str, *operands: Vector) -> Vector:
+        vector_type = operands[0].type
+        full_name = f"llvm.{name}.v{self.lanes}{'f32' if vector_type.element == ir.FloatType() else 'f64'}"
+        function = self.module.globals.get(full_name)
         if function is None:
-            function = ir.Function(self.module, ir.FunctionType(kind, [kind] * len(given)), declared)
-        return self.build.call(function, given)
+            function = ir.Function(self.module, ir.FunctionType(vector_type, [vector_type] * len(operands)), full_name)
+        return self.build.call(function, operands)
 
 
-def _divide(w: _Writer, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
-    if w.is_constant(b) and not w.is_constant(a):
+def _divide(w: _LoopWriter, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
+    if w.is_invariant(b) and not w.is_invariant(a):
         # the reciprocal leaves the loop
-        return w.build.fmul(a, w.build.fdiv(w.like(b, 1.0), b), flags=_FLAGS)
+        return w.build.fmul(a, w.build.fdiv(w.literal_like(b, 1.0), b), flags=_FLAGS)
     return w.build.fdiv(a, b)
 
 
-def _sign(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    below = w.build.select(w.build.fcmp_ordered("<", a, w.like(a, 0.0)), w.like(a, -1.0), a)
-    return w.build.select(w.build.fcmp_ordered(">", a, w.like(a, 0.0)), w.like(a, 1.0), below)
+def _sign(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
+    below = w.build.select(w.build.fcmp_ordered("<", a, w.literal_like(a, 0.0)), w.literal_like(a, -1.0), a)
+    return w.build.select(w.build.fcmp_ordered(">", a, w.literal_like(a, 0.0)), w.literal_like(a, 1.0), below)
 
 
-def _extreme(order: str) -> Callable[..., Vector]:
+def _extremum_rule(order: str) -> Callable[..., Vector]:
     """The larger or smaller of two numbers, NaN if either is."""
 
-    def rule(w: _Writer, eqn: JaxprEqn | None, a: Vector, b: Vector) -> Vector:
-        chosen = w.build.select(w.build.fcmp_unordered(order, a, b), a, b)
-        return w.build.select(w.build.fcmp_unordered("uno", b, b), b, chosen)
+    def rule(w: _LoopWriter, eqn: JaxprEqn | None, a: Vector, b: Vector) -> Vector:
+        extremum = w.build.select(w.build.fcmp_unordered(order, a, b), a, b)
+        return w.build.select(w.build.fcmp_unordered("uno", b, b), b, extremum)
 
     return rule
 
 
-_LARGER, _SMALLER = _extreme(">"), _extreme("<")
+_MAXIMUM, _MINIMUM = _extremum_rule(">"), _extremum_rule("<")
 
 
-def _clamp(w: _Writer, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> Vector:
-    return _SMALLER(w, eqn, _LARGER(w, eqn, low, a), high)
+def _clamp(w: _LoopWriter, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> Vector:
+    return _MINIMUM(w, eqn, _MAXIMUM(w, eqn, low, a), high)
 
 
-def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    power = equation_parameter(eqn, "y")
-    if not 1 <= abs(power) <= 8:
-        raise Unsupported(f"integer_pow by {power}")
-    result = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(power))
-    return result if power > 0 else w.build.fdiv(w.like(a, 1.0), result)
+def _integer_power(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
+    exponent = equation_parameter(eqn, "y")
+    if not 1 <= abs(exponent) <= 8:
+        raise Unsupported(f"integer_pow by {exponent}")
+    power = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(exponent))
+    return power if exponent > 0 else w.build.fdiv(w.literal_like(a, 1.0), power)
 
 
-def _comparison(order: str) -> Callable[..., Vector]:
-    def rule(w: _Writer, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
+def _comparison_rule(order: str) -> Callable[..., Vector]:
+    def rule(w: _LoopWriter, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
         dtype = _dtype(eqn.invars[0])
         if jnp.issubdtype(dtype, jnp.floating):
             return (w.build.fcmp_unordered if order == "!=" else w.build.fcmp_ordered)(order, a, b)
-        signed = jnp.issubdtype(dtype, jnp.signedinteger)
-        return (w.build.icmp_signed if signed else w.build.icmp_unsigned)(order, a, b)
+        is_signed = jnp.issubdtype(dtype, jnp.signedinteger)
+        return (w.build.icmp_signed if is_signed else w.build.icmp_unsigned)(order, a, b)
 
     return rule
 
 
-def _select(w: _Writer, eqn: JaxprEqn, which: Vector, *cases: Vector) -> Vector:
-    if len(cases) != 2 or which.type.element != _BIT:
+def _select(w: _LoopWriter, eqn: JaxprEqn, condition: Vector, *cases: Vector) -> Vector:
+    if len(cases) != 2 or condition.type.element != _BIT:
         raise Unsupported("select_n among more than two")
-    return w.build.select(which, cases[1], cases[0])
+    return w.build.select(condition, cases[1], cases[0])
 
 
-def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
+def _convert(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
     old, new = _dtype(eqn.invars[0]), _dtype(eqn.outvars[0])
     if old == new:
         return a
     if new == _BOOL:
         raise Unsupported(f"conversion of {old} to bool")
-    target, wider = w.vector(_KINDS[str(new)]), old == _BOOL or new.itemsize > old.itemsize
-    signed = jnp.issubdtype(old, jnp.signedinteger)
-    was, becomes = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
-    if was and becomes:
-        return (w.build.fpext if wider else w.build.fptrunc)(a, target)
-    if was:
+    target, is_wider = w.vector_type(_MEMORY_TYPES[str(new)]), old == _BOOL or new.itemsize > old.itemsize
+    is_signed = jnp.issubdtype(old, jnp.signedinteger)
+    from_float, to_float = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
+    if from_float and to_float:
+        return (w.build.fpext if is_wider else w.build.fptrunc)(a, target)
+    if from_float:
         return (w.build.fptosi if jnp.issubdtype(new, jnp.signedinteger) else w.build.fptoui)(a, target)
-    if becomes:
-        return (w.build.sitofp if signed else w.build.uitofp)(a, target)
+    if to_float:
+        return (w.build.sitofp if is_signed else w.build.uitofp)(a, target)
     if a.type == target:
         return a
-    return (w.build.trunc if not wider else w.build.sext if signed else w.build.zext)(a, target)
+    return (w.build.trunc if not is_wider else w.build.sext if is_signed else w.build.zext)(a, target)
 
 
 def _instruction(name: str, **options: Any) -> Callable[..., Vector]:
-    return lambda w, eqn, *given: getattr(w.build, name)(*given, **options)
+    return lambda w, eqn, *operands: getattr(w.build, name)(*operands, **options)
 
 
 def _intrinsic(name: str) -> Callable[..., Vector]:
-    return lambda w, eqn, *given: w.intrinsic(name, *given)
+    return lambda w, eqn, *operands: w.call_intrinsic(name, *operands)
 
 
-_OF_FLOATS: dict[str, Callable[..., Vector]] = {
+def _one_minus_square(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
+    """1 - a², in JAX 0.11's derivatives of tanh."""
+    unit = w.literal_like(a, 1.0)
+    return w.build.fmul(w.build.fadd(unit, a), w.build.fsub(unit, a))
+
+
+_FLOAT_RULES: dict[str, Callable[..., Vector]] = {
     "add": _instruction("fadd", flags=_FLAGS),
     "add_any": _instruction("fadd", flags=_FLAGS),
     "sub": _instruction("fsub", flags=_FLAGS),
@@ -544,29 +602,30 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "div": _divide,
     "neg": _instruction("fneg"),
     "square": lambda w, eqn, a: w.build.fmul(a, a, flags=_FLAGS),
-    # JAX 0.11's, in derivatives of tanh
-    "one_minus_square": lambda w, eqn, a: w.build.fmul(w.build.fadd(w.like(a, 1.0), a), w.build.fsub(w.like(a, 1.0), a)),
-    "integer_pow": _power,
+    "one_minus_square": _one_minus_square,
+    "integer_pow": _integer_power,
     "abs": _intrinsic("fabs"),
     **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
     # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(equation_parameter(eqn, "rounding_method"))], a),
+    "round": lambda w, eqn, a: w.call_intrinsic(("round", "rint")[int(equation_parameter(eqn, "rounding_method"))], a),
     "sign": _sign,
-    "max": _LARGER,
-    "min": _SMALLER,
+    "max": _MAXIMUM,
+    "min": _MINIMUM,
     "clamp": _clamp,
-    "is_finite": lambda w, eqn, a: w.build.fcmp_ordered("<", w.intrinsic("fabs", a), w.like(a, float("inf"))),
+    "is_finite": lambda w, eqn, a: w.build.fcmp_ordered("<", w.call_intrinsic("fabs", a), w.literal_like(a, float("inf"))),
 }
-_OF_INTEGERS: dict[str, Callable[..., Vector]] = {
+_INTEGER_RULES: dict[str, Callable[..., Vector]] = {
     **{name: _instruction(name) for name in ("add", "sub", "mul", "xor")},
     **{name: _instruction(f"{name}_") for name in ("and", "or", "not")},
     "shift_left": _instruction("shl"),
     "shift_right_logical": _instruction("lshr"),
 }
-_OF_ALL: dict[str, Callable[..., Vector]] = {
-    **dict(zip(("gt", "lt", "ge", "le", "eq", "ne"), map(_comparison, (">", "<", ">=", "<=", "==", "!=")), strict=True)),
+_COMMON_RULES: dict[str, Callable[..., Vector]] = {
+    **dict(
+        zip(("gt", "lt", "ge", "le", "eq", "ne"), map(_comparison_rule, (">", "<", ">=", "<=", "==", "!=")), strict=True)
+    ),
     "select_n": _select,
     "convert_element_type": _convert,
-    "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector(_KINDS[str(_dtype(eqn.outvars[0]))])),
+    "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector_type(_MEMORY_TYPES[str(_dtype(eqn.outvars[0]))])),
     **dict.fromkeys(("copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze"), lambda w, eqn, a: a),
 }

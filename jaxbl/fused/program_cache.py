@@ -1,9 +1,9 @@
-"""Compiled programs on disk, found without tracing: by what a function is given, and by all that could change the code.
+"""Compiled programs on disk that are found without tracing.
 
 JAX keeps compiled code, too, but finds it by the traced program, and to trace one takes longer than it runs. Here the key is
 the structure of the arguments (classes, static numbers, shapes and types of arrays), the text of the whole package, the
-versions of what it stands on, and the processor. Programs that need classes of other
-packages, whose text is not known, are not kept.
+versions of the packages that it needs, and the processor. Programs that need classes of other packages, whose text is not
+known, are not stored.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,11 +24,16 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from jaxbl.workers import PROGRAMS_VARIABLE, make_private_folder
 
-_STANDS_ON = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
-_OLD = 30.0
+from . import Unsupported, raising_unsupported, warn_of_scan
+
+LoopDefinition = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]
+"""A function of one sample, examples of its arguments, and options of its :class:`jaxbl.fused.llvm.Loop`."""
+_DEPENDENCIES = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
+_UNUSED_DAYS = 30.0
 """Days after which programs of another version of the package are deleted, if nothing has used them."""
 
 
@@ -37,62 +42,65 @@ class UnknownArgument(Exception):
 
 
 def cache_folder() -> Path | None:
-    """The folder, if programs are kept: as :data:`PROGRAMS_VARIABLE` says. Whoever sets it must not change the package while
-    it runs, as tests do."""
+    """The folder for programs that :data:`PROGRAMS_VARIABLE` names; None if programs are not stored.
+
+    Whoever sets the variable must not change the package while it runs, as tests do.
+    """
     name = os.environ.get(PROGRAMS_VARIABLE)
-    return _folder(name) if name else None
+    return _make_folder(name) if name else None
 
 
 @functools.cache
-def _folder(name: str) -> Path | None:
-    own = Path(name) / _version()
+def _make_folder(name: str) -> Path | None:
+    """The folder of this version; None if others could write to it. Old versions are deleted."""
+    folder = Path(name) / _version_hash()
     # what is in them is run
-    if not (make_private_folder(own.parent) and make_private_folder(own)):
+    if not (make_private_folder(folder.parent) and make_private_folder(folder)):
         return None
     try:
-        os.utime(own)
-        for other in own.parent.iterdir():
-            if time.time() - other.stat().st_mtime > 86400.0 * _OLD:
+        os.utime(folder)
+        for other in folder.parent.iterdir():
+            if time.time() - other.stat().st_mtime > 86400.0 * _UNUSED_DAYS:
                 shutil.rmtree(other, ignore_errors=True)
     except OSError:
         return None
-    return own
+    return folder
 
 
 @functools.cache
-def _version() -> str:
-    """Hash of the package's text, of what it stands on, of the processor, and of JAX's flags."""
-    found = hashlib.sha256(sys.version.encode())
+def _version_hash() -> str:
+    """Hash of the package's text, of the packages that it needs, of the processor, and of JAX's flags."""
+    digest = hashlib.sha256(sys.version.encode())
     package = Path(__file__).parents[1]
     for file in sorted(package.rglob("*.py")):
-        found.update(str(file.relative_to(package)).encode() + file.read_bytes())
-    for name in _STANDS_ON:
+        digest.update(str(file.relative_to(package)).encode() + file.read_bytes())
+    for name in _DEPENDENCIES:
         with suppress(PackageNotFoundError):
-            found.update(f"{name} {version(name)}".encode())
-    flags = {name: value for name, value in os.environ.items() if name.startswith(("JAX_", "XLA_")) and "CACHE" not in name}
-    found.update(f"{platform.machine()} {jax.default_backend()} {sorted(flags.items())}".encode())
+            digest.update(f"{name} {version(name)}".encode())
+    flags = {name: flag for name, flag in os.environ.items() if name.startswith(("JAX_", "XLA_")) and "CACHE" not in name}
+    digest.update(f"{platform.machine()} {jax.default_backend()} {sorted(flags.items())}".encode())
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        found.update("".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model"))})).encode())
-    return found.hexdigest()[:16]
+        digest.update("".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model"))})).encode())
+    return digest.hexdigest()[:16]
 
 
-def program_key(what: str, *given: Any) -> str | None:
-    """Name of a program, `what` it is and what it is given; None where none are kept, or its arguments are unknown."""
-    return None if cache_folder() is None else hash_program(what, *given)
+def program_key(name: str, *arguments: Any) -> str | None:
+    """The key of a program with these arguments; None if programs are not stored, or an argument is unknown."""
+    return None if cache_folder() is None else hash_program(name, *arguments)
 
 
-def hash_program(what: str, *given: Any) -> str | None:
-    """As :func:`program_key`, whether programs are kept or not."""
+def hash_program(name: str, *arguments: Any) -> str | None:
+    """The same key, whether programs are stored or not."""
     try:
-        text = f"{what} {len(jax.local_devices())} {jax.config.read('jax_enable_x64')} {_described(given)}"
+        text = f"{name} {len(jax.local_devices())} {jax.config.read('jax_enable_x64')} {_describe(arguments)}"
     except UnknownArgument:
         return None
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def load(key: str | None) -> Any:
-    """What is kept under a name; None if nothing is, or it cannot be read."""
+    """Load the program of a key; None if there is none, or it cannot be read."""
     folder = cache_folder()
     if key is None or folder is None:
         return None
@@ -101,40 +109,58 @@ def load(key: str | None) -> Any:
     return None
 
 
-def save(key: str | None, value: Any) -> None:
-    """Keep a value that can be pickled; without a word where that is not possible."""
+def save(key: str | None, program: Any) -> None:
+    """Store what can be pickled under a key; without a message where that is not possible."""
     folder = cache_folder()
     if key is None or folder is None:
         return
-    with suppress(Exception):  # a full disk, a value that cannot be pickled: the program is made anew next time
-        new = folder / f"{key}.{os.getpid()}"
-        new.write_bytes(pickle.dumps(value))
-        new.replace(folder / key)
+    with suppress(Exception):  # a full disk, or no pickle: the program is made anew next time
+        draft = folder / f"{key}.{os.getpid()}"
+        draft.write_bytes(pickle.dumps(program))
+        draft.replace(folder / key)
 
 
-def _described(value: Any) -> str:
-    """A value as text: all of it but what arrays hold."""
-    if value is None or isinstance(value, bool | int | float | str | bytes):
-        return repr(value)
-    if eqx.is_array(value) or isinstance(value, jax.ShapeDtypeStruct):
-        return f"{value.dtype}{value.shape}{getattr(value, 'weak_type', False)}"
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key!r}:{_described(one)}" for key, one in sorted(value.items())) + "}"
-    if isinstance(value, FunctionType):
-        if value.__closure__ is not None:
-            raise UnknownArgument(value.__qualname__)
-        return _named(value)
-    if isinstance(value, tuple | list):
-        named = "" if type(value) in (tuple, list) else _named(type(value))
-        return f"{named}({','.join(map(_described, value))})"
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        each = (f"{field.name}={_described(getattr(value, field.name))}" for field in dataclasses.fields(value))
-        return f"{_named(type(value))}({','.join(each)})"
-    raise UnknownArgument(str(type(value)))
+def load_or_compile_loop(key: str | None, define: Callable[[], LoopDefinition]) -> Any:
+    """Load a loop of float64, or compile and store it; None, and a message, where that is not supported."""
+    if (loop := load(key)) is not None:
+        return loop
+    try:
+        with raising_unsupported(), jax.enable_x64(True):
+            from .jaxprs import trace
+            from .llvm import Loop
+
+            sample, examples, options = define()
+            loop = Loop(trace(sample, *examples), np.dtype(float), **options)
+            save(key, loop)
+            return loop
+    except Unsupported as reason:
+        warn_of_scan(str(reason))
+        return None
 
 
-def _named(thing: Any) -> str:
+def _describe(argument: Any) -> str:
+    """An argument as text, without the numbers in its arrays."""
+    if argument is None or isinstance(argument, bool | int | float | str | bytes):
+        return repr(argument)
+    if eqx.is_array(argument) or isinstance(argument, jax.ShapeDtypeStruct):
+        return f"{argument.dtype}{argument.shape}{getattr(argument, 'weak_type', False)}"
+    if isinstance(argument, Mapping):
+        return "{" + ",".join(f"{key!r}:{_describe(member)}" for key, member in sorted(argument.items())) + "}"
+    if isinstance(argument, FunctionType):
+        if argument.__closure__ is not None:
+            raise UnknownArgument(argument.__qualname__)
+        return _full_name(argument)
+    if isinstance(argument, tuple | list):
+        prefix = "" if type(argument) in (tuple, list) else _full_name(type(argument))
+        return f"{prefix}({','.join(map(_describe, argument))})"
+    if dataclasses.is_dataclass(argument) and not isinstance(argument, type):
+        fields = (f"{field.name}={_describe(getattr(argument, field.name))}" for field in dataclasses.fields(argument))
+        return f"{_full_name(type(argument))}({','.join(fields)})"
+    raise UnknownArgument(str(type(argument)))
+
+
+def _full_name(definition: Any) -> str:
     """Module and name of a class or function of this package."""
-    if thing.__module__.partition(".")[0] != __name__.partition(".")[0]:
-        raise UnknownArgument(f"{thing.__module__}.{thing.__qualname__}")
-    return f"{thing.__module__}.{thing.__qualname__}"
+    if definition.__module__.partition(".")[0] != __name__.partition(".")[0]:
+        raise UnknownArgument(f"{definition.__module__}.{definition.__qualname__}")
+    return f"{definition.__module__}.{definition.__qualname__}"

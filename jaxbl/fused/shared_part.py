@@ -1,4 +1,7 @@
-"""What lanes share, computed ahead of them: input, noise, and all of the plant where no lane differs in it."""
+"""The part of a run that all lanes share: input, noise, and the whole plant where no lane differs in it.
+
+It is computed ahead of the lanes, some blocks of samples (a span) at a time.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -14,108 +17,125 @@ from .llvm import Loop
 from .noise import LONGEST_SPAN, draw_noise
 
 SharedValues = tuple[list[Any], list[Any], list[Any]]
-"""Next state of what lanes share, what follows each block of a stretch of samples reads of it `(blocks,)`, and what each
-sample does `(samples,)`."""
+"""State of the shared part after a span, outputs of each block `(blocks,)`, and outputs of each sample `(samples,)`."""
+SharedPartRunner = Callable[[list[Any], int, int, int], SharedValues]
+"""Computes a span from the state before it, the seed, its first sample and its number of samples."""
 
 
 class SharedPart(NamedTuple):
-    """What lanes share: from its state and a sample to the next one and what lanes read; the same at the end of a block of
-    `length` of a run's `steps`. Samples are computed in stretches of whole blocks."""
+    """What all lanes share, as functions of its state.
 
-    inner: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
-    outer: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
+    Attributes:
+        step: state, index and noise of a sample -> state, outputs that lanes read at the sample.
+        end_block: state, () -> state, outputs that lanes read after the block.
+        state: shapes and types of the state's numbers.
+        sides: whose noise is drawn.
+        steps: samples of a run.
+        block_length: samples of a block.
+    """
+
+    step: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
+    end_block: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
     state: list[jax.ShapeDtypeStruct]
     sides: tuple[str, ...]
     steps: int
-    length: int
+    block_length: int
 
     @property
-    def stretch(self) -> int:
-        """Samples of a stretch, but the last one."""
-        return min(LONGEST_SPAN // self.length * self.length, self.steps)
+    def span_length(self) -> int:
+        """Samples of a span; the last one may be shorter."""
+        return min(LONGEST_SPAN // self.block_length * self.block_length, self.steps)
 
-    def given(self, seed: int, first: int, count: int) -> tuple[Any, Any]:
-        """Indices and noise of some samples."""
+    def sample_inputs(self, seed: int, first: int, count: int) -> tuple[Any, Any]:
+        """Indices and noise of samples, `(count,)` each."""
         noise = draw_noise(seed, first, count)
         return np.arange(first, first + count, dtype=np.int32), {side: noise[side] for side in self.sides}
 
-    def shapes(self, *length: int) -> tuple[Any, Any]:
-        """Of what is given."""
-        noise = jax.ShapeDtypeStruct(length, jnp.float32)
-        return jax.ShapeDtypeStruct(length, jnp.int32), dict.fromkeys(self.sides, noise)
-
-
-SharedPartRunner = Callable[[list[Any], int, int, int], SharedValues]
-"""From the state of what lanes share, seed, first sample and number of samples of a stretch."""
+    def input_shapes(self, *shape: int) -> tuple[Any, Any]:
+        """Shapes and types of `sample_inputs`."""
+        noise = jax.ShapeDtypeStruct(shape, jnp.float32)
+        return jax.ShapeDtypeStruct(shape, jnp.int32), dict.fromkeys(self.sides, noise)
 
 
 class SharedPartScan:
-    """By XLA, sample by sample."""
+    """Runs a shared part by XLA, sample by sample."""
 
-    def __init__(self, shared: SharedPart):
-        def block(state: list[Any], given: Any) -> SharedValues:
-            state, handed = jax.lax.scan(shared.inner, state, given)
-            return *shared.outer(state, ()), handed
+    def __init__(self, part: SharedPart):
+        def run_block(state: list[Any], inputs: Any) -> SharedValues:
+            state, sample_outputs = jax.lax.scan(part.step, state, inputs)
+            return *part.end_block(state, ()), sample_outputs
 
-        self._shared = shared
-        lengths = {min(shared.length, shared.steps), shared.steps % shared.length} - {0}
-        self._blocks = {n: jax.jit(block).lower(shared.state, shared.shapes(n)).compile() for n in lengths}
+        self._part = part
+        lengths = {min(part.block_length, part.steps), part.steps % part.block_length} - {0}
+        self._programs = {n: jax.jit(run_block).lower(part.state, part.input_shapes(n)).compile() for n in lengths}
 
     def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
-        parts = []
-        for begin in range(0, count, self._shared.length):
-            length = min(self._shared.length, count - begin)
-            state, *read = self._blocks[length](state, self._shared.given(seed, first + begin, length))
-            parts.append(read)
-        last = [np.stack(column) for column in zip(*(last for last, _ in parts), strict=True)]
-        return state, last, [np.concatenate(column) for column in zip(*(handed for _, handed in parts), strict=True)]
+        outputs = []
+        for start in range(0, count, self._part.block_length):
+            length = min(self._part.block_length, count - start)
+            inputs = self._part.sample_inputs(seed, first + start, length)
+            state, *block_and_sample_outputs = self._programs[length](state, inputs)
+            outputs.append(block_and_sample_outputs)
+        of_blocks, of_samples = zip(*outputs, strict=True)
+        block_outputs = [np.stack(column) for column in zip(*of_blocks, strict=True)]
+        sample_outputs = [np.concatenate(column) for column in zip(*of_samples, strict=True)]
+        return state, block_outputs, sample_outputs
 
 
 class SharedPartLoop:
-    """By XLA what needs no state, for all samples of a stretch at once; by a loop of scalars the rest. `Unsupported` where
-    there can be no such loop."""
+    """Runs a shared part faster: what needs no state by XLA, for all samples of a span at once; the rest by a compiled loop.
 
-    def __init__(self, shared: SharedPart):
-        parts = split_by_state(shared.inner, shared.state, shared.shapes())
-        self._shared, self._direct = shared, parts.direct
-        # one program for all stretches, what it computes beyond the last sample is left unread; and few arrays, as each
-        # takes XLA and NumPy some microseconds
-        given, ahead = shared.shapes(shared.stretch), jax.vmap(parts.ahead)
-        dtypes = [one.dtype for one in jax.tree.leaves(jax.eval_shape(ahead, given))]
-        self._groups = [[i for i, one in enumerate(dtypes) if one == dtype] for dtype in dict.fromkeys(dtypes)]
+    Raises:
+        Unsupported: the rest reads something that is no number, or needs an operation that loops lack.
+    """
 
-        def stacked(given: Any) -> list[Any]:
-            made = jax.tree.leaves(ahead(given))
-            return [jnp.stack([made[i] for i in group]) for group in self._groups]
+    def __init__(self, part: SharedPart):
+        split = split_by_state(part.step, part.state, part.input_shapes())
+        self._part, self._is_stateless = part, split.is_stateless
+        # one program for all spans: what it computes beyond the last sample is not read. Numbers of one type are stacked,
+        # as each array takes XLA and NumPy some microseconds
+        inputs, compute_stateless = part.input_shapes(part.span_length), jax.vmap(split.compute_stateless)
+        dtypes = [leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(compute_stateless, inputs))]
+        self._groups = [[i for i, other in enumerate(dtypes) if other == dtype] for dtype in dict.fromkeys(dtypes)]
 
-        self._parallel = jax.jit(stacked).lower(given).compile()
+        def compute_stacked(inputs: Any) -> list[Any]:
+            leaves = jax.tree.leaves(compute_stateless(inputs))
+            return [jnp.stack([leaves[i] for i in group]) for group in self._groups]
+
+        self._compute_stacked = jax.jit(compute_stacked).lower(inputs).compile()
         self._loop = None
-        self._dtypes: list[list[np.dtype]] = [[], []]
-        if shared.state:
-            after = trace_inlined(lambda *state: jax.tree.leaves(shared.outer(state, ())), *shared.state)
-            count = len(shared.state)
-            self._dtypes = [[out.dtype for out in part.out_avals[count:]] for part in (after, parts.step)]
-            self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, after=after)
+        self._block_dtypes: list[np.dtype] = []
+        self._sample_dtypes: list[np.dtype] = []
+        if part.state:
+            end_block = trace_inlined(lambda *state: jax.tree.leaves(part.end_block(state, ())), *part.state)
+            count = len(part.state)
+            self._block_dtypes = [out.dtype for out in end_block.out_avals[count:]]
+            self._sample_dtypes = [out.dtype for out in split.step.out_avals[count:]]
+            self._loop = Loop(split.step, np.dtype(float), carry=count, lanes=1, after_block=end_block)
 
     def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
-        shared = self._shared
-        made: dict[int, np.ndarray] = {}
-        for group, rows in zip(self._groups, self._parallel(shared.given(seed, first, shared.stretch)), strict=True):
-            made |= zip(group, np.asarray(rows)[:, :count], strict=True)
-        alone = sum(self._direct)
-        direct, read = ([made[i] for i in some] for some in (range(alone), range(alone, len(made))))
-        sizes = -(-count // shared.length), count
+        part = self._part
+        stacks = self._compute_stacked(part.sample_inputs(seed, first, part.span_length))
+        columns: dict[int, np.ndarray] = {}
+        for group, rows in zip(self._groups, stacks, strict=True):
+            columns |= zip(group, np.asarray(rows)[:, :count], strict=True)
+        stateless_count = sum(self._is_stateless)
+        stateless = iter([columns[i] for i in range(stateless_count)])
+        loop_inputs = [columns[i] for i in range(stateless_count, len(columns))]
         state = [np.array([leaf]) for leaf in state]
-        last, kept = ([np.empty(size, dtype) for dtype in some] for size, some in zip(sizes, self._dtypes, strict=True))
+        block_outputs = [np.empty(-(-count // part.block_length), dtype) for dtype in self._block_dtypes]
+        loop_outputs = [np.empty(count, dtype) for dtype in self._sample_dtypes]
         if self._loop is not None:
-            self._loop([*state, *read, *kept, *last], count, 0, 1, block=shared.length)
-        own, rest = iter(direct), iter(kept)
-        return [leaf[0] for leaf in state], last, [next(own) if one else next(rest) for one in self._direct]
+            arrays = [*state, *loop_inputs, *loop_outputs, *block_outputs]
+            self._loop(arrays, count, 0, 1, block_length=part.block_length)
+        stateful = iter(loop_outputs)
+        sample_outputs = [next(stateless) if is_stateless else next(stateful) for is_stateless in self._is_stateless]
+        return [leaf[0] for leaf in state], block_outputs, sample_outputs
 
 
-def compile_shared_part(shared: SharedPart) -> SharedPartRunner:
-    """By the loop if there can be one."""
+def compile_shared_part(part: SharedPart) -> SharedPartRunner:
+    """Compile a shared part: by the loop if that supports it, otherwise by XLA."""
     try:
-        return SharedPartLoop(shared)
+        return SharedPartLoop(part)
     except Unsupported:
-        return SharedPartScan(shared)
+        return SharedPartScan(part)

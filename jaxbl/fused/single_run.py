@@ -1,7 +1,7 @@
 """One run with a record of its samples, by loops for this machine's processor.
 
-The same as :func:`jaxbl.simulate.scan` computes with a record: XLA starts some kernels for each sample of a single lane, and
-takes longer to compile them than a study of that size takes to run.
+The numbers are those of :func:`jaxbl.simulate.scan` with a record. XLA starts some kernels for each sample of a single lane,
+and takes longer to compile them than a study of that size takes to run.
 """
 
 from collections.abc import Callable
@@ -37,45 +37,49 @@ def record_run(
     record: Callable[[State, Signals], dict[str, Any]],
     every: int = 1,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Simulate one experiment, in its precision: the reducers' figures `()` and the record `(samples,)`, both by name.
-    Arguments as of :func:`jaxbl.simulate.scan`."""
+    """Simulate one experiment, in its precision; arguments as for :func:`jaxbl.simulate.scan`.
+
+    Returns:
+        The reducers' metrics `()` and the record `(samples,)`, both by name.
+    """
     with jax.default_device(host_device()):
         start = jax.eval_shape(lambda: initial_carry(experiment, reducers))
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
         names: list[str] = []
 
-        def sample(state: Any, given: Any) -> tuple[list[Any], list[Any]]:
-            carry, signals = advance_sample(experiment, reducers, tree.unflatten(state), *given)
+        def step(state: Any, sample_inputs: Any) -> tuple[list[Any], list[Any]]:
+            carry, signals = advance_sample(experiment, reducers, tree.unflatten(state), *sample_inputs)
             row = record(carry[0], signals)
             names[:] = row
             return jax.tree.leaves(carry), list(row.values())
 
-        def settle(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
+        def finish_block(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
             return jax.tree.leaves(end_block(experiment, tree.unflatten(state))), []
 
-        def result(*state: Any) -> dict[str, Any]:
+        def finish(*state: Any) -> dict[str, Any]:
             return compute_metrics(experiment, reducers, tree.unflatten(state))
 
         steps = experiment.run.steps
-        shared = SharedPart(sample, settle, leaves, experiment.sides, steps, block_length(steps))
-        ahead = compile_shared_part(shared)
-        state, columns = _once(lambda: jax.tree.leaves(initial_carry(experiment, reducers))), [[] for _ in names]
-        for first in range(0, steps, shared.stretch):
-            state, _, handed = ahead(state, seed, first, min(shared.stretch, steps - first))
-            for column, part in zip(columns, handed, strict=True):
-                # copied: what is kept of a stretch does not keep the rest of it
-                column.append(np.array(part[-first % every :: every]))
-        found = dict(zip(sorted(jax.eval_shape(result, *leaves)), _once(result, *state), strict=True))
-    return found, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}
+        # a single lane shares everything
+        part = SharedPart(step, finish_block, leaves, experiment.sides, steps, block_length(steps))
+        run_span = compile_shared_part(part)
+        state, columns = _call_once(lambda: jax.tree.leaves(initial_carry(experiment, reducers))), [[] for _ in names]
+        for first in range(0, steps, part.span_length):
+            state, _, outputs = run_span(state, seed, first, min(part.span_length, steps - first))
+            for column, output in zip(columns, outputs, strict=True):
+                # copied, so that the samples that are dropped free their memory
+                column.append(np.array(output[-first % every :: every]))
+        metrics = dict(zip(sorted(jax.eval_shape(finish, *leaves)), _call_once(finish, *state), strict=True))
+    return metrics, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}
 
 
-def _once(function: Callable[..., Any], *numbers: Any) -> list[Any]:
-    """Leaves of a function of numbers."""
+def _call_once(function: Callable[..., Any], *numbers: Any) -> list[Any]:
+    """Call a function of numbers; returns the leaves of its result. A loop compiles faster than XLA."""
     closed = trace_inlined(function, *(jax.ShapeDtypeStruct((), jnp.result_type(number)) for number in numbers))
     try:
         loop = Loop(closed, np.dtype(float), values=len(numbers), lanes=1)
     except Unsupported:
         return [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*numbers))]
-    kept = [np.empty(1, aval.dtype) for aval in closed.out_avals]
-    loop([*(np.array([number]) for number in numbers), *kept], 1, 0, 1)
-    return [column[0] for column in kept]
+    outputs = [np.empty(1, aval.dtype) for aval in closed.out_avals]
+    loop([*(np.array([number]) for number in numbers), *outputs], 1, 0, 1)
+    return [output[0] for output in outputs]

@@ -177,20 +177,20 @@ def _compile_fused(
 
     with jax.default_device(devices[0]):
         # compile the program that draws the noise, now and not with the first chunk
-        next(simulator.stretches(0))
+        next(simulator.compute_inputs(0))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
             # seeds may repeat, as padding of the last chunk; the next chunk has probably the same ones
             unique_seeds = dict.fromkeys(int(seed) for seed in seeds)
-            simulator.keep(unique_seeds)
+            simulator.keep_seeds(unique_seeds)
             metrics = {seed: simulator(values, seed) for seed in unique_seeds}
         columns = {name: np.stack([metrics[int(seed)][name] for seed in seeds]) for name in metrics[int(seeds[0])]}
         return columns, observer_gains(set_leaves(experiment, values))
 
     item_size = jnp.result_type(experiment.run.sample_period).itemsize
     column_count = len(metric_columns(experiment, names)) * layout.seeds
-    return Program(run, (simulator.carried + len(paths) + column_count) * layout.points * item_size / 1e6)
+    return Program(run, (simulator.carry_count + len(paths) + column_count) * layout.points * item_size / 1e6)
 
 
 def _compile_scan(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:

@@ -39,10 +39,10 @@ class FusedChain:
     """The loop over time in registers, threads side by side; input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
-        self._passage = HostSimulator(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
+        self._simulator = HostSimulator(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
         self._values, self._seeds = workload.values(), count(SEED)
 
     def __call__(self) -> dict[str, np.ndarray]:
         # nothing is kept for the next lanes
-        self._passage.keep(())
-        return self._passage(self._values, next(self._seeds))
+        self._simulator.keep_seeds(())
+        return self._simulator(self._values, next(self._seeds))

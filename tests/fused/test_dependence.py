@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.dependence import Dependence, carry_dependences, split_by_lane, split_by_state
+from jaxbl.fused.dependence import Dependence, find_carry_dependences, split_by_lane, split_by_state
 
 
 def begin(values):
@@ -22,7 +22,7 @@ def step(values, carry, given):
 @pytest.fixture
 def parts():
     values = [jnp.asarray(1.0), jnp.asarray(3.0)]
-    kinds = carry_dependences(begin, ((step, jnp.asarray(0.0)),), values)
+    kinds = find_carry_dependences(begin, ((step, jnp.asarray(0.0)),), values)
     return kinds, split_by_lane(step, values, begin(values), jnp.asarray(0.0), kinds, kinds)
 
 
@@ -65,14 +65,14 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
     state = [jnp.asarray(0.2), jnp.asarray(-0.1)]
     given = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
     parts = split_by_state(sample, state, jax.tree.map(lambda x: x[0], given))
-    assert parts.direct == [True, False, True, False]
+    assert parts.is_stateless == [True, False, True, False]
     # neither the table nor a sine is left to the loop
     assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}
-    direct, read = jax.vmap(parts.ahead)(given)
+    direct, read = jax.vmap(parts.compute_stateless)(given)
     last, handed = jax.lax.scan(sample, state, given)
     for i in range(9):
         new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(one[i] for one in read))
         state, ways = new[:2], {True: iter(one[i] for one in direct), False: iter(new[2:])}
-        for alone, whole in zip(parts.direct, handed, strict=True):
+        for alone, whole in zip(parts.is_stateless, handed, strict=True):
             np.testing.assert_allclose(next(ways[alone]), whole[i], rtol=1e-6)
     np.testing.assert_allclose(state, last, rtol=1e-6)

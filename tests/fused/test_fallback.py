@@ -47,10 +47,10 @@ UNKNOWN = {
 def unknown(request, monkeypatch):
     """Makes it so; returns what is said of it."""
     fused.warn_of_scan.cache_clear()
-    single_plant._path_loop.cache_clear()
+    single_plant._trajectory_loop.cache_clear()
     yield lambda: request.param(monkeypatch) or UNKNOWN[request.param]
     # loops that could not be had are not kept
-    single_plant._path_loop.cache_clear()
+    single_plant._trajectory_loop.cache_clear()
 
 
 STUDY = small({"run.substeps": 2})
@@ -95,7 +95,7 @@ def test_a_plant_is_scanned(unknown, caplog):
         one = prepare(jaxbl.read_config(STUDY))
         start, torque = one.plant.init(one.initial), np.ones(50)
         expected, said = single_plant.simulate_plant(one, start, torque), unknown()
-        single_plant._path_loop.cache_clear()
+        single_plant._trajectory_loop.cache_clear()
         found = [single_plant.simulate_plant(one, start, torque) for _ in range(2)]
     for path in found:
         np.testing.assert_allclose(path.position["motor"], expected.position["motor"], rtol=1e-9, atol=1e-12)

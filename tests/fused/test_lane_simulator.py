@@ -68,7 +68,7 @@ def scanned(experiment, values, reducer, seed):
 class Parts(LaneSimulator):
     """What the loop or the kernel is made of, not compiled."""
 
-    def _march(self, given, stretches):
+    def _simulate(self, values, spans):
         raise NotImplementedError
 
 
@@ -125,14 +125,14 @@ def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))
     values = spread(whole, ["observer.motor.alpha", "observer.motor.lambda"], 7)
-    passage = HostSimulator(whole, (ALL_METRICS,), tuple(values), 7, 1)
+    simulator = HostSimulator(whole, (ALL_METRICS,), tuple(values), 7, 1)
     varied = Parts(whole, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
-    assert passage.carried < varied.carried
+    assert simulator.carry_count < varied.carry_count
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
-    assert isinstance(passage._ahead, SharedPartLoop)
-    assert passage._ahead._loop is not None
+    assert isinstance(simulator._run_shared_part, SharedPartLoop)
+    assert simulator._run_shared_part._loop is not None
     expected = scanned(whole, values, ALL_METRICS, 3)
-    for name, figure in passage(values, 3).items():
+    for name, figure in simulator(values, 3).items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-9, err_msg=name)
 
 
@@ -158,11 +158,11 @@ def test_the_kernel_of_accelerators_in_single_precision():
     work = Workload(150, 263, "float32")
     with jax.enable_x64(False):
         whole = work.experiment()
-        passages = [
+        simulators = [
             HostSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, 1),
             DeviceSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
-        host, device = (passage(work.values(), SEED) for passage in passages)
+        host, device = (simulator(work.values(), SEED) for simulator in simulators)
     for name, figure in device.items():
         assert figure.dtype in (np.float32, bool)
         if name.endswith("_rmse"):
@@ -176,7 +176,7 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
     with jax.enable_x64(precision == "float64"):
         made = parts(half, precision)
-        kernel = Kernel(made._body, made._around, len(made._paths), 2 * LANES, 200, 64)
+        kernel = Kernel(made._step, made._hooks, len(made._paths), 2 * LANES, 200, 64)
         # from JAX 0.11 on it has to be told which GPU
         device = AbstractDevice("NVIDIA H100", None, "gpu")
         with use_abstract_mesh(AbstractMesh((), (), abstract_device=device)):
@@ -201,7 +201,7 @@ def test_what_is_joined_for_a_gpu_computes_the_same(half):
         return (-a if minus_product else a) * b + (-c if minus_rest else c)
 
     random = np.random.default_rng(1)
-    for part in (made._body, *made._around):
+    for part in (made._step, *made._hooks):
         given = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
         other = join_multiply_add(replace_primitives(part, {}), multiply_add)
         pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*given)
@@ -212,15 +212,15 @@ def test_what_is_joined_for_a_gpu_computes_the_same(half):
 
 def test_values_of_another_number_of_lanes_are_refused():
     work = Workload(40, 70, "float64")
-    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
     with pytest.raises(ValueError, match=r"encoders\.noise: 40 lanes need as many values, not an array of shape \(3,\)"):
-        passage(work.values() | {"encoders.noise": np.ones(3)}, SEED)
+        simulator(work.values() | {"encoders.noise": np.ones(3)}, SEED)
 
 
 def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     work = Workload(4000, 3000, "float64")
-    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
-    loop, calls = passage._loop, []
+    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    loop, calls = simulator._loop, []
 
     def failing(*arguments, **options):
         calls.append(1)
@@ -229,19 +229,19 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
         loop(*arguments, **options)
 
     failing.signature = loop.signature
-    monkeypatch.setattr(passage, "_loop", failing)
+    monkeypatch.setattr(simulator, "_loop", failing)
     with pytest.raises(MemoryError, match="no more"):
-        passage(work.values(), SEED)
+        simulator(work.values(), SEED)
     monkeypatch.undo()
-    assert np.isfinite(passage(work.values(), SEED)["motor.velocity_rmse"]).all()
+    assert np.isfinite(simulator(work.values(), SEED)["motor.velocity_rmse"]).all()
 
 
 @pytest.mark.parametrize(("precision", "threads"), [("float32", 2), ("float64", 1)])
 def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision, threads):
     """Lanes with a shaft too stiff for the plant's step overflow, some at once, some later, some on one side alone; one
     after the other, and mixed."""
-    monkeypatch.setattr(module, "_CALL", 1)
-    monkeypatch.setattr(module, "_SHARE", 1)
+    monkeypatch.setattr(module, "_CALL_WORK", 1)
+    monkeypatch.setattr(module, "_THREAD_WORK", 1)
     lanes, samples = 300, []
     stiffness = np.concatenate([np.full(100, 60.0), np.geomspace(1e5, 1e7, 200)])
     orders = np.arange(lanes), np.random.default_rng(0).permutation(lanes)
@@ -251,19 +251,19 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         staying = ALL_METRICS._replace(done=None)
         expected = HostSimulator(whole, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        passage = HostSimulator(whole, (ALL_METRICS,), tuple(values), lanes, threads)
-        assert len(passage._threads) == threads
-        loop = passage._loop
+        simulator = HostSimulator(whole, (ALL_METRICS,), tuple(values), lanes, threads)
+        assert len(simulator._pools) == threads
+        loop = simulator._loop
 
         def counted(arrays, upto, first, last, loop=loop, **options):
             samples.append((upto - options.get("start", 0)) * last)
             loop(arrays, upto, first, last, **options)
 
         counted.signature, counted.lanes = loop.signature, loop.lanes
-        monkeypatch.setattr(passage, "_loop", counted)
+        monkeypatch.setattr(simulator, "_loop", counted)
         for order in orders:
             samples.clear()
-            found = passage({"transmission.stiffness": stiffness[order]}, 3)
+            found = simulator({"transmission.stiffness": stiffness[order]}, 3)
             assert set(found) == set(expected)
             for name, figure in found.items():
                 assert figure.dtype == expected[name].dtype
@@ -275,8 +275,8 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
 @pytest.mark.parametrize(("precision", "threads"), [("float32", 1), ("float64", 2)])
 def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     """Some keep the tolerance, some never do, and of both some overflow, early or in the last quarter."""
-    monkeypatch.setattr(module, "_CALL", 1)
-    monkeypatch.setattr(module, "_SHARE", 1)
+    monkeypatch.setattr(module, "_CALL_WORK", 1)
+    monkeypatch.setattr(module, "_THREAD_WORK", 1)
     lanes, samples = 256, []
     # about the stiffness from which float32 and float64 overflow within the run
     late = np.linspace(1.6965e5, 1.698e5, 64), np.linspace(1.703e5, 1.713e5, 64)
@@ -290,15 +290,15 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         every, staying = (
             HostSimulator(whole, (one,), tuple(values), lanes, 1) for one in (ALL_METRICS, asked._replace(done=None))
         )
-        assert staying.carried < every.carried
+        assert staying.carry_count < every.carry_count
         expected, stayed = every(values, 3), staying(values, 3)
         assert 0 < np.count_nonzero(expected["motor.converged"]) < lanes
         assert set(stayed) < set(expected)
         # a side is not followed once its answer is known: what overflows later is not seen
         assert (stayed["finite"] >= expected["finite"]).all()
         assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        passage = HostSimulator(whole, (asked,), tuple(values), lanes, threads)
-        loop = passage._loop
+        simulator = HostSimulator(whole, (asked,), tuple(values), lanes, threads)
+        loop = simulator._loop
 
         def counted(arrays, upto, first, last, loop=loop, **options):
             if upto > options.get("start", 0):
@@ -306,9 +306,9 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
             loop(arrays, upto, first, last, **options)
 
         counted.signature, counted.lanes = loop.signature, loop.lanes
-        monkeypatch.setattr(passage, "_loop", counted)
+        monkeypatch.setattr(simulator, "_loop", counted)
         samples.clear()
-        found = passage(values, 3)
+        found = simulator(values, 3)
         # in the last block, those are left that keep the tolerance
         assert samples[-1] < lanes // 4
         assert set(found) == set(stayed)
@@ -319,10 +319,10 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
 
 
 def test_all_lanes_may_leave(monkeypatch):
-    monkeypatch.setattr(module, "_CALL", 1)
+    monkeypatch.setattr(module, "_CALL_WORK", 1)
     whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
-    passage = HostSimulator(whole, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
-    found = passage({"transmission.stiffness": np.full(5, 1e8)}, 3)
+    simulator = HostSimulator(whole, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
+    found = simulator({"transmission.stiffness": np.full(5, 1e8)}, 3)
     assert not found["finite"].any()
     assert not found["load.converged"].any()
     assert np.isnan(found["load.velocity_rmse"]).all()
@@ -330,25 +330,27 @@ def test_all_lanes_may_leave(monkeypatch):
 
 def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
     work = Workload(40, 300, "float64")
-    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
     drawn = []
-    ahead = passage._ahead
-    monkeypatch.setattr(passage, "_ahead", lambda state, seed, *rest: drawn.append(seed) or ahead(state, seed, *rest))
-    first = passage(work.values(), 1)
+    ahead = simulator._run_shared_part
+    monkeypatch.setattr(
+        simulator, "_run_shared_part", lambda state, seed, *rest: drawn.append(seed) or ahead(state, seed, *rest)
+    )
+    first = simulator(work.values(), 1)
     for seed in (1, 2, 1):
-        again = passage(work.values(), seed)
+        again = simulator(work.values(), seed)
     assert drawn == [1, 2]
     for name, figure in first.items():
         np.testing.assert_array_equal(again[name], figure)
-    passage.keep([2])
+    simulator.keep_seeds([2])
     for seed in (2, 1):
-        passage(work.values(), seed)
+        simulator(work.values(), seed)
     assert drawn == [1, 2, 1]
     # no room
-    monkeypatch.setattr(module, "_KEPT", 100)
-    passage.keep([])
+    monkeypatch.setattr(module, "_CACHE_BYTES", 100)
+    simulator.keep_seeds([])
     for seed in (2, 2):
-        passage(work.values(), seed)
+        simulator(work.values(), seed)
     assert drawn == [1, 2, 1, 2, 2]
 
 

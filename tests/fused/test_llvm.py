@@ -20,7 +20,12 @@ def loop():
         return total, total
 
     return Loop(
-        trace_inlined(sample, NUMBER, NUMBER, NUMBER, INDEX, NUMBER), np.dtype(float), values=1, carry=1, fixed=1, lanes=2
+        trace_inlined(sample, NUMBER, NUMBER, NUMBER, INDEX, NUMBER),
+        np.dtype(float),
+        values=1,
+        carry=1,
+        constants=1,
+        lanes=2,
     )
 
 
@@ -28,20 +33,20 @@ def arrays():
     return {
         "value 0": np.array([1.0, 2.0]),
         "carry 0": np.zeros(2),
-        "fixed number 0": np.array(10.0),
-        "input 0": np.arange(5, dtype=np.int32),
-        "input 1": np.arange(5.0),
-        "kept number 0": np.empty(10),
+        "constant 0": np.array(10.0),
+        "sample input 0": np.arange(5, dtype=np.int32),
+        "sample input 1": np.arange(5.0),
+        "sample output 0": np.empty(10),
     }
 
 
 def test_a_loop_says_what_it_takes(loop):
     assert [one.name for one in loop.signature] == list(arrays())
-    assert [one.holds for one in loop.signature] == ["lanes", "lanes", "one", "samples", "samples", "both"]
+    assert [one.extent for one in loop.signature] == ["lanes", "lanes", "scalar", "samples", "samples", "samples and lanes"]
     given = arrays()
     loop(list(given.values()), 5, 0, 2)
     np.testing.assert_array_equal(given["carry 0"], [110.0, 120.0])
-    np.testing.assert_array_equal(given["kept number 0"].reshape(5, 2)[2], [33.0, 36.0])
+    np.testing.assert_array_equal(given["sample output 0"].reshape(5, 2)[2], [33.0, 36.0])
 
 
 WRONG = {
@@ -77,9 +82,9 @@ def test_rows_of_one_array_stand_for_several(loop):
     rest = list(given.values())[2:]
     loop([ArrayRows(both), *rest], 5, 0, 2)
     np.testing.assert_array_equal(both, [[1.0, 2.0], [110.0, 120.0]])
-    with pytest.raises(ValueError, match="input 0 of a loop needs 5 contiguous numbers of type int32"):
+    with pytest.raises(ValueError, match="sample input 0 of a loop needs 5 contiguous numbers of type int32"):
         loop([ArrayRows(both), rest[0], ArrayRows(np.zeros((2, 5))), rest[3]], 5, 0, 2)
-    with pytest.raises(ValueError, match="fixed number 0 of a loop is no row of one array"):
+    with pytest.raises(ValueError, match="constant 0 of a loop is no row of one array"):
         loop([ArrayRows(np.zeros((3, 2))), *rest[1:]], 5, 0, 2)
     with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
         loop([ArrayRows(np.zeros((4, 2))[::2]), *rest], 5, 0, 2)

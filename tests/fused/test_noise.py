@@ -20,7 +20,7 @@ def test_noise_is_that_of_the_scan(seed, first, count):
 
 
 def test_another_generator_of_jax_is_left_to_xla(monkeypatch):
-    monkeypatch.setattr(module, "_drawing", module._drawing.__wrapped__)  # compiled anew
+    monkeypatch.setattr(module, "_compile_noise", module._compile_noise.__wrapped__)  # compiled anew
     before = draw_noise(3, 5, 40)
     with jax.threefry_partitionable(False):
         found = draw_noise(3, 5, 40)

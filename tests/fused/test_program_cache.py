@@ -39,7 +39,7 @@ print(len(traced), repr(float(np.sum(needed))), repr(float(np.sum(states.positio
 
 
 def test_another_process_does_not_trace(tmp_path, monkeypatch):
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     said = []
     for _ in range(2):
         done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
@@ -49,7 +49,7 @@ def test_another_process_does_not_trace(tmp_path, monkeypatch):
 
 
 def test_names_tell_structures_apart(tmp_path, monkeypatch):
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     drag, lag = make_effect("motor.quadratic_drag", drag=1.0), make_effect("actuator.lag", time_constant=1.0)
     given = [
         drag,
@@ -73,16 +73,16 @@ def test_names_tell_structures_apart(tmp_path, monkeypatch):
 
 
 def test_what_is_not_known_by_its_text_is_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     assert program_cache.program_key("program", lambda x: x) is None
     assert program_cache.program_key("program", np.random.default_rng(0)) is None
-    monkeypatch.setenv(program_cache.PROGRAMS, "")
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, "")
     assert program_cache.program_key("program", 1) is None
 
 
 @pytest.mark.parametrize("content", [b"", b"half a pickle"])
 def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     key = program_cache.program_key("program", 1)
     program_cache.save(key, [1, 2])
     assert program_cache.load(key) == [1, 2]
@@ -94,11 +94,11 @@ def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
 
 def test_programs_in_a_folder_that_others_can_write_to_are_not_loaded(tmp_path, monkeypatch):
     """They are pickled: to load one is to run it."""
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path / "programs"))
-    program_cache._folder.cache_clear()
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path / "programs"))
+    program_cache._make_folder.cache_clear()
     program_cache.save("key", 3)
     assert program_cache.load("key") == 3
     (tmp_path / "programs").chmod(0o777)
-    program_cache._folder.cache_clear()
+    program_cache._make_folder.cache_clear()
     assert program_cache.load("key") is None
-    program_cache._folder.cache_clear()
+    program_cache._make_folder.cache_clear()

@@ -49,7 +49,7 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
 
     monkeypatch.setattr(module, "SharedPartLoop", Noted)
     with jax.enable_x64(precision == "float64"):
-        length = HostSimulator(experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._length
+        length = HostSimulator(experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._block_length
         ((looped, scanned, shared),) = made
         assert (looped._loop is not None) >= states
         # the plant's four states are not carried by each lane

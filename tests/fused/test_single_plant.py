@@ -59,7 +59,7 @@ def test_the_path_is_that_of_the_scan(name, observed):
         measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in one.sides}
         more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
     expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
-    assert module._path_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
+    assert module._trajectory_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
     found = simulate_plant(one, start, torque, 0.7, **more)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for have, want in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -84,7 +84,7 @@ def test_slopes_are_those_of_differences(name):
     time = 1e-3 * np.arange(STEPS)
     states = simulate_plant(one, start, torque)
     ways = directions(one, start)
-    assert module._slopes_loop(module._PlantStructure.of(one, start)) is not None
+    assert module._derivatives_loop(module._PlantStructure.of(one, start)) is not None
     changes, new = step_derivatives(one, states, torque, time, ways)
     assert changes.shape == (len(ways), len(jax.tree.leaves(start)), STEPS)
 
@@ -124,8 +124,8 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     one = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
     start, torque, _ = record(one)
     plant = module._PlantStructure.of(one, start)
-    assert module._path_loop(plant, ()) is None
-    assert module._slopes_loop(plant) is None
+    assert module._trajectory_loop(plant, ()) is None
+    assert module._derivatives_loop(plant) is None
     expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque))
     found = simulate_plant(one, start, torque)
     for side in one.sides:
@@ -144,8 +144,8 @@ def test_tables_that_no_step_reads_are_no_obstacle():
     start, torque, _ = record(one)
     recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
     other = eqx.tree_at(lambda e: e.excitation, one, recorded)
-    assert module._path_loop(module._PlantStructure.of(other, start), ()) is not None
-    assert module._slopes_loop(module._PlantStructure.of(other, start)) is not None
+    assert module._trajectory_loop(module._PlantStructure.of(other, start), ()) is not None
+    assert module._derivatives_loop(module._PlantStructure.of(other, start)) is not None
     expected, found = simulate_plant(one, start, torque), simulate_plant(other, start, torque)
     assert np.array_equal(found.position["motor"], expected.position["motor"])
     ways = [directions(e, start)[:6] for e in (one, other)]
@@ -173,12 +173,12 @@ def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
     runs = []
     for inertia in (0.02, 0.04):
         other = set_leaves(one, {"drive.motor_inertia": jnp.asarray(inertia)})
-        before = module._path_loop.cache_info().misses
+        before = module._trajectory_loop.cache_info().misses
         runs.append(simulate_plant(other, start, torque).position["motor"])
-    assert module._path_loop.cache_info().misses == before
+    assert module._trajectory_loop.cache_info().misses == before
     assert np.ptp(runs[0] - runs[1]) > 0.0
     # made, used and dropped many times in one process
     for _ in range(5):
-        module._path_loop.cache_clear()
+        module._trajectory_loop.cache_clear()
         gc.collect()
         assert np.array_equal(simulate_plant(one, start, torque).position["motor"], runs[0])

@@ -110,7 +110,7 @@ def test_quantised_readings():
 @pytest.mark.parametrize(("columns", "machine_code"), [(1, True), (3, True), (21, True), (3, False)])
 def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monkeypatch):
     if not machine_code:
-        monkeypatch.setattr(signal_scan, "_loop", lambda *_: None)
+        monkeypatch.setattr(signal_scan, "_compile_loop", lambda *_: None)
     readings = np.stack([(1.0 + seed) * motion(seed, 300)[1] for seed in range(columns)], axis=1)
     found = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
     for one, position in zip(found.T, readings.T, strict=True):

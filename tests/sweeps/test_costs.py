@@ -64,7 +64,7 @@ def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
     devices = jax.devices()
     assert under_test.load_costs(devices) == under_test._CPU
     assert not calls
-    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     assert [under_test.load_costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
     assert calls == [devices]
 
