@@ -67,8 +67,8 @@ def make(folder: Path, rows: int) -> int:
             "motor.velocity_rmse": np.sqrt(alpha) * np.exp(0.1 * noise) / lambda_,
             "motor.f_plus": np.exp(0.3 * noise),
         }
-        store.write(index, pd.DataFrame(labels | columns))
-    store.update(finished=True)
+        store.write_part(index, pd.DataFrame(labels | columns))
+    store.update_manifest(finished=True)
     return engine.rows
 
 

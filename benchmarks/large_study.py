@@ -59,12 +59,12 @@ def clock(owner, name, phase, processor=time.process_time):
 
 clock(engine.Engine, "run", "chunks")
 clock(engine.Engine, "_compile", "compile")
-clock(engine.Engine, "labels", "labels")
+clock(engine.Engine, "row_labels", "labels")
 clock(engine.Engine, "__init__", "points")
-clock(engine.Engine, "order", "order")
+clock(engine.Engine, "chunk_order", "order")
 # parts are written by a thread of their own
-clock(store.Store, "write", "write", time.thread_time)
-clock(store.Store, "has", "look")
+clock(store.Store, "write_part", "write", time.thread_time)
+clock(store.Store, "has_part", "look")
 clock(run.Run, "finish", "finish")
 clock(sweep, "sweep", "sweep")
 clock(jaxbl.report.sweep, "write_sweep_report", "report")

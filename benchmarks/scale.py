@@ -61,14 +61,14 @@ def measure(data: dict[str, Any], folder: Path) -> Cost:
     config = read_config(data)
     engine = Engine(config)
     store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-    store.write(0, engine.run(engine.chunk(0)))
+    store.write_part(0, engine.run(engine.chunk(0)))
     start = time.process_time()
     frames = [engine.run(engine.chunk(index)) for index in range(len(engine))]
     between = time.process_time()
     for index, frame in enumerate(frames):
-        store.write(index, frame)
+        store.write_part(index, frame)
     end = time.process_time()
-    size = sum(path.stat().st_size for path in store.existing())
+    size = sum(path.stat().st_size for path in store.list_part_files())
     return Cost(config.run.steps, *(what / engine.rows for what in (between - start, end - between, size)))
 
 

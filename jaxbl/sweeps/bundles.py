@@ -83,16 +83,16 @@ class ClusterRun(Run):
         for part, done in self._cluster.done(compute_bundle, _bundles(self.engine, self.kept, chunks, size), self._look):
             for one in part:
                 chunk = self.engine.chunk(one) if isinstance(one, int) else one
-                _wait_for(self.kept.part(chunk.index), done.host)
+                _wait_for(self.kept.part_path(chunk.index), done.host)
                 self.count(chunk)
-            self.kept.note(done.checksums)
+            self.kept.add_checksums(done.checksums)
             self.elsewhere += done.work
 
     def _look(self) -> None:
         """Tell progress by the parts that exist: bundles take long."""
         if time.monotonic() > self._next_look:
             start = time.monotonic()
-            self.tell(len(self.kept.existing()))
+            self.tell(len(self.kept.list_part_files()))
             # a list of 300 000 files takes seconds
             self._next_look = time.monotonic() + max(_LOOK, 10.0 * (time.monotonic() - start))
 
@@ -100,7 +100,7 @@ class ClusterRun(Run):
 def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
     """Have all chunks of a study computed that are missing, without waiting for more than the first. Raises as
     :class:`ClusterRun`."""
-    missing = [index for index in engine.chunk_order() if not store.has(index)]
+    missing = [index for index in engine.chunk_order() if not store.has_part(index)]
     seconds = 0.0
     for _, done in cluster.done(compute_bundle, _bundles(engine, store, missing[:1], 1)):
         seconds = done.work.run_seconds

@@ -1,6 +1,6 @@
-"""A chunk's file: its rows, the study and the chunk that they are of, and a checksum of each column.
+"""A part: the file of a chunk, with its rows, a header that names study and chunk, and a checksum of each column.
 
-What was stored years ago, or copied from elsewhere, is only read where it is what was written.
+A part is only read if it is what was written, however old it is and wherever it was copied from.
 """
 
 import json
@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from jaxbl.files import catch_store_errors, checksum, has_file, is_remote, open_draft
 
 _KEY, _SUM = b"jaxbl.part", b"jaxbl.checksum"
-"""In the file's metadata: the mark as JSON, and its checksum."""
+"""Keys of the file's metadata: the header as JSON, and its checksum."""
 
 
 class Damaged(Exception):
@@ -27,13 +27,13 @@ class Damaged(Exception):
 
 
 class PartHeader(NamedTuple):
-    """What a part says of itself.
+    """The header of a part.
 
     Attributes:
         study: head of the study's manifest (:func:`jaxbl.sweeps.store.manifest_head`).
         layout: seeds and points of a chunk.
-        backend: that computed the study.
-        chunk: index.
+        backend: backend that computed the study.
+        chunk: index of the chunk.
         rows: number of runs.
         columns: checksum of each column.
     """
@@ -46,11 +46,11 @@ class PartHeader(NamedTuple):
     columns: dict[str, str]
 
 
-def write_part(path: Path, frame: pd.DataFrame, mark: PartHeader) -> None:
-    """Write a part with its mark, whole or not at all; rows and checksums are those of the frame."""
+def write_part(path: Path, frame: pd.DataFrame, header: PartHeader) -> None:
+    """Write a part atomically; number of rows and checksums of its header are those of the frame."""
     columns = {str(name): values.to_numpy() for name, values in frame.items()}
     checksums = {name: _checksum(values) for name, values in columns.items()}
-    text = json.dumps(mark._replace(rows=len(frame), columns=checksums)._asdict()).encode()
+    text = json.dumps(header._replace(rows=len(frame), columns=checksums)._asdict()).encode()
     # from arrays: pyarrow takes three times as long for a frame
     table = pa.table(
         {name: pa.array(values, from_pandas=True) for name, values in columns.items()},
@@ -62,9 +62,9 @@ def write_part(path: Path, frame: pd.DataFrame, mark: PartHeader) -> None:
 
 
 def read_header(path: Path) -> PartHeader:
-    """What a part says of itself. Raises `Damaged` where that cannot be read, or is not what was written."""
+    """Read the header of a part. Raises `Damaged` if it cannot be read, or is not what was written."""
     try:
-        with _opened(path) as file:
+        with _open_source(path) as file:
             metadata = pq.read_schema(file).metadata or {}
     except FileNotFoundError:
         raise
@@ -72,32 +72,32 @@ def read_header(path: Path) -> PartHeader:
         raise Damaged(f"cannot be read ({_first_line(error)})") from None
     text = metadata.get(_KEY)
     if text is None:
-        raise Damaged("says nothing of the study and the chunk that it is of")
+        raise Damaged("has no header that names its study and chunk")
     if metadata.get(_SUM) != checksum(text).encode():
-        raise Damaged("what it says of itself does not agree with its checksum")
+        raise Damaged("its header does not agree with its checksum")
     return PartHeader(**json.loads(text))
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> tuple[PartHeader, pd.DataFrame]:
-    """A part's mark and rows; all columns, or some. Raises `Damaged` where these are not what was written."""
-    mark = read_header(path)
+    """Read header and rows of a part; all columns, or only those named. Raises `Damaged` if they are not what was written."""
+    header = read_header(path)
     try:
-        with _opened(path) as source, pq.ParquetFile(source, page_checksum_verification=True) as file:
+        with _open_source(path) as source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             frame = file.read(columns=columns).to_pandas()
     except (OSError, ValueError, KeyError, TypeError, MemoryError, pa.ArrowException) as error:
         raise Damaged(f"cannot be read ({_first_line(error)})") from None
-    wanted = [*mark.columns] if columns is None else [name for name in columns if name in mark.columns]
-    if [*frame.columns] != wanted or len(frame) != mark.rows:
-        raise Damaged(f"has {len(frame)} rows and {len(frame.columns)} columns, not {mark.rows} and {len(wanted)}")
+    expected = [*header.columns] if columns is None else [name for name in columns if name in header.columns]
+    if [*frame.columns] != expected or len(frame) != header.rows:
+        raise Damaged(f"has {len(frame)} rows and {len(frame.columns)} columns, not {header.rows} and {len(expected)}")
     for name in frame.columns:
-        if _checksum(frame[name].to_numpy()) != mark.columns[name]:
+        if _checksum(frame[name].to_numpy()) != header.columns[name]:
             raise Damaged(f"column '{name}' does not agree with its checksum")
-    return mark, frame
+    return header, frame
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """What pyarrow reads a file from: its path, or its bytes where it is in an object store."""
+def _open_source(path: Path) -> Iterator[Any]:
+    """The source that pyarrow reads a file from: its path, or its bytes if it is in an object store."""
     if is_remote(path):
         if not has_file(path.parent, path.name):
             raise FileNotFoundError(path)
@@ -109,9 +109,9 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _checksum(values: np.ndarray) -> str:
-    """CRC-32 of type and values. It guards against damage, not against forgery, and costs a fifth of a cryptographic one."""
+    """CRC-32 of type and values: it detects damage, not forgery, in a fifth of the time of a cryptographic hash."""
     if values.dtype == object:
-        return _crc(json.dumps([str(one) for one in values]).encode())
+        return _crc(json.dumps([str(value) for value in values]).encode())
     return _crc(np.ascontiguousarray(values).view(np.uint8).data, zlib.crc32(str(values.dtype).encode()))
 
 
@@ -120,8 +120,8 @@ def file_checksum(path: Path) -> str:
     return _crc(path.read_bytes())
 
 
-def _crc(content: bytes | memoryview, begun: int = 0) -> str:
-    return f"{zlib.crc32(content, begun):08x}"
+def _crc(content: bytes | memoryview, start: int = 0) -> str:
+    return f"{zlib.crc32(content, start):08x}"
 
 
 def _first_line(error: BaseException) -> str:

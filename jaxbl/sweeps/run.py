@@ -47,7 +47,7 @@ def open_or_create_store(
         store.count_parts()
     elif store.manifest["parts"] != len(engine):
         # the manifest was lost, and begun anew for other chunks
-        store.update(parts=len(engine))
+        store.update_manifest(parts=len(engine))
     return engine, store
 
 
@@ -151,13 +151,13 @@ class Run:
         for group in range(len(self.engine.points.groups)):
             self._refine(group)
         if self._store is not None:
-            self._store.trim(self._chunks, self._total)
+            self._store.set_final_totals(self._chunks, self._total)
 
     def finish(self) -> None:
         """Say in the manifest that all is there."""
         work = self.work
         if work.lanes or not self.kept.manifest["finished"]:
-            self.kept.update(finished=True, seconds={"compile": work.compile_seconds, "run": work.run_seconds})
+            self.kept.update_manifest(finished=True, seconds={"compile": work.compile_seconds, "run": work.run_seconds})
 
     def _refine(self, group: int) -> None:
         """The coarse grid of a group, and what its boundaries need."""
@@ -173,7 +173,7 @@ class Run:
             self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(expected)
             expected = 0
             if self._store is not None:
-                self._store.grow(self._chunks, self._total)
+                self._store.raise_totals(self._chunks, self._total)
             chunks = self.engine.split_points(group, points, self._next)
             self._next += len(chunks)
             self.ensure(chunks)
@@ -205,7 +205,7 @@ class Run:
                     self._frames[chunk.index] = frame
                     self.count(chunk)
                     continue
-                before, written = written, (chunk, writer.submit(self._store.write, chunk.index, frame))
+                before, written = written, (chunk, writer.submit(self._store.write_part, chunk.index, frame))
                 # frames are large: one waits at most
                 self._keep(before)
             self._keep(written)
@@ -214,12 +214,12 @@ class Run:
         """Count a part that is being written, once it is."""
         if written is not None:
             chunk, checksum = written
-            self.kept.note({chunk.index: checksum.result()})
+            self.kept.add_checksums({chunk.index: checksum.result()})
             self.count(chunk)
 
     def is_there(self, chunk: Chunk) -> bool:
         """Whether a chunk is stored whole; of a refined study, also whether it has the points that are due."""
-        if self._store is None or not self._store.has(chunk.index):
+        if self._store is None or not self._store.has_part(chunk.index):
             return False
         return self.engine.points.refinement is None or self._stored(chunk, []) is not None
 
@@ -232,7 +232,7 @@ class Run:
             return self._frames[chunk.index]
         frame = self._stored(chunk, columns)
         if frame is None:
-            raise InputError(f"{self._store.part(chunk.index)}: was changed by another process; run the same command again")
+            raise InputError(f"{self._store.part_path(chunk.index)}: was changed by another process; run the same command again")
         return frame
 
     def count(self, chunk: Chunk) -> None:

@@ -54,7 +54,7 @@ def status(folder: str | Path) -> Status:
     """How far the study in a folder is. Raises `InputError` where there is none."""
     folder = to_path(folder)
     store = Store.open(folder)
-    times = np.sort([path.stat().st_mtime for path in store.existing()])
+    times = np.sort([path.stat().st_mtime for path in store.list_part_files()])
     recent = times[times > times[-1] - _RECENT] if len(times) else times
     span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
     return Status(

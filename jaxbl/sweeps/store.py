@@ -47,19 +47,18 @@ if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 FORMAT = 4
-"""Of the manifest: raised where older versions could not read it."""
+"""Format of the manifest; it is raised when older versions cannot read a new one."""
 
 _COMMANDS = {
-    # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
+    # command: the marker file that names its study; its other results; keys of the config that decide none of its numbers
     "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
     "sweep": ("manifest.json", ("study.toml", "points", "laws.json", "damaged"), ("verify", "tune")),
     "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = "figures", "report.html"
-_SAVED = 10.0
-"""Seconds at least from one time that the manifest is written to the next while chunks are computed: parts know what they
-are."""
+_SAVE_INTERVAL = 10.0
+"""Least seconds between two writes of the manifest while chunks are computed; parts have headers, so that none is lost."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -74,7 +73,7 @@ def identity(config: Config, command: str = "sweep") -> str:
     for key in ("title", "notes", "figures", "identify", *_COMMANDS[command][2]):
         data.pop(key, None)
     for key in ("q", "marks"):
-        # judged and drawn anew each time
+        # conditions are judged and marks drawn anew each time
         data.get("verify", {}).pop(key, None)
     _name_by_content(data["excitation"], config.excitation)
     if config.tune is not None and "holdout" in data.get("tune", {}):
@@ -83,80 +82,86 @@ def identity(config: Config, command: str = "sweep") -> str:
 
 
 def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
-    """What was recorded counts, not where it lies."""
+    """Put a hash of a recorded input in place of its file name: the path of the file decides no number."""
     if excitation.kind == "recorded":
         record = excitation.build()
         data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
 
 
 def manifest_head(config: Config, command: str) -> dict[str, Any]:
-    """What a command's manifest says of its study: its own identity, and that of the study's single run."""
+    """The first entries of a command's manifest: identity of the study for it and for a single run, and title."""
     return {"identity": identity(config, command), "single_run": identity(config, "simulate"), "title": config.title}
 
 
 def claim_folder(
     folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, alone: bool = True
 ) -> None:
-    """Make sure that a command may write its results for a study into a folder; make the folder.
+    """Check that a command may write its results for a study into a folder, and make the folder.
 
-    All commands of one study may share one folder. With `overwrite`, results of other studies are removed from it first;
-    what killed processes left half written is removed if no other process writes there (`alone`).
+    All commands of one study may share a folder.
+
+    Args:
+        folder: folder of the results.
+        config: the study.
+        command: command that writes.
+        overwrite: remove the results of other studies from the folder.
+        alone: no other process writes there, so that drafts of killed processes are removed.
 
     Raises:
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
-    found, unsure = {}, False
-    for other, (marker, _, _) in _COMMANDS.items():
+    heads, own_is_damaged = {}, False
+    for marker_command, (marker, _, _) in _COMMANDS.items():
         if (folder / marker).exists():
             try:
-                found[other] = read_json(folder / marker)
+                heads[marker_command] = read_json(folder / marker)
             except InputError:
-                if other == command != "sweep" and not overwrite:
-                    # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
-                    unsure = True
+                if marker_command == command != "sweep" and not overwrite:
+                    # the stages of the command are studies, which have headers (:class:`jaxbl.gains.stages.Stages`)
+                    own_is_damaged = True
                     continue
-                mark = _read_first_header(folder) if other == "sweep" else None
-                if mark is None and not overwrite:
+                header = _read_first_header(folder) if marker_command == "sweep" else None
+                if header is None and not overwrite:
                     raise
-                found[other] = {} if mark is None else mark.study
-        elif other == "sweep" and (mark := _read_first_header(folder)) is not None:
-            found[other] = mark.study
-    # a damaged file of ours is read as an empty one above
-    if any(data and "single_run" not in data for data in found.values()):
+                heads[marker_command] = {} if header is None else header.study
+        elif marker_command == "sweep" and (header := _read_first_header(folder)) is not None:
+            heads[marker_command] = header.study
+    # an empty head is that of a damaged marker, which belongs to a study
+    if any(head and "single_run" not in head for head in heads.values()):
         raise InputError(f"{folder}: holds files that are not of a study; choose another folder with --out")
-    same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
-    if command != "simulate" and command in found:
-        same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or unsure or is_empty(folder)):
+    same = [head.get("single_run") == identity(config, "simulate") for head in heads.values()]
+    if command != "simulate" and command in heads:
+        same.append(heads[command].get("identity") == identity(config, command))
+    if all(same) and (heads or own_is_damaged or is_empty(folder)):
         if alone:
             remove_drafts(folder)
         return
-    if not found:
+    if not heads:
         for file in (folder / name for name in LOG_RESULTS if (folder / name).exists()):
             log = read_log_path(file)
             log = f"see {file.name}" if log is None else f"'{Path(log).name}'"
             raise InputError(f"{folder}: holds the results of a log ({log}); choose another folder with --out")
         raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
     if not overwrite:
-        title = next((data["title"] for data in found.values() if data.get("title")), "untitled")
+        title = next((head["title"] for head in heads.values() if head.get("title")), "untitled")
         raise InputError(
             f"{folder}: holds another study ('{title}', other numbers); choose another folder with --out, or --overwrite"
         )
-    left = [name for marker, outputs, _ in _COMMANDS.values() for name in (marker, *outputs)]
-    for path in (folder / name for name in (*left, *_COMMON)):
-        remove(path)
+    results = [name for marker, outputs, _ in _COMMANDS.values() for name in (marker, *outputs)]
+    for name in (*results, *_COMMON):
+        remove(folder / name)
 
 
 def load_config(folder: Path) -> Config:
-    """The study of a folder. Raises `InputError` where it is damaged."""
+    """Read the study of a folder. Raises `InputError` if it is damaged."""
     path = folder / "study.toml"
-    # it stands alone: what it included is in it
+    # included files are merged into it, so that it can be read from its text
     return read_config(tomllib.loads(path.read_text()) if is_remote(path) else path)
 
 
 def _read_first_header(folder: Path) -> PartHeader | None:
-    """What the first whole part in a folder says of itself."""
+    """The header of the first readable part in a folder; None without one."""
     for path in list_paths(folder / "points", "part-*.parquet"):
         try:
             return parts.read_header(path)
@@ -167,23 +172,23 @@ def _read_first_header(folder: Path) -> PartHeader | None:
 
 @contextmanager
 def _report_damage(part: Path) -> Iterator[None]:
-    """Around what reads a part: one line where it is damaged."""
+    """Raise `InputError` with a remedy if a part that is read inside is damaged."""
     try:
         yield
-    except Damaged as why:
+    except Damaged as damage:
         raise InputError(
-            f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
+            f"{part}: is damaged ({damage}); run 'jaxbl sweep' again, which moves it to damaged/ and computes it anew"
         ) from None
 
 
 class Store:
-    """The folder of one study.
+    """The folder of a study.
 
     Attributes:
-        folder: where it is.
-        manifest: what is known of the study as a whole; `checksums` are those of whole parts, by index.
-        damaged: parts that were kept aside, and why.
-        keeps_manifest: whether it writes the manifest while parts are added; one process does.
+        folder: path of the folder.
+        manifest: entries of `manifest.json`; `checksums` has those of whole parts, by index.
+        damaged: a sentence for each damaged part that was moved to `damaged/`.
+        keeps_manifest: True if this process writes the manifest while parts are added; only one does.
     """
 
     def __init__(self, folder: Path, manifest: dict[str, Any], *, keeps_manifest: bool = True):
@@ -192,26 +197,36 @@ class Store:
         self.manifest = manifest
         self.damaged: list[str] = []
         self._copies: Path | None = None
-        self._saved, self._pause = 0.0, _SAVED
+        self._saved, self._pause = 0.0, _SAVE_INTERVAL
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
-        """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
-        or damaged is written anew by what the parts say."""
-        store, there = None, (folder / "manifest.json").exists()
-        if there:
+        """Open the store in a claimed folder (:func:`claim_folder`), or create it.
+
+        A manifest that is lost or damaged is written anew from the headers of the parts.
+
+        Args:
+            folder: claimed folder.
+            config: the study.
+            layout: seeds and points of a chunk, if no part exists.
+            backend: backend of all chunks, if no part exists.
+            chunks: number of chunks.
+            rows: number of rows of all chunks.
+        """
+        store, has_manifest = None, (folder / "manifest.json").exists()
+        if has_manifest:
             try:
                 store = cls.open(folder)
             except InputError:
                 if _read_first_header(folder) is None:
                     raise
         if store is None:
-            mark = _read_first_header(folder)
+            header = _read_first_header(folder)
             manifest = {
                 "format": FORMAT,
                 **manifest_head(config, "sweep"),
-                "layout": layout._asdict() if mark is None else mark.layout,
-                "backend": backend if mark is None else mark.backend,
+                "layout": layout._asdict() if header is None else header.layout,
+                "backend": backend if header is None else header.backend,
                 "parts": chunks,
                 "rows": rows,
                 "finished": False,
@@ -220,9 +235,9 @@ class Store:
                 "checksums": {},
             }
             store = cls(folder, manifest)
-        # the manifest first: it is what makes the folder this study's
-        if there:
-            store.update()
+        # the manifest first: it reserves the folder for this study
+        if has_manifest:
+            store.update_manifest()
         elif not create_file(folder / "manifest.json", json_with_checksum(store.manifest)):
             raise FolderInUse(f"{folder}: another process began a study there just now; run the same command again")
         if not is_remote(folder):
@@ -232,7 +247,7 @@ class Store:
 
     @classmethod
     def open(cls, folder: Path, *, keeps_manifest: bool = True) -> "Store":
-        """Open a study that is there. Raises `InputError` where there is none."""
+        """Open the store in a folder. Raises `InputError` if there is none."""
         path = folder / "manifest.json"
         if not has_file(folder, path.name):
             if _read_first_header(folder) is not None:
@@ -243,7 +258,7 @@ class Store:
         except InputError:
             if _read_first_header(folder) is None:
                 raise
-            raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew by what the parts say") from None
+            raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew from the parts") from None
         if manifest.get("format") != FORMAT:
             raise InputError(
                 f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
@@ -257,184 +272,192 @@ class Store:
 
     @property
     def backend(self) -> Backend:
-        """That of all chunks, but for groups that the fused loop cannot run."""
+        """Backend of all chunks, except in groups that the fused loop does not support."""
         return self.manifest["backend"]
 
     @property
     def _head(self) -> dict[str, Any]:
         return {name: self.manifest[name] for name in ("identity", "single_run")}
 
-    def update(self, **values: Any) -> None:
-        """Set entries of the manifest."""
-        self.manifest |= values
-        begun = time.monotonic()
+    def update_manifest(self, **entries: Any) -> None:
+        """Set entries of the manifest and write it."""
+        self.manifest |= entries
+        start = time.monotonic()
         write_atomic(self.folder / "manifest.json", json_with_checksum(self.manifest))
         self._saved = time.monotonic()
-        # of very many parts it is long
-        self._pause = max(_SAVED, 100.0 * (self._saved - begun))
+        # with very many parts it is long: spend at most 1 % of the time on it
+        self._pause = max(_SAVE_INTERVAL, 100.0 * (self._saved - start))
 
-    def part(self, index: int) -> Path:
+    def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
 
-    def has(self, index: int) -> bool:
-        """Whether a chunk is there and is what was written; one that is not is kept aside.
+    def has_part(self, index: int) -> bool:
+        """True if the part of a chunk is stored and whole; a damaged one is moved to `damaged/`.
 
         Raises:
-            InputError: it is of another study.
+            InputError: the part is of another study.
         """
-        path = self.part(index)
+        path = self.part_path(index)
         if not path.exists():
             return False
         try:
             self._check_file(path, index)
-        except Damaged as why:
-            self._put_aside(path, str(why))
+        except Damaged as damage:
+            self._move_to_damaged(path, str(damage))
             return False
         return True
 
     def _check_file(self, path: Path, index: int) -> None:
-        """Whether a part's file is what was written, by the manifest or else by itself. Raises `Damaged`, or `InputError`
-        where it is of another study."""
-        known = self.manifest["checksums"].get(str(index))
-        if known is None:
-            mark, _ = parts.read_part(path)
-            self._check(path, mark, index)
+        """Check a part's file by its checksum in the manifest, or else by its header and columns.
+
+        Raises:
+            Damaged: the file is not what was written.
+            InputError: the part is of another study.
+        """
+        checksum = self.manifest["checksums"].get(str(index))
+        if checksum is None:
+            header, _ = parts.read_part(path)
+            self._check_header(path, header, index)
             self.manifest["checksums"][str(index)] = parts.file_checksum(path)
-        elif parts.file_checksum(path) != known:
+        elif parts.file_checksum(path) != checksum:
             raise Damaged("does not agree with its checksum in manifest.json")
 
-    def _check(self, path: Path, mark: PartHeader, index: int) -> None:
-        """Whether a whole part is the one that belongs here."""
-        if {name: mark.study.get(name) for name in self._head} != self._head:
+    def _check_header(self, path: Path, header: PartHeader, index: int) -> None:
+        """Check that a part is of this study and of this chunk. Raises `InputError` or `Damaged`."""
+        if {name: header.study.get(name) for name in self._head} != self._head:
             raise InputError(
-                f"{path}: is of another study ('{mark.study.get('title') or 'untitled'}', other numbers); move it away, and "
-                "run 'jaxbl sweep' again, which computes this part"
+                f"{path}: is of another study ('{header.study.get('title') or 'untitled'}', other numbers); move it away, "
+                "and run 'jaxbl sweep' again, which computes this part"
             )
-        if mark.chunk != index or mark.layout != self.manifest["layout"]:
-            raise Damaged(f"is part {mark.chunk} of this study")
+        if header.chunk != index or header.layout != self.manifest["layout"]:
+            raise Damaged(f"is part {header.chunk} of this study")
 
-    def _put_aside(self, path: Path, why: str) -> None:
-        """Keep a damaged file where it is in nobody's way."""
+    def _move_to_damaged(self, path: Path, damage: str) -> None:
+        """Move a damaged file to `damaged/`, under a name that is free there."""
         folder = self.folder / "damaged"
         if not is_remote(folder):
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
         rename_file(path, target)
-        self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
+        self.damaged.append(f"{path.relative_to(self.folder)} {damage}; it is kept as {target.relative_to(self.folder)}")
 
-    def write(self, index: int, frame: pd.DataFrame) -> str:
-        """Write a part; its checksum is to be noted (:meth:`note`). Changes nothing here: it may run in another thread."""
+    def write_part(self, index: int, frame: pd.DataFrame) -> str:
+        """Write the rows of a chunk, and return the file's checksum for :meth:`add_checksums`.
+
+        The store itself does not change, so that this may run in another thread.
+        """
         head = self._head | {"title": self.manifest["title"]}
-        parts.write_part(self.part(index), frame, PartHeader(head, self.manifest["layout"], self.backend, index, 0, {}))
-        return parts.file_checksum(self.part(index))
+        path = self.part_path(index)
+        parts.write_part(path, frame, PartHeader(head, self.manifest["layout"], self.backend, index, 0, {}))
+        return parts.file_checksum(path)
 
-    def note(self, checksums: dict[int, str]) -> None:
-        """Add parts that were written, by their checksums, to the manifest."""
-        self.manifest["checksums"] |= {str(index): value for index, value in checksums.items()}
-        # not for each part: a large study's manifest is large
+    def add_checksums(self, checksums: dict[int, str]) -> None:
+        """Add checksums of written parts, by index, to the manifest; write it from time to time."""
+        self.manifest["checksums"] |= {str(index): checksum for index, checksum in checksums.items()}
         if self.keeps_manifest and time.monotonic() - self._saved > self._pause:
-            self.update()
+            self.update_manifest()
 
-    def existing(self) -> list[Path]:
-        """Files of parts, whole or damaged."""
-        # a sixth digit comes after five
+    def list_part_files(self) -> list[Path]:
+        """All files of parts, whole or damaged, in the order of their indices."""
+        # names with six digits come after those with five
         return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
-        """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
+        """Read columns of a chunk; None if the part cannot be read, or has other rows than `labels` (columns by name)."""
         try:
-            _, frame = parts.read_part(self.part(index), [*labels, *columns])
+            _, frame = parts.read_part(self.part_path(index), [*labels, *columns])
         except (Damaged, OSError):
             return None
-        same = all(np.array_equal(frame[name].to_numpy(), values) for name, values in labels.items())
-        return frame if same else None
+        same_rows = all(np.array_equal(frame[name].to_numpy(), column) for name, column in labels.items())
+        return frame if same_rows else None
 
-    def grow(self, parts: int, rows: int) -> None:
-        """Say how many chunks and rows a refined study has as far as is known."""
+    def raise_totals(self, parts: int, rows: int) -> None:
+        """Set the numbers of parts and rows of a refined study if they have grown."""
         if rows > self.manifest["rows"]:
-            self.update(parts=parts, rows=rows)
+            self.update_manifest(parts=parts, rows=rows)
 
     def count_parts(self) -> None:
-        """Have as many chunks as there are files, at least: of a refined study only these say how many it has so far, if its
-        manifest was lost."""
-        there = [index + 1 for index, _ in self._indexed() if index is not None]
-        if max(there, default=0) > self.manifest["parts"]:
-            self.update(parts=max(there))
+        """Raise the number of parts to that of the files: if the manifest of a refined study was lost, only these tell it."""
+        part_count = max((index + 1 for index, _ in self._numbered_files() if index is not None), default=0)
+        if part_count > self.manifest["parts"]:
+            self.update_manifest(parts=part_count)
 
-    def trim(self, parts: int, rows: int) -> None:
-        """Say how many chunks and rows a refined study has in the end, and remove what lies beyond."""
+    def set_final_totals(self, parts: int, rows: int) -> None:
+        """Set the numbers of parts and rows of a refined study that is computed, and remove parts beyond them."""
         if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
-            self.update(parts=parts, rows=rows)
-        for index, path in self._indexed():
+            self.update_manifest(parts=parts, rows=rows)
+        for index, path in self._numbered_files():
             if index is not None and index >= parts:
                 path.unlink()
                 self.manifest["checksums"].pop(str(index), None)
 
-    def _indexed(self) -> Iterator[tuple[int | None, Path]]:
-        """Files among the points with the indices that their names say."""
-        for path in self.existing():
+    def _numbered_files(self) -> Iterator[tuple[int | None, Path]]:
+        """Yield all files of parts with their indices; None for a file with another name."""
+        for path in self.list_part_files():
             number = path.stem.removeprefix("part-")
-            yield (int(number) if number.isdecimal() and path == self.part(int(number)) else None), path
+            yield (int(number) if number.isdecimal() and path == self.part_path(int(number)) else None), path
 
-    def refuse_others(self) -> None:
-        """Raise `InputError` if a file among the points is none of this study."""
-        for index, path in self._indexed():
+    def refuse_foreign_files(self) -> None:
+        """Raise `InputError` if a file among the parts is not a part of this study."""
+        for index, path in self._numbered_files():
             if index is None or index >= self.manifest["parts"]:
                 raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
 
-    def parts(self) -> list[Path]:
-        """Files of the chunks that are there. Raises `InputError` if there is none, or one that the study does not have."""
-        self.refuse_others()
-        found = [path for _, path in self._indexed()]
-        if not found:
-            raise InputError(f"{self.folder}: holds no points yet; wait for the sweep at work in it, or run 'jaxbl sweep'")
-        return found
+    def stored_parts(self) -> list[Path]:
+        """Files of the stored parts. Raises `InputError` if there is none, or one that the study does not have."""
+        self.refuse_foreign_files()
+        paths = self.list_part_files()
+        if not paths:
+            raise InputError(f"{self.folder}: holds no points yet; wait for the sweep that runs in it, or run 'jaxbl sweep'")
+        return paths
 
     def columns(self) -> list[str]:
         """Names of the columns."""
-        mark = _read_first_header(self.folder)
-        return list(mark.columns) if mark is not None else list(next(self.batches()).columns)
+        header = _read_first_header(self.folder)
+        return list(header.columns) if header is not None else list(next(self.batches()).columns)
 
     def batches(self, columns: list[str] | None = None) -> Iterator[pd.DataFrame]:
-        """Rows of the chunks that are there, one after the other; all columns, or some.
+        """Yield the rows of the stored parts, part by part; all columns, or only those named.
 
         Raises:
             InputError: a part is damaged, or not of this study.
         """
-        for part in self.parts():
+        for part in self.stored_parts():
             with _report_damage(part):
-                mark, frame = parts.read_part(self._near(part), columns)
-                self._check(part, mark, int(part.stem.removeprefix("part-")))
+                header, frame = parts.read_part(self._local_copy(part), columns)
+                self._check_header(part, header, int(part.stem.removeprefix("part-")))
             yield frame
 
     def dataset(self, check: bool) -> "Dataset":
-        """Rows of the chunks that are there as a dataset of pyarrow, which reads what is asked of it, and compares each page
-        with its checksum. With `check` each file is first compared with that in the manifest, else each part's mark read.
+        """The rows of the stored parts as a dataset of pyarrow, which compares each page that it reads with its checksum.
+
+        Args:
+            check: first compare each file with its checksum in the manifest; otherwise only headers are checked.
 
         Raises:
             InputError: a part is damaged, or not of this study.
         """
         from pyarrow import dataset
 
-        found = self.parts()
-        for part in found:
+        paths = self.stored_parts()
+        for part in paths:
             index = int(part.stem.removeprefix("part-"))
             with _report_damage(part):
                 if check:
                     self._check_file(part, index)
                 else:
-                    self._check(part, parts.read_header(part), index)
-        form = dataset.ParquetFileFormat(
+                    self._check_header(part, parts.read_header(part), index)
+        file_format = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )
-        remote: Any = found[0]
-        system = remote.fs if is_remote(remote) else None
-        names = [str(part.path if system else part) for part in cast(Any, found)]
-        return cast("Dataset", dataset.dataset(names, format=form, filesystem=system))
+        first: Any = paths[0]
+        file_system = first.fs if is_remote(first) else None
+        names = [str(part.path if file_system else part) for part in cast(Any, paths)]
+        return cast("Dataset", dataset.dataset(names, format=file_format, filesystem=file_system))
 
-    def _near(self, part: Path) -> Path:
-        """A part where it is read fast: of an object store, a copy for as long as this lives, as a report reads it often."""
+    def _local_copy(self, part: Path) -> Path:
+        """A part on this machine: one in an object store is copied once, since a report reads it often."""
         if not is_remote(part):
             return part
         if self._copies is None:
@@ -446,14 +469,14 @@ class Store:
         return copy
 
     def verify(self) -> int:
-        """Read all parts; those that are damaged are kept aside. Returns how many are whole.
+        """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones.
 
         Raises:
-            InputError: a part is of another study, or none that this one has.
+            InputError: a part is of another study, or has an index that this study does not have.
         """
         self.manifest["checksums"] = {}
-        found = sum(self.has(int(path.stem.removeprefix("part-"))) for path in self.parts())
+        whole_parts = sum(self.has_part(int(path.stem.removeprefix("part-"))) for path in self.stored_parts())
         if self.damaged:
             self.manifest["finished"] = False
-        self.update()
-        return found
+        self.update_manifest()
+        return whole_parts

@@ -208,7 +208,7 @@ def sweep(
     with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _LET_GO):
             engine, store = open_or_create_store(folder, engine, require_backend=backend is not None, overwrite=overwrite)
-            store.refuse_others()
+            store.refuse_foreign_files()
             if verify_store:
                 store.verify()
             run = Run(engine, store, progress) if cluster is None else ClusterRun(cluster, engine, store, progress)

@@ -69,8 +69,8 @@ def stored(folder, data, **columns):
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):
         labels = pd.DataFrame(engine.row_labels(engine.chunk(index)))
-        store.write(index, labels.merge(result.frame, on=keys, how="left", validate="1:1"))
-    store.update(finished=True)
+        store.write_part(index, labels.merge(result.frame, on=keys, how="left", validate="1:1"))
+    store.update_manifest(finished=True)
     return open_study(folder)
 
 

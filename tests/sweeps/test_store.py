@@ -247,7 +247,7 @@ def test_an_edited_part_is_kept_aside(copy, finished, computed):
     frame = pd.read_parquet(part)
     frame["motor.velocity_rmse"] *= 1.01
     frame.to_parquet(part, index=False)
-    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(says nothing of the study"):
+    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(has no header"):
         _ = open_study(copy).frame
     sweep(study(), copy)
     assert computed == [1]
@@ -463,12 +463,12 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished):
     store = Store.create(tmp_path, engine.config, engine.layout, engine.backend, 100_001, 9)
     rows = next(finished[1].source.batches())
     for index in (99_999, 100_000, 2):
-        store.write(index, rows.assign(seed=index))
-    store.update()
+        store.write_part(index, rows.assign(seed=index))
+    store.update_manifest()
     opened = open_study(tmp_path)
     assert opened.frame["seed"].drop_duplicates().tolist() == [2, 99_999, 100_000]
     assert opened.dataset().to_table(columns=["seed"]).to_pandas()["seed"].tolist() == opened.frame["seed"].tolist()
-    assert open_study(tmp_path).source.has(100_000)
+    assert open_study(tmp_path).source.has_part(100_000)
 
 
 def test_a_study_in_an_object_store_is_read_alike(finished):
