@@ -117,7 +117,6 @@ class LaneSimulator(abc.ABC):
         self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
         names = sorted(jax.eval_shape(result, values, carry, ()))
         self._of_lane = dict(zip(names, ends.of_lane, strict=True))
-        self._figure_dtypes = [np.dtype(aval.dtype) for aval in ends.lane.out_avals]
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
