@@ -74,8 +74,8 @@ def _add(part: Any, parts: MujocoParts, *side: str) -> Answer:
 # transmission laws
 
 
-@_add.register
-def _(law: SigmoidBacklash, parts: MujocoParts) -> Answer:
+@_add.register(SigmoidBacklash)
+def _(law, parts):
     # springs in parallel, each slack up to its corner
     corners, slopes, error = _approximate_tanh()
     softening = 2.0 * law.slope * law.dead_zone * law.stiffness
@@ -99,14 +99,14 @@ def _approximate_tanh() -> tuple[list[float], list[float], float]:
     return corners.tolist(), (np.diff(heights) / np.diff(corners)).tolist(), float(error)
 
 
-@_add.register
-def _(law: LinearShaft, parts: MujocoParts) -> Answer:
+@_add.register(LinearShaft)
+def _(law, parts):
     parts.add_gear_spring(law.stiffness)
     return exactly("spring of a tendon between the joints")
 
 
-@_add.register
-def _(law: DeadZone, parts: MujocoParts) -> Answer:
+@_add.register(DeadZone)
+def _(law, parts):
     parts.half_gap += law.half_gap
     parts.add_gear_spring(law.stiffness)
     return exactly("spring of a tendon between the joints, slack within the gap (springlength)")
@@ -115,8 +115,8 @@ def _(law: DeadZone, parts: MujocoParts) -> Answer:
 # friction
 
 
-@_add.register
-def _(effect: CoulombFriction, parts: MujocoParts, side: str) -> Answer:
+@_add.register(CoulombFriction)
+def _(effect, parts, side):
     parts.sides[side].dry += effect.torque
     # MuJoCo leaves a friction row at rest (1 - impedance) of the free acceleration, against the damping 1 / step
     creep = (1.0 - IMPEDANCE) * parts.step * effect.torque / parts.sides[side].inertia
@@ -125,8 +125,8 @@ def _(effect: CoulombFriction, parts: MujocoParts, side: str) -> Answer:
     )
 
 
-@_add.register
-def _(effect: StribeckFriction, parts: MujocoParts, side: str) -> Answer:
+@_add.register(StribeckFriction)
+def _(effect, parts, side):
     if effect.torque <= 0.0:
         return unsaid(_NO_SLIDING)
     step, torque, speed = parts.shorten_step(_BRISTLE_STEPS), effect.torque, effect.stribeck_velocity
@@ -136,8 +136,8 @@ def _(effect: StribeckFriction, parts: MujocoParts, side: str) -> Answer:
     return nearly(f"LuGre friction of a passive dcmotor: contacts bend by up to {bend:.2g} rad before they slide")
 
 
-@_add.register
-def _(effect: PreslidingFriction, parts: MujocoParts, side: str) -> Answer:
+@_add.register(PreslidingFriction)
+def _(effect, parts, side):
     if effect.torque <= 0.0:
         return unsaid(_NO_SLIDING)
     stiffness, breakaway = effect.torque / effect.length, effect.torque * effect.breakaway_ratio
@@ -145,27 +145,22 @@ def _(effect: PreslidingFriction, parts: MujocoParts, side: str) -> Answer:
     return exactly("LuGre friction of a passive dcmotor, while it moves by less than the length within a time step")
 
 
-@_add.register
-def _(effect: DriftingFriction, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("no friction of MuJoCo changes with time; set dof_frictionloss while it runs")
-
-
-@_add.register
-def _(effect: ViscousFriction, parts: MujocoParts, side: str) -> Answer:
+@_add.register(ViscousFriction)
+def _(effect, parts, side):
     parts.sides[side].viscous += effect.viscous
     return exactly("damping of the joint")
 
 
-@_add.register
-def _(effect: AsymmetricFriction, parts: MujocoParts, side: str) -> Answer:
+@_add.register(AsymmetricFriction)
+def _(effect, parts, side):
     if effect.viscous_difference:
         return unsaid("the damping of a joint is odd in the velocity; no element has a torque in proportion to |v|")
     parts.add_constant_torque(side, 0.5 * effect.torque_difference)
     return exactly("constant torque of a passive dcmotor")
 
 
-@_add.register
-def _(effect: QuadraticDrag, parts: MujocoParts, side: str) -> Answer:
+@_add.register(QuadraticDrag)
+def _(effect, parts, side):
     parts.sides[side].drag += effect.drag
     return exactly("damping of the joint, its second coefficient")
 
@@ -173,19 +168,14 @@ def _(effect: QuadraticDrag, parts: MujocoParts, side: str) -> Answer:
 # other loads
 
 
-@_add.register
-def _(effect: ConstantTorque, parts: MujocoParts, side: str) -> Answer:
+@_add.register(ConstantTorque)
+def _(effect, parts, side):
     parts.add_constant_torque(side, effect.torque)
     return exactly("constant torque of a passive dcmotor")
 
 
-@_add.register
-def _(effect: Inertia, parts: MujocoParts, side: str) -> Answer:
-    return exactly("inertia of the body")
-
-
-@_add.register
-def _(effect: Gravity, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Gravity)
+def _(effect, parts, side):
     if parts.sides[side].slides:
         parts.add_wave(side, effect.torque, 1.0, -effect.phase)
         return exactly("cogging of a passive dcmotor, one wave")
@@ -196,32 +186,22 @@ def _(effect: Gravity, parts: MujocoParts, side: str) -> Answer:
     return exactly("an eccentric mass that gravity pulls down")
 
 
-@_add.register
-def _(effect: PeriodicDisturbance, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("a model has no torque of time alone; add it to data.qfrc_applied while it runs")
-
-
-@_add.register
-def _(effect: Cogging, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Cogging)
+def _(effect, parts, side):
     parts.add_wave(side, effect.amplitude, effect.harmonic, effect.phase)
     return exactly("cogging of a passive dcmotor")
 
 
-@_add.register
-def _(effect: CoggingHarmonics, parts: MujocoParts, side: str) -> Answer:
+@_add.register(CoggingHarmonics)
+def _(effect, parts, side):
     waves = (effect.sine, effect.cosine), (effect.sine_2, effect.cosine_2), (effect.sine_3, effect.cosine_3)
     for k, (sine, cosine) in enumerate(waves, 1):
         parts.add_wave(side, math.hypot(sine, cosine), k * effect.harmonic, math.atan2(cosine, sine))
     return exactly("cogging of passive dcmotors, one a wave")
 
 
-@_add.register
-def _(effect: TorqueRipple, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("the gain of an actuator is at most affine in the position")
-
-
-@_add.register
-def _(effect: Flexibility, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Flexibility)
+def _(effect, parts, side):
     if effect.inertia:
         rate, ratio = float(2.0 * np.pi * effect.frequency), float(min(effect.damping_ratio, MAX_DAMPING_RATIO))
         stiffness, damping = effect.inertia * rate**2, 2.0 * ratio * rate * effect.inertia
@@ -230,8 +210,8 @@ def _(effect: Flexibility, parts: MujocoParts, side: str) -> Answer:
     return exactly("a further body on the side, its joint with stiffness and damping")
 
 
-@_add.register
-def _(effect: Tabulated, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Tabulated)
+def _(effect, parts, side):
     if effect.speeds:
         return unsaid("the damping of a joint is a cubic in the velocity, no table")
     if effect.positions and effect.turn:
@@ -244,64 +224,49 @@ def _(effect: Tabulated, parts: MujocoParts, side: str) -> Answer:
 # gear
 
 
-@_add.register
-def _(effect: Backlash, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Backlash)
+def _(effect, parts, side):
     parts.half_gap += effect.half_gap
     return exactly("the springs of the gear are slack within the gap (springlength)")
 
 
-@_add.register
-def _(effect: Hardening, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Hardening)
+def _(effect, parts, side):
     parts.add_gear_spring(0.0, effect.cubic_stiffness)
     return exactly("cubic stiffness of a tendon")
 
 
-@_add.register
-def _(effect: Damping, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Damping)
+def _(effect, parts, side):
     parts.damping += effect.damping
     if parts.half_gap == 0.0:
         return exactly("damping of the tendon; with a gap its limits, which is only near")
     return nearly("limits of the tendon that act as spring and damper: as the law, but the flanks do not pull as they part")
 
 
-@_add.register
-def _(effect: Hysteresis, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off")
+# actuator
 
 
-@_add.register
-def _(effect: Eccentricity, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("tendons between joints are linear in the positions")
-
-
-@_add.register
-def _(effect: LoadFriction, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("the friction of a joint does not depend on what its tendon carries")
-
-
-# actuator and encoders
-
-
-@_add.register
-def _(effect: Delay, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Delay)
+def _(effect, parts, side):
     parts.actuator.delay += effect.delay
     return nearly(f"delay of the actuator: exact to one time step, at most {parts.step:.2g} s")
 
 
-@_add.register
-def _(effect: GainError, parts: MujocoParts, side: str) -> Answer:
+@_add.register(GainError)
+def _(effect, parts, side):
     parts.actuator.scale(1.0 + effect.relative)
     return exactly("gain of the actuator")
 
 
-@_add.register
-def _(effect: Saturation, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Saturation)
+def _(effect, parts, side):
     parts.actuator.clip(effect.limit)
     return exactly("ctrlrange or forcerange of the actuator")
 
 
-@_add.register
-def _(effect: Lag, parts: MujocoParts, side: str) -> Answer:
+@_add.register(Lag)
+def _(effect, parts, side):
     if parts.actuator.lag is not None:
         return unsaid("an actuator has one lag, and there is one already")
     parts.actuator.lag = effect.time_constant
@@ -309,13 +274,27 @@ def _(effect: Lag, parts: MujocoParts, side: str) -> Answer:
     return exactly("filter of the actuator (dyntype)")
 
 
-@_add.register
-def _(effect: BackEmf, parts: MujocoParts, side: str) -> Answer:
+@_add.register(BackEmf)
+def _(effect, parts, side):
     parts.actuator.scale(effect.torque_constant / effect.resistance)
     parts.sides[side].viscous += effect.torque_constant**2 / effect.resistance
     return exactly("gain of the actuator, whose input is a voltage, and damping of the joint")
 
 
-@_add.register
-def _(effect: EncoderEffect, parts: MujocoParts, side: str) -> Answer:
-    return unsaid("the sensors of a model read true positions; it changes no motion")
+# effects that add no element
+
+
+for _cls, _answer in (
+    (DriftingFriction, unsaid("no friction of MuJoCo changes with time; set dof_frictionloss while it runs")),
+    (Inertia, exactly("inertia of the body")),
+    (PeriodicDisturbance, unsaid("a model has no torque of time alone; add it to data.qfrc_applied while it runs")),
+    (TorqueRipple, unsaid("the gain of an actuator is at most affine in the position")),
+    (
+        Hysteresis,
+        unsaid("a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off"),
+    ),
+    (Eccentricity, unsaid("tendons between joints are linear in the positions")),
+    (LoadFriction, unsaid("the friction of a joint does not depend on what its tendon carries")),
+    (EncoderEffect, unsaid("the sensors of a model read true positions; it changes no motion")),
+):
+    _add.register(_cls, lambda *_, answer=_answer: answer)

@@ -25,30 +25,27 @@ _BEGUN = 1e-3
 """Part of the speed that a pulse makes, from which on an error that was zero is simulated."""
 
 
-def half_cycle_ratio(lambda_: float, alpha: float, disturbance: float) -> float:
-    """Ratio of a peak to the one before under a constant disturbance (rad/s^2), for x1 > 0; exact.
-
-    It is below 1 for any lambda > 0 and |disturbance| < alpha. For x1 < 0 the disturbance has the other sign.
-
-    With c = 2 (alpha - d) it is exp(-(lambda / 2) pi / sqrt(c - lambda^2 / 4)), as both arcs of the half cycle have the same
-    c; 0 where lambda^2 >= 4 c, `inf` where d >= alpha: the error does not come back.
-    """
-    c = 2.0 * (alpha - disturbance)
-    if c <= 0.0:
-        return np.inf
-    below = c - 0.25 * lambda_**2
-    return float(np.exp(-0.5 * np.pi * lambda_ / np.sqrt(below))) if below > 0.0 else 0.0
-
-
 def peak_law(
     lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, *, damping: float, peak: float
 ) -> np.ndarray:
-    """Peaks (rad/s) over time under a slow disturbance below alpha; `times` (s), `disturbance` (rad/s^2) of one shape (n,).
+    """Peaks of the error over time under a slow disturbance below alpha.
 
-    Without losses the area of a cycle is kept, V^3 / (alpha^2 - d^2): the peaks follow the disturbance, and come back with
-    it. Damping shrinks them at a third of its rate, and lambda, by :func:`half_cycle_ratio`, at a rate k that does not
-    depend on V, as a cycle takes 4 V alpha / (alpha^2 - d^2): V' = V (ln(alpha^2 - d^2))' / 3 - V damping / 3 - k(d), which
-    ends at zero after a finite time.
+    Without losses a cycle keeps its area V^3 / (alpha^2 - d^2), so that peaks V follow the disturbance and come back with
+    it. Damping shrinks peaks at a third of its rate. lambda shrinks them at a rate k that does not depend on V: in a half
+    cycle by exp(-(lambda / 2) pi / sqrt(2 (alpha - d))) (on the side x1 > 0; lambda^2 small beside alpha - d), and a cycle
+    takes 4 V alpha / (alpha^2 - d^2). Together V' = V (ln(alpha^2 - d^2))' / 3 - V damping / 3 - k(d), and V reaches zero
+    after a finite time.
+
+    Args:
+        lambda_: gain, rad^0.5/s.
+        alpha: gain, rad/s^2.
+        times: s, shape (n,).
+        disturbance: rad/s^2, shape (n,).
+        damping: viscous damping of x2, 1/s.
+        peak: peak at the first of the times, rad/s.
+
+    Returns:
+        Peaks, rad/s, shape (n,).
     """
     # at |d| = alpha itself there is no half cycle; beside it there is one
     above, below = (np.maximum(alpha + sign * disturbance, 1e-9 * alpha) for sign in (1.0, -1.0))
