@@ -1,5 +1,8 @@
 """Selection of a figure's rows: the values of the axes that its `where` fixes."""
 
+# pandas' own annotations are wider than what its methods return
+# pyright: reportReturnType=false
+
 import math
 from typing import Any
 

@@ -79,7 +79,7 @@ def read_header(path: Path) -> PartHeader:
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> tuple[PartHeader, pd.DataFrame]:
-    """Read header and rows of a part; all columns, or only those named. Raises `Damaged` if they are not what was written."""
+    """Read header and rows of a part; all columns, or only those named. Raises `Damaged` where they changed since."""
     header = read_header(path)
     try:
         with _open_source(path) as source, pq.ParquetFile(source, page_checksum_verification=True) as file:

@@ -232,7 +232,9 @@ class Run:
             return self._frames[chunk.index]
         frame = self._stored(chunk, columns)
         if frame is None:
-            raise InputError(f"{self._store.part_path(chunk.index)}: was changed by another process; run the same command again")
+            raise InputError(
+                f"{self._store.part_path(chunk.index)}: was changed by another process; run the same command again"
+            )
         return frame
 
     def count(self, chunk: Chunk) -> None:

@@ -70,9 +70,7 @@ class Gravity(SideEffect):
     kind: ClassVar[str] = "gravity"
     places: ClassVar[tuple[str, ...]] = ("load",)
     # over a small angle it is the torque at position 0
-    special_cases: ClassVar = {
-        "constant_torque": lambda numbers: {"torque": -numbers["torque"] * np.sin(numbers["phase"])}
-    }
+    special_cases: ClassVar = {"constant_torque": lambda numbers: {"torque": -numbers["torque"] * np.sin(numbers["phase"])}}
     torque: Scalar = size("N m", "largest gravity torque m g l")
     phase: Scalar = angle("position at which the mass hangs down")
 
@@ -128,9 +126,7 @@ class CoggingHarmonics(SideEffect):
     places: ClassVar[tuple[str, ...]] = ("motor",)
     special_cases: ClassVar = {"cogging": _largest_wave}
     # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
-    harmonic: Scalar = harmonic(
-        "periods n a turn", _base_harmonics, trial_count=lambda log: len(_cogging_harmonics(log))
-    )
+    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=lambda log: len(_cogging_harmonics(log)))
     sine: Scalar = size("N m", "s_1", default=0.0)
     cosine: Scalar = size("N m", "c_1", default=0.0)
     sine_2: Scalar = size("N m", "s_2", default=0.0)
