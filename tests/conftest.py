@@ -1,6 +1,7 @@
 """Settings of all tests: float64 unless a test asks otherwise, no silent rank promotion, two CPU devices."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -77,6 +78,14 @@ def client():
         Client(workers, set_as_default=False) as connection,
     ):
         yield connection
+
+
+@pytest.fixture
+def default_interrupt():
+    """SIGINT as in a terminal, also for processes that are started: a suite in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

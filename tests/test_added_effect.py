@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
+from command_server import run_command, run_python
 from hidden_log import driven, model
 from small_study import rigid
 
@@ -22,21 +23,19 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """Environment of a process that has the package."""
+    """Environment of processes that have the package."""
     text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     folder, site = tmp_path_factory.mktemp("package"), tmp_path_factory.mktemp("site")
     for name, content in re.findall(r"```(?:python|toml)\n# (\S+)\n(.*?)```", text, re.S):
         (folder / name).write_text(content, encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
     subprocess.run([*pip, "--no-build-isolation", "--target", site, folder], check=True)
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    return {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
 
 
 def jaxbl(installed, *arguments):
     """Run a command in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "jaxbl", *map(str, arguments)], env=installed, capture_output=True, text=True
-    )
+    done = run_command(*arguments, cwd=ROOT, **installed)
     assert done.returncode == 0, done.stderr
     assert "warning" not in done.stderr
     return done.stdout
@@ -95,5 +94,6 @@ def test_it_is_named_where_it_is_missing(installed, tmp_path):
 
 def test_the_reference_lists_it(installed):
     code = "import docs.generate as g; print(g.page())"
-    done = subprocess.run([sys.executable, "-c", code], env=installed, cwd=ROOT, capture_output=True, text=True, check=True)
+    done = run_python("-c", code, cwd=ROOT, **installed)
+    assert done.returncode == 0, done.stderr
     assert f"| `{NAME}` | Friction that builds up over a sliding length" in done.stdout

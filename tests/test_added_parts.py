@@ -2,11 +2,10 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command_server import run_python
 from plugin import install_package
 
 ROOT = Path(__file__).parents[1]
@@ -119,10 +118,7 @@ def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
     install_package(tmp_path, "more_parts", SOURCE, {f"jaxbl.{group}": entries for group, entries in parts.items()})
     (tmp_path / "study.json").write_text(json.dumps(STUDY))
     script = SCRIPT.replace("PAGE", repr(str(ROOT / "docs" / "generate.py")))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", script, cwd=tmp_path, PYTHONPATH=os.pathsep.join([str(tmp_path), str(ROOT)]))
     assert done.returncode == 0, done.stderr
     # what is wrong is left out with one line, and ends nothing
     assert [line for line in done.stderr.splitlines() if "warning" in line] == [

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
+from command_server import run_command, run_python
 from measured import made
 from progress_lines import without_progress
 from small_study import ALPHA, listed, rigid
@@ -78,11 +79,7 @@ SAID = {
 
 def read(what: str, folder: Path) -> dict[str, str]:
     """What was said of inputs of a kind, by a process that ends where one takes too much."""
-    script = [sys.executable, str(HERE / "bad_inputs.py"), what, str(folder)]
-    paths = os.pathsep.join([str(HERE.parent), str(HERE), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        script, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, timeout=1500, check=False
-    )
+    done = run_python(HERE / "bad_inputs.py", what, folder, cwd=folder, timeout=1500.0)
     assert done.returncode == 0, done.stderr[-5000:]
     return json.loads((folder / "said.json").read_text())
 
@@ -113,23 +110,16 @@ def test_five_hundred_generated_ones(what, tmp_path):
     assert 50 < named < len(found) - 20
 
 
-def command(*arguments: str, cwd: Path, before: tuple[str, ...] = (), **environment: str) -> subprocess.CompletedProcess:
-    call = [*before, sys.executable, "-m", "jaxbl", *arguments]
-    return subprocess.run(
-        call, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False
-    )
-
-
 def test_a_command_ends_with_two_and_one_line(tmp_path):
     os.mkfifo(tmp_path / "log.csv")
-    done = command("inspect", "log.csv", cwd=tmp_path)
+    done = run_command("inspect", "log.csv", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "jaxbl: log.csv: is a pipe or a device; a file is needed\n"
 
 
 def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
     made().to_csv(tmp_path / "a\x1b[31mb.csv", index=False)
-    done = command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
+    done = run_command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(r"a\x1b[31mb.csv: 4000 samples")
     assert "\x1b" not in done.stdout
@@ -141,7 +131,7 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     axes = [listed(ALPHA, 5.0, 9.0)]
     figures = [{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}]
     (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
-    done = command("sweep", "study.toml", cwd=tmp_path)
+    done = run_command("sweep", "study.toml", cwd=tmp_path)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     # and where the results may only be read, that is said before the figures are drawn
     folder = tmp_path / "results" / "study"
@@ -150,7 +140,8 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     before = () if os.geteuid() else ("setpriv", "--bounding-set=-dac_override")
     if before and shutil.which("setpriv") is None:
         return
-    done = command("plot", str(folder), cwd=tmp_path, before=before)
+    call = [*before, sys.executable, "-m", "jaxbl", "plot", folder]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     folder.chmod(0o755)
     said = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
     assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {said}\n")
@@ -158,7 +149,7 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])
-def test_an_interrupt_before_work_begins(tmp_path, wait):
+def test_an_interrupt_before_work_begins(tmp_path, default_interrupt, wait):
     """While modules are loaded; some of them swallow a KeyboardInterrupt."""
     made().to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid()))

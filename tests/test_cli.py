@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
+from command_server import run_command, run_python, start_command
 from measured import EMPS, made, real
 from passed import PASSED
 from progress_lines import without_progress
@@ -45,7 +46,7 @@ def interrupt(*_):
 
 
 def jaxbl(*arguments, cwd, **environment):
-    """The command as a process of its own, its output in pipes."""
+    """The command by a new interpreter, which imports what it needs."""
     return subprocess.run(
         [sys.executable, "-m", "jaxbl", *arguments], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
         env=os.environ | environment,
@@ -94,7 +95,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     assert lines[0].startswith("6 runs. The observers converged in ")
     assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[lines.index("Next:") - 1])
     assert lines[-1] == "results/study/report.html"
-    second = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
+    second = run_command("sweep", "study.toml", cwd=tmp_path, **cache)
     assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
 
 
@@ -103,8 +104,7 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
     axes = [listed("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
     study = write(tmp_path, rigid(axes=axes), "a study.toml")
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "jaxbl", "sweep", study.name, "--out", "out"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with start_command("sweep", study.name, "--out", "out", cwd=tmp_path) as process:
         for _ in range(3600):
             if list(folder.glob("points/part-*.parquet")) or process.poll() is not None:
                 break
@@ -329,16 +329,7 @@ def test_a_sweep_is_explored(call, tmp_path):
 def test_explore_serves_until_it_is_interrupted(call, tmp_path):
     write(tmp_path, rigid(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
-    command = [sys.executable, "-m", "jaxbl", "explore", "out", "--json"]
-    with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    ) as process:
-        assert process.stderr is not None
+    with start_command("explore", "out", "--json", cwd=tmp_path, TMPDIR=str(tmp_path)) as process:
         (url,) = (line.split()[1] for line in iter(process.stderr.readline, "Ctrl+C ends it.\n") if line.startswith("Open "))
         with urllib.request.urlopen(url) as answer:
             assert b"jaxbl explore" in answer.read()
@@ -537,22 +528,35 @@ def test_default_folder():
     assert folder_of(Path("a/b.toml"), None) == Path("results/b")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "command"),
-    [
-        # gain_map is run by tests/test_docs.py, as the README says
-        ("load_gains", "sweep"),
-        ("gain_boundary", "sweep"),
-        ("paper_table1", "simulate"),
-        ("tune_paper_drive", "tune"),
-        ("observer_choice", "tune"),
-        ("condition_atlas", "verify"),
-    ],
-)
-def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
-    # in a process of its own, where float64 is on only inside the engine
-    study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
+# gain_map is run by tests/test_docs.py, as the README says
+SHIPPED = {
+    "load_gains": "sweep",
+    "gain_boundary": "sweep",
+    "paper_table1": "simulate",
+    "tune_paper_drive": "tune",
+    "observer_choice": "tune",
+    "condition_atlas": "verify",
+}
+RUN_SHIPPED = """
+import contextlib, io, json, sys
+from jaxbl.__main__ import program
+
+ended = {}
+for name, command in json.loads(sys.argv[1]).items():
+    sys.argv = ["jaxbl", command, f"{name}.toml"]
+    with contextlib.redirect_stderr(io.StringIO()) as errors:
+        try:
+            program()
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+    ended[name] = [code, errors.getvalue()]
+print(json.dumps(ended))
+"""
+
+
+def shorten_study(study):
+    """The same study on few points, over half a second."""
     study["run"]["duration"] = 0.5
     tuned = study.get("tune", {})
     tuned["refine"] = 0
@@ -565,12 +569,24 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
         axis["values"] = axis["values"][-1:]
     if "refine" in study.get("sweep", {}):
         study["sweep"]["refine"] = 1
-    for name in {"alpha_ratio", "lambda_ratio"} & set(study.get("verify", {})):
-        study["verify"][name]["num"] = 8
+    for ratio in {"alpha_ratio", "lambda_ratio"} & set(study.get("verify", {})):
+        study["verify"][ratio]["num"] = 8
     for axis in study.get("axes", []):
         axis |= {"num": 2} if "num" in axis else {"values": axis["values"][:2]}
-    done = jaxbl(command, write(tmp_path, study), cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
+    # in a process of their own, where float64 is on only inside the engine
+    for name in SHIPPED:
+        study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
+        shorten_study(study)
+        write(tmp_path, study, f"{name}.toml")
+    done = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
+    ended = json.loads(done.stdout.splitlines()[-1])
+    said = {name: (code, without_progress(errors)) for name, (code, errors) in ended.items()}
+    assert said == dict.fromkeys(SHIPPED, (0, ""))
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
@@ -660,7 +676,7 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
 
 def test_inspect_runs_without_a_word_on_stderr(tmp_path):
     (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
-    done = jaxbl("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)
+    done = run_command("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     assert "motion up to" in done.stdout
 
@@ -761,9 +777,8 @@ def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis, cal
 
 def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
     """SIGINT from outside, as soon as the folder is there."""
-    command = [sys.executable, "-m", "jaxbl", *IDENTIFY]
     folder = tmp_path / "results" / "an axis"
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with start_command(*IDENTIFY, cwd=tmp_path) as process:
         for _ in range(3600):
             if folder.exists() or process.poll() is not None:
                 break
@@ -946,9 +961,7 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
 def test_completion_knows_the_commands(tmp_path):
     asked = {"_JAXBL_COMPLETE": "complete_bash", "COMP_WORDS": "jaxbl swee", "COMP_CWORD": "1"}
     code = "import sys; sys.argv = ['jaxbl']; from jaxbl.__main__ import program; program()"
-    shown = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False
-    )
+    shown = run_python("-c", code, cwd=tmp_path, **asked)
     assert shown.stdout.split() == ["sweep"]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from command_server import Process
 
 from jaxbl import workers
 from jaxbl.errors import NoResult
@@ -58,15 +59,7 @@ def test_a_killed_process_is_told():
         list(map_jobs(is_killed, [1, 2], 2))
 
 
-@pytest.fixture
-def heeded():
-    """Interrupts, which a test runner's own processes may ignore."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, heeded):
+def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, default_interrupt):
     def interrupt():
         while not any(tmp_path.iterdir()):
             time.sleep(0.05)
@@ -82,8 +75,7 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, heeded):
 
 def test_processes_end_with_the_one_they_work_for(tmp_path):
     code = "import sys, pathlib, test_workers as t; list(t.map_jobs(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
-    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
-    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"PYTHONPATH": paths}) as parent:
+    with Process(["-c", code, str(tmp_path)], Path(__file__).parent, dict(os.environ)) as parent:
         while not (files := list(tmp_path.iterdir())):
             time.sleep(0.05)
         parent.kill()

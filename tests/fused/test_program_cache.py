@@ -1,12 +1,10 @@
 """Compiled programs on disk: another process finds them without tracing, and what may have changed is not found."""
 
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_server import run_python
 
 from jaxbl.drive.effects import make_effect
 from jaxbl.fused import program_cache
@@ -42,7 +40,8 @@ def test_another_process_does_not_trace(tmp_path, monkeypatch):
     monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     said = []
     for _ in range(2):
-        done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+        done = run_python("-c", SCRIPT, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
         said.append(done.stdout.split())
     assert said[0][0] == "1" and said[1][0] == "0"
     assert said[0][1:] == said[1][1:]

@@ -2,11 +2,8 @@
 grow, and datagrams; as a command, with bad input, and interrupted."""
 
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -16,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
+from command_server import start_command
 from growing import HALF_GAP, STIFFNESS, axis, log_of
 from hidden_log import FRICTIONS, GAP, geared
 from mcap_log import write_mcap
@@ -276,11 +274,7 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
     log.write_text("".join(rows[:6000]))
     limit = ["--alarm-gap", str(0.9 * HALF_GAP)] if alarm else []
     words = ["watch", log, "--model", logs / "axis.toml", "--follow", *OPTIONS, *limit, "--out", tmp_path / "out"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "jaxbl", *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    ) as process:  # fmt: skip
-        assert process.stdout is not None
+    with start_command(*words, cwd=tmp_path, PYTHONUNBUFFERED="1") as process:
         lines = [process.stdout.readline()]
         with log.open("a") as file:
             file.writelines(rows[6000:])
