@@ -23,7 +23,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 Scheduler = Union[str, "Client", "Cluster", None]
-"""How a cluster is given (:func:`connected`)."""
+"""How a cluster is given (:func:`connect`)."""
 
 _ANSWER = 15.0
 """Seconds in which a scheduler has to answer."""

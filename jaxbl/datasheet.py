@@ -327,7 +327,7 @@ def _format_number(value: float, digits: int = 6) -> str:
 
 
 def _write_drive(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> str:
-    """The tables of the drive, its input and its sensors; numbers are :func:`by_key`."""
+    """The tables of the drive, its input and its sensors; numbers are :func:`rename_to_geared`."""
     import tomli_w
 
     from .drive.effects import CoulombFriction

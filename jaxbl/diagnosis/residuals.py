@@ -123,7 +123,7 @@ def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
 
 def _torques(experiment: Experiment, position: dict, velocity: dict, *rest: Any) -> tuple[dict[str, Array], ...]:
     """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
-    :meth:`jaxbl.drive.plant.Plant.torques`."""
+    :meth:`jaxbl.drive.plant.Plant.side_torques`."""
     acting, drive = experiment.plant.side_torques(position, velocity, *rest), experiment.drive
     total = {side: one - drive.viscous(side) * velocity[side] for side, (one, _) in acting.items()}
     return total, {side: jnp.asarray(level, velocity[side].dtype) for side, (_, level) in acting.items()}

@@ -131,7 +131,7 @@ def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
 
 @jit
 def _torques(experiment: Experiment, k: Kinematics, states: EffectStates) -> dict[str, Any]:
-    """Torques along a segment, as of :meth:`jaxbl.drive.plant.Plant.torques`."""
+    """Torques along a segment, as of :meth:`jaxbl.drive.plant.Plant.side_torques`."""
     return jax.vmap(experiment.plant.side_torques)(k.position, k.velocity, states, k.torque, k.time)
 
 

@@ -132,7 +132,7 @@ class LogFile:
     def load_seconds(self, column: str | int, unit: float, channel: str = "") -> np.ndarray:
         """A column of time stamps, s, shape (rows,), of numbers of so many seconds each, or of dates, from the first one on.
 
-        InputError as :meth:`numbers`.
+        InputError as :meth:`load_numbers`.
         """
         name = self.find_column(column, channel)
         stamps = self.load_values(name)

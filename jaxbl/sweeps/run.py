@@ -64,7 +64,7 @@ def _engine_for(store: Store, engine: Engine, require_backend: bool) -> Engine:
 @contextmanager
 def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterator[tuple[Engine, Store]]:
     """A folder into which other processes may write parts of the same study, begun by whichever is first: the engine for it,
-    and its store, which leaves the manifest alone. Raises as :func:`begun`."""
+    and its store, which leaves the manifest alone. Raises as :func:`open_or_create_store`."""
     latest = time.monotonic() + _PREPARED
     while True:
         with suppress(FolderInUse), lock_folder(folder):

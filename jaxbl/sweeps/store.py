@@ -378,7 +378,7 @@ class Store:
             self.update_manifest(parts=parts, rows=rows)
 
     def count_parts(self) -> None:
-        """Raise the number of parts to that of the files: a lost manifest of a refined study leaves only these to tell it."""
+        """Raise the number of parts to that of the files: if a refined study lost its manifest, only these tell it."""
         part_count = max((index + 1 for index, _ in self._numbered_files() if index is not None), default=0)
         if part_count > self.manifest["parts"]:
             self.update_manifest(parts=part_count)
