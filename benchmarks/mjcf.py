@@ -23,7 +23,7 @@ from effect_values import VALUES
 from small_study import small
 
 from jaxbl.config import Config, precision, prepare, read_config
-from jaxbl.exports.mjcf import mjcf
+from jaxbl.exports.mjcf import write_mjcf
 from jaxbl.simulate import Experiment, plant_trajectory
 
 DURATION = 10.0
@@ -258,7 +258,7 @@ def free_runs(kind: str, count: int) -> tuple[list[float], list[float]]:
         inputs, expected = simulated(config)
         own = difference(expected, simulated(config, 4)[1])
         if own < DETERMINED:
-            model, _, _ = mjcf(config, linear=KINDS[kind][1])
+            model, _, _ = write_mjcf(config, linear=KINDS[kind][1])
             found.append(difference(played(model, inputs, config.run.sample_period), expected))
         else:
             chaotic.append(own)
@@ -295,7 +295,7 @@ def main(count: int) -> None:
     print(f"{len(everything)} drives but {COARSE}: median {np.median(everything):.1e}, worst {max(everything):.1e}")
     for name, study in single_effects():
         config = read_config(study)
-        model, _, said = mjcf(config)
+        model, _, said = write_mjcf(config)
         inputs, expected = simulated(config)
         apart = difference(played(model, inputs, config.run.sample_period), expected)
         print(f"{name:32} {said.get(f'effects.{name}', said['transmission']).fidelity:12} {apart:.1e}", flush=True)

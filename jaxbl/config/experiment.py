@@ -98,13 +98,13 @@ class _ObserverTable(Table):
 
 def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
     """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
-    own = {field.name for field, _ in parameters(cls)}
-    others: dict[str, Any] = {
+    keys = {field.name for field, _ in parameters(cls)}
+    other_keys: dict[str, Any] = {
         name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHER_KINDS))
         for name, key in _GAINS.items()
-        if name not in own
+        if name not in keys
     }
-    gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **others))
+    gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **other_keys))
     sides: dict[str, Any] = {
         "motor": (gains, Field(description="gains of the motor observer")),
         "load": (gains | None, Field(default=None, description="gains of the load observer; none on a rigid drive")),
@@ -116,7 +116,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
 _USUAL = "super_twisting"
 ObserverTable = Annotated[
     tagged_union([_observer_table(name, cls) for name, cls in OBSERVERS.items()], "kind"),
-    BeforeValidator(lambda given: {"kind": _USUAL} | dict(given) if isinstance(given, Mapping) else given),
+    BeforeValidator(lambda table: {"kind": _USUAL} | dict(table) if isinstance(table, Mapping) else table),
 ]
 
 

@@ -18,7 +18,7 @@ class _SpanTable(Table):
     stop: float
 
     @model_validator(mode="after")
-    def _ordered(self) -> "_SpanTable":
+    def _check_order(self) -> "_SpanTable":
         if self.start >= self.stop:
             raise table_error(f"start {self.start} should be less than stop {self.stop}")
         return self
@@ -54,7 +54,7 @@ class CompareTable(Table):
 
 
 class SideCertificateTable(Table):
-    """What a certificate of one observer assumes, and the limits that gains must provably keep."""
+    """Assumptions of a certificate for one observer, and limits that its gains must provably keep."""
 
     noise: float | None = Field(
         default=None, ge=0.0, json_schema_extra={"unit": "rad"},
@@ -86,7 +86,7 @@ class SideCertificateTable(Table):
 
 
 class CertificateTable(Table):
-    """What gains provably hold, whatever noise and disturbance do within bounds; super-twisting observers only."""
+    """Bounds that gains provably hold for all noise and disturbance within limits; super-twisting observers only."""
 
     motor: SideCertificateTable = Field(default_factory=SideCertificateTable)
     load: SideCertificateTable | None = Field(default=None, description="as motor; none on a rigid drive")
@@ -98,7 +98,7 @@ TUNE_NAMES = ("tuned", "usual rule", "config")
 
 
 class TuneTable(Table):
-    """How `jaxbl tune` chooses gains; f⁺ is the bound that a pilot run of the study finds.
+    """Settings of `jaxbl tune`. f⁺ is the bound that a pilot run of the study finds.
 
     Left out, `observers` is the study's own kind, super_twisting, whose lambda and alpha are searched on a map.
     """
@@ -205,7 +205,7 @@ class MarkTable(GainPairTable):
 
 
 class VerifyTable(Table):
-    """What `jaxbl verify` does besides the study's own points: the normalised error system, and marks."""
+    """Settings of `jaxbl verify` besides the study's own points: the normalised error system, and marks."""
 
     q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
     alpha_ratio: RangeTable = Field(

@@ -8,7 +8,7 @@ from .tables import Table
 
 
 class UncertaintyTable(Table):
-    """How well the drive's numbers are known. Accepted in every study; simulate and sweep do not use it, tune can."""
+    """Uncertainty of the drive's numbers. Accepted in every study; simulate and sweep do not use it, tune can."""
 
     relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
     exact: list[str] = Field(
@@ -18,7 +18,7 @@ class UncertaintyTable(Table):
 
 
 class IdentifyTable(Table):
-    """What `jaxbl identify` seeks in a log, and how."""
+    """Settings of `jaxbl identify`."""
 
     parameters: list[str] | None = Field(
         default=None,

@@ -41,10 +41,10 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    return source if isinstance(source, Config) else _validate(*_read(source))
+    return source if isinstance(source, Config) else _validate(*_read_with_includes(source))
 
 
-_UNGIVEN = {"lambda": 1.0, "alpha": 1.0}
+_MISSING_GAINS = {"lambda": 1.0, "alpha": 1.0}
 
 
 def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
@@ -57,7 +57,7 @@ def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config,
     Raises:
         InputError: as :func:`read_config`.
     """
-    config, missing = _model(source)
+    config, missing = _read_model_of_any_log(source)
     if config.log.kind == "element":
         raise InputError(_ELEMENT.format(source if isinstance(source, str | Path) else "config"))
     return config, missing
@@ -69,11 +69,11 @@ _ELEMENT = (
 )
 
 
-def _model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
-    """As :func:`read_model`, of any kind of log."""
+def _read_model_of_any_log(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+    """Read a model as :func:`read_model` does, for any kind of log."""
     if isinstance(source, Config):
         return source, frozenset()
-    name, data, origins = _read(source)
+    name, data, origins = _read_with_includes(source)
     log = data.get("log")
     if isinstance(log, dict) and log.get("kind") == "element" and "drive" not in data:
         raise InputError(_ELEMENT.format(name))
@@ -86,19 +86,19 @@ def _model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, fro
     for side in ("motor",) if rigid else ("motor", "load"):
         if isinstance(observer, dict) and side not in observer:
             missing.add(f"observer.{side}")
-            observer[side] = dict(_UNGIVEN)
+            observer[side] = dict(_MISSING_GAINS)
     return _validate(name, data, origins), frozenset(missing)
 
 
-def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], Origins]:
-    """How messages call a study, its data with what it includes, and the file that each key came from."""
+def _read_with_includes(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], Origins]:
+    """Read a study with its included files. Returns its name for messages, the data, and the file of each key."""
     if isinstance(source, Mapping):
         data = dict(source)
         try:
             check_sizes(data)
         except InputError as error:
             raise InputError(f"config: {error}") from None
-        return "config", *_included(copy.deepcopy(data), "config", Path(), [], [])
+        return "config", *_merge_includes(copy.deepcopy(data), "config", Path(), [], [])
     return str(Path(source)), *_file(Path(source), [], [])
 
 
@@ -111,7 +111,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     data, _ = _file(path, [], [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
-    config, _ = _model(path)
+    config, _ = _read_model_of_any_log(path)
     ratio = None if config.drive.kind == "rigid" else config.drive.gear_ratio
     return config.log, ratio, config.nominal_drive()
 
@@ -125,7 +125,7 @@ def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[dict[str, An
     for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
         if isinstance(table, dict) and isinstance(table.get("file"), str):
             table["file"] = str((path.parent / table["file"]).resolve())
-    return _included(data, str(path), path.parent, [*chain, path.resolve()], read)
+    return _merge_includes(data, str(path), path.parent, [*chain, path.resolve()], read)
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -157,10 +157,10 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def _included(
+def _merge_includes(
     data: dict[str, Any], name: str, folder: Path, chain: list[Path], read: list[Path]
 ) -> tuple[dict[str, Any], Origins]:
-    """The data with the files that it includes (from `folder`) merged in, and the file that each key came from."""
+    """Merge the included files (relative to `folder`) into the data. Returns it, and the file of each key."""
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
@@ -176,18 +176,21 @@ def _included(
         try:
             path.stat()
         except OSError as error:
-            why = explain_missing_file(path, [".toml"]) if isinstance(error, FileNotFoundError) else error.strerror
-            raise InputError(f"{name}: include: {path}: {why}") from None
+            reason = explain_missing_file(path, [".toml"]) if isinstance(error, FileNotFoundError) else error.strerror
+            raise InputError(f"{name}: include: {path}: {reason}") from None
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
         _merge(merged, *_file(path, chain, read), origins)
-    _merge(merged, data, _origins(data, name), origins)
+    _merge(merged, data, _origins_from_file(data, name), origins)
     return merged, origins
 
 
-def _origins(data: Mapping[str, Any], file: str) -> Origins:
-    """All keys come from one file."""
-    return {name: Origin(file, _origins(one, file) if isinstance(one, Mapping) else {}) for name, one in data.items()}
+def _origins_from_file(data: Mapping[str, Any], file: str) -> Origins:
+    """Return origins of keys that all come from one file."""
+    return {
+        name: Origin(file, _origins_from_file(element, file) if isinstance(element, Mapping) else {})
+        for name, element in data.items()
+    }
 
 
 def _merge(into: dict[str, Any], data: dict[str, Any], new: Origins, origins: Origins) -> None:
@@ -246,10 +249,10 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
         InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
     """
     data = config.resolved()
-    known = numeric_paths(config)
+    paths = numeric_paths(config)
     for path, value in values.items():
-        if path not in known:
-            raise InputError(f"unknown path '{path}'; {suggest_path(path, known)}")
+        if path not in paths:
+            raise InputError(f"unknown path '{path}'; {suggest_path(path, paths)}")
         section, *keys = path.split(".")
         if section == "effects":
             kind, _, key = path.removeprefix("effects.").rpartition(".")

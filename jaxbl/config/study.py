@@ -82,14 +82,14 @@ class Config(Table):
         _check_sides(self)
         _check_effects(self)
         _check_input(self)
-        known = numeric_paths(self)
+        paths = numeric_paths(self)
         for path in self.uncertainty.exact:
-            if path not in known and path != "drive.gear_ratio" and path not in EFFECTS:
-                raise table_error(f"uncertainty.exact: unknown path '{path}'; {suggest_path(path, known)}")
+            if path not in paths and path != "drive.gear_ratio" and path not in EFFECTS:
+                raise table_error(f"uncertainty.exact: unknown path '{path}'; {suggest_path(path, paths)}")
         return self
 
     def build(self) -> Experiment:
-        """The experiment that the config describes, with Python numbers as leaves."""
+        """Build the experiment that the config describes, with Python numbers as leaves."""
         rigid = self.drive.kind == "rigid"
         return Experiment(
             drive=self.drive.build(),
@@ -105,7 +105,7 @@ class Config(Table):
         )
 
     def nominal_drive(self) -> NominalDrive:
-        """What a log of the drive is checked against."""
+        """Return the nominal numbers that a log of the drive is checked against."""
         drive, law = self.drive, None if self.transmission is None else self.transmission.build()
         if law is None or drive.kind != "two_inertia":
             return NominalDrive(drive.motor_inertia, drive.motor_viscous)
@@ -120,25 +120,25 @@ class Config(Table):
         )
 
     def resolved(self) -> dict[str, Any]:
-        """The whole config as plain data, defaults filled in."""
+        """Return the config as plain data with defaults filled in."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
     def remarks(self) -> list[str]:
-        """What is valid and perhaps not meant, in sentences."""
-        found, run = [], self.run
+        """Return sentences on settings that are valid and perhaps not meant."""
+        remarks, run = [], self.run
         for key, table in (("excitation", self.excitation), ("tune.holdout", self.tune and self.tune.holdout)):
             # half a sample for the rounding of times, one for the last value's own hold
             if table is not None and table.kind == "recorded" and table.length < run.duration - 2.0 * run.sample_period:
                 ends = f"{table.file} ends after {table.length:g} s, the run after {run.duration:g} s"
-                found.append(f"{key}: {ends}; its last value is held for the rest.")
-        return found
+                remarks.append(f"{key}: {ends}; its last value is held for the rest.")
+        return remarks
 
     def to_toml(self) -> str:
         """The whole config as TOML that :func:`.reading.read_config` takes."""
         return tomli_w.dumps(self.resolved())
 
 
-_MOST_SUBSTEPS = next(known.maximum for field, known in parameters(Run) if field.name == "substeps")
+_MOST_SUBSTEPS = next(parameter.maximum for field, parameter in parameters(Run) if field.name == "substeps")
 
 
 def _check_sides(config: Config) -> None:
@@ -148,8 +148,8 @@ def _check_sides(config: Config) -> None:
         raise table_error("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
     if not rigid and config.transmission is None:
         raise table_error("[transmission] is missing: a two_inertia drive needs one, such as law = 'dead_zone'")
-    others = () if config.tune is None else config.tune.compare
-    gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(others)}
+    compared_tables = () if config.tune is None else config.tune.compare
+    gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(compared_tables)}
     for name, table in gains.items():
         if rigid and table.load is not None:
             raise table_error(f"{name}.load has no meaning on a rigid drive; remove it")
@@ -165,16 +165,16 @@ def _check_sides(config: Config) -> None:
         rate = config.transmission.build().stiffness
         rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
         # the scheme is stable while step * frequency < 2
-        least = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
-        if least > _MOST_SUBSTEPS:
+        least_substeps = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
+        if least_substeps > _MOST_SUBSTEPS:
             raise table_error(
                 f"drive, transmission: inertias and stiffness make an oscillation of {math.sqrt(rate):.3g} rad/s, which "
                 f"{_MOST_SUBSTEPS} plant steps a sample cannot resolve; check their units"
             )
-        if config.run.substeps < least:
+        if config.run.substeps < least_substeps:
             raise table_error(
                 f"run.substeps: {config.run.substeps} plant steps a sample are unstable for this stiffness and "
-                f"sample_period; at least {least} are needed, ten times as many for accuracy"
+                f"sample_period; at least {least_substeps} are needed, ten times as many for accuracy"
             )
 
 
@@ -209,37 +209,37 @@ def _check_input(config: Config) -> None:
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:
-    """Dotted paths of everything that an axis may vary in this config, with unit and description."""
-    found: dict[str, Parameter] = {}
+    """Return all paths that an axis may vary in this config, with unit and description."""
+    parameters_by_path: dict[str, Parameter] = {}
     for section in ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
                     "identifier", "run"):  # fmt: skip
         table = getattr(config, section)
         if table is not None:
-            found |= dict(_paths(table, section))
-    found[KIND_PATH] = Parameter("", "kind of observer")
-    for path in _of_other_kinds(config):
-        found.pop(path, None)
+            parameters_by_path |= dict(_paths(table, section))
+    parameters_by_path[KIND_PATH] = Parameter("", "kind of observer")
+    for path in _paths_of_other_observers(config):
+        parameters_by_path.pop(path, None)
     kinds = [effect.kind for effect in config.effects]
     for i, effect in enumerate(config.effects):
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
-        found |= dict(_paths(effect, f"effects.{label}"))
+        parameters_by_path |= dict(_paths(effect, f"effects.{label}"))
     if config.drive.kind == "rigid":
         return {
-            path: known
-            for path, known in found.items()
+            path: parameter
+            for path, parameter in parameters_by_path.items()
             if path.startswith("effects.") or ("load" not in path and not path.startswith("identifier."))
         }
-    return found
+    return parameters_by_path
 
 
-def _of_other_kinds(config: Config) -> Iterator[str]:
+def _paths_of_other_observers(config: Config) -> Iterator[str]:
     """Paths of observers that say nothing of the study's own kind: its sides may hold gains of others."""
-    own = config.observer.observer
-    if own is OBSERVERS[config.observer.kind]:
+    observer = config.observer.observer
+    if observer is OBSERVERS[config.observer.kind]:
         yield "observer.discretisation"
-    gains = {config_key(field.name) for field, _ in parameters(own)}
-    others = {config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
-    yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in others)
+    gains = {config_key(field.name) for field, _ in parameters(observer)}
+    other_gains = {config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
+    yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in other_gains)
 
 
 KIND_PATH = "observer.kind"
@@ -259,10 +259,10 @@ def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
             yield path, Parameter(str(extra.get("unit", "")), field.description or "")
 
 
-def suggest_path(path: str, known: Mapping[str, Parameter]) -> str:
+def suggest_path(path: str, paths: Mapping[str, Parameter]) -> str:
     """A hint that names the nearest valid path, or all of them where none is near."""
-    close = difflib.get_close_matches(path, list(known), n=1, cutoff=0.3)
-    return f"nearest valid path: '{close[0]}'" if close else f"valid paths: {', '.join(known)}"
+    close = difflib.get_close_matches(path, list(paths), n=1, cutoff=0.3)
+    return f"nearest valid path: '{close[0]}'" if close else f"valid paths: {', '.join(paths)}"
 
 
 def precision(config: Config) -> Any:

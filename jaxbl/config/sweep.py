@@ -14,12 +14,12 @@ DEFAULT_TOLERANCE = 0.1
 
 
 def is_boolean(column: str) -> bool:
-    """Whether a metric column is true or false."""
+    """Return True if the values of a metric column are true or false."""
     return column.rpartition(".")[2] in ("converged", "finite")
 
 
 class SweepTable(Table):
-    """How the axes are combined and repeated."""
+    """Combination and repetition of the axes."""
 
     seeds: int = Field(
         default=1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
@@ -122,7 +122,7 @@ class AxisTable(Table):
         return space(self.start, self.stop, self.size(depth))
 
     def size(self, depth: int = 0) -> int:
-        """How many values :meth:`grid` has."""
+        """Return the number of values of :meth:`grid`."""
         if self.values is not None:
             return len(self.values)
         assert self.num is not None

@@ -28,7 +28,9 @@ class Table(StrictTable):
         names = {name for name in type(self).model_fields if name not in ("kind", "law")}
         # of the class: an instance would bind a partial function from Python 3.14 on
         values = {name: getattr(self, name) for name in names}
-        return type(self).factory(**{name: tuple(one) if isinstance(one, list) else one for name, one in values.items()})
+        return type(self).factory(
+            **{name: tuple(element) if isinstance(element, list) else element for name, element in values.items()}
+        )
 
 
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
@@ -38,9 +40,9 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     single value that tells it from others (`kind="sine"`).
     """
     fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
-    for field, known in parameters(module):
+    for field, parameter in parameters(module):
         # lists of numbers are empty by default
-        number = Positive if known.above == 0.0 else float
+        number = Positive if parameter.above == 0.0 else float
         kind: Any = field.type if field.metadata.get("static") else list[float] if field.default == () else number
         optional = field.default is None
         fields[field.name] = (
@@ -48,11 +50,11 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
             Field(
                 default=... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
                 alias=config_key(field.name) if config_key(field.name) != field.name else None,
-                description=known.doc,
-                json_schema_extra={"unit": known.unit} if known.unit else None,
-                ge=known.minimum,
-                gt=known.above,
-                le=known.maximum,
+                description=parameter.doc,
+                json_schema_extra={"unit": parameter.unit} if parameter.unit else None,
+                ge=parameter.minimum,
+                gt=parameter.above,
+                le=parameter.maximum,
             ),
         )
     model = create_model(module.__name__, __base__=base, __doc__=module.__doc__, **fields)

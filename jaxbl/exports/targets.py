@@ -20,7 +20,7 @@ from .chain import build_observer_chain
 from .filter import input_columns, write_filter_code
 from .fmu import FMI, build_fmu
 from .lowering import count_operations
-from .mjcf import MUJOCO, by_answer, mjcf
+from .mjcf import MUJOCO, group_by_fidelity, write_mjcf
 from .plant import build_plant_program
 from .st import write_st_code
 
@@ -117,8 +117,8 @@ def _export_st(request: Request) -> Files:
 
 
 def _export_mjcf(request: Request) -> Files:
-    text, step, notes = mjcf(request.config, linear=request.linear)
-    lists = by_answer(notes)
+    text, step, notes = write_mjcf(request.config, linear=request.linear)
+    lists = group_by_fidelity(notes)
     lines = [f"model.xml: MuJoCo {MUJOCO} or later, steps of {step:.3g} s."]
     lines += [
         f"{answer}: {path}: {reason}" for answer in ("approximated", "not said") for path, reason in lists[answer].items()

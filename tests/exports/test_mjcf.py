@@ -17,7 +17,7 @@ from jaxbl.drive import as_arrays
 from jaxbl.drive.effects import CoulombFriction, SideEffect
 from jaxbl.drive.transmission import LinearShaft, SigmoidBacklash
 from jaxbl.errors import InputError
-from jaxbl.exports.mjcf import mjcf
+from jaxbl.exports.mjcf import write_mjcf
 from jaxbl.exports.mujoco_parts import ActuatorParts, MujocoParts, SideParts, exactly, unsaid
 from jaxbl.exports.to_mujoco import to_mujoco
 
@@ -50,7 +50,7 @@ def study(*effects, **tables):
 
 def compiled(config, linear=()):
     """The model at the study's initial state, and what it has of the study."""
-    text, _, said = mjcf(config, linear=linear)
+    text, _, said = write_mjcf(config, linear=linear)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -133,7 +133,7 @@ def test_every_part_is_listed_with_its_path(tmp_path):
     out = jaxbl.export(config, tmp_path / "out", "mjcf")
     about = json.loads((tmp_path / "out" / "export.json").read_text())
     assert out.summary.items() <= about.items()
-    written, step, said = mjcf(config)
+    written, step, said = write_mjcf(config)
     groups = {how: set(about[how]) for how in ("exactly", "approximated", "not said")}
     assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
     assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
@@ -154,14 +154,14 @@ def test_every_part_is_listed_with_its_path(tmp_path):
 def test_sides_on_a_line_slide():
     numbers = {"amplitude": 0.1, "harmonic": 6.0}
     config = read_config(rigid(effects=[{"kind": "motor.cogging", **numbers}]))
-    text, _, _ = mjcf(config, linear=["motor"])
+    text, _, _ = write_mjcf(config, linear=["motor"])
     (joint,) = ET.fromstring(text).iter("joint")
     assert joint.get("type") == "slide"
     assert "drive.motor_inertia = 0.05 kg -->" in text
     assert "amplitude = 0.1 N," in text
     assert mujoco.MjModel.from_xml_string(text).body("motor").mass[0] == 0.05
     with pytest.raises(InputError, match=r"^linear: the drive has no side 'load'; it should be among motor$"):
-        mjcf(config, linear=["load"])
+        write_mjcf(config, linear=["load"])
 
 
 def test_options_of_another_target_are_refused(tmp_path):
@@ -198,12 +198,12 @@ def test_limits_keep_their_place_in_the_chain():
 
 def test_steps_resolve_gear_and_effects():
     config = study(transmission=GAP | {"stiffness": 400.0}, run={"duration": 0.1, "substeps": 10})
-    _, step, _ = mjcf(config)
+    _, step, _ = write_mjcf(config)
     fastest = np.sqrt(400.0 * (1.0 / 0.05 + 25.0 / 7.0))
     assert step == 1e-3 / np.ceil(max(10.0, 1e-3 * fastest / 0.1))
     quick = {"kind": "actuator.lag", "time_constant": 5e-5}
-    assert mjcf(study(quick, transmission=SHAFT))[1] == pytest.approx(5e-6)
-    assert mjcf(study(quick, quick, transmission=SHAFT))[2]["effects.1"].fidelity == "not said"
+    assert write_mjcf(study(quick, transmission=SHAFT))[1] == pytest.approx(5e-6)
+    assert write_mjcf(study(quick, quick, transmission=SHAFT))[2]["effects.1"].fidelity == "not said"
 
 
 class UnknownToMujoco(SideEffect):
@@ -229,4 +229,4 @@ def test_classes_of_other_packages_are_asked(monkeypatch):
     assert parts.sides["motor"].dry == 1.0
     monkeypatch.setattr(LinearShaft, "to_mujoco", lambda law, parts: unsaid("a secret"), raising=False)
     with pytest.raises(InputError, match=r"^transmission\.law: MuJoCo cannot say 'linear_shaft': a secret; another law"):
-        mjcf(study(transmission=SHAFT))
+        write_mjcf(study(transmission=SHAFT))
