@@ -41,7 +41,7 @@ def said(*command: Any, folder: Path) -> str:
 
 def row(kind: str, precision: str) -> list[str]:
     """Of both sides with the identifier, on the paper's drive."""
-    study = read_config(Path(__file__).parent.parent / "sweeps" / "paper_table1.toml").resolved()
+    study = read_config(Path(__file__).parent.parent / "sweeps" / "paper_table1.toml").to_dict()
     study["observer"] = {"kind": kind, "motor": GAINS, "load": GAINS}
     for table in ("axes", "figures", "verify", "tune", "notes"):
         study.pop(table, None)

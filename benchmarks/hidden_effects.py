@@ -50,7 +50,7 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files(logs, holdout, Path(folder))
         found = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)
-    return {**found.summary, "model": found.model.resolved()}
+    return {**found.summary, "model": found.model.to_dict()}
 
 
 def oracle(case: Case) -> Mapping[str, float]:

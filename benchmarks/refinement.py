@@ -32,7 +32,7 @@ STUDY = Path(__file__).parents[1] / "sweeps" / "gain_boundary.toml"
 
 def full_grid(config):
     """The study of the fine grid."""
-    data = config.resolved()
+    data = config.to_dict()
     depth = data["sweep"].pop("refine")
     for axis in data["axes"]:
         if "num" in axis:

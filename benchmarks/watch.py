@@ -75,7 +75,7 @@ def half_gap_of(config: Config) -> float:
 
 
 def study(name: str, **tables: Any) -> Config:
-    data = read_config(SWEEPS / STUDIES[name]).resolved()
+    data = read_config(SWEEPS / STUDIES[name]).to_dict()
     for table in ("axes", "figures", "sweep"):
         data.pop(table, None)
     for path, value in tables.items():

@@ -62,7 +62,7 @@ def simulated_axis() -> MeasuredLog:
     """The axis of docs/logs.md."""
     frame = run(ROOT / "sweeps" / "geared_axis.toml").trace[["t", "u", "theta_e", "theta_s"]]
     config, _ = read_model(ROOT / "sweeps" / "geared_axis_nominal.toml")
-    return MeasuredLog(frame, config.resolved())
+    return MeasuredLog(frame, config.to_dict())
 
 
 def hidden_effect() -> MeasuredLog:

@@ -117,7 +117,7 @@ def test_the_example_of_the_design_is_valid_and_comes_back_from_toml(tmp_path):
     assert config.effects[0].torque == 0.02
     (tmp_path / "b.toml").write_text(config.to_toml())
     again = read_config(tmp_path / "b.toml")
-    assert again.resolved() == config.resolved()
+    assert again.to_dict() == config.to_dict()
     # defaults are filled in
     assert tomllib.loads(config.to_toml())["run"]["position_tolerance"] == 1e-3
 
@@ -469,7 +469,7 @@ JUNK = st.one_of(
     st.lists(st.floats(), max_size=3),
     st.dictionaries(st.sampled_from(["kind", "path", "values", "alpha", "x", "y\n"]), st.floats() | st.text(max_size=3)),
 )
-COMPLETE = read_config(tomllib.loads(EXAMPLE)).resolved()
+COMPLETE = read_config(tomllib.loads(EXAMPLE)).to_dict()
 
 
 def places(data, prefix=()):
@@ -487,7 +487,7 @@ def places(data, prefix=()):
     )
 )
 def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
-    data = read_config(COMPLETE).resolved()
+    data = read_config(COMPLETE).to_dict()
     for place, junk, new_key in mutations:
         target = data
         for key in place[:-1]:
@@ -507,7 +507,7 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
         message = str(error)
     else:
         message = ""
-        assert read_config(tomllib.loads(config.to_toml())).resolved() == config.resolved()
+        assert read_config(tomllib.loads(config.to_toml())).to_dict() == config.to_dict()
     assert message.isprintable()
 
 
@@ -543,9 +543,9 @@ def test_included_tables_are_merged_key_by_key(tmp_path):
     observer = config.observer.motor
     assert (observer.lambda_, observer.alpha, observer.velocity_error) == (1.0, 3.0, 0.25)
     assert (config.run.duration, config.run.substeps) == (0.3, 1)
-    assert "include" not in config.resolved() and "include" not in config.to_toml()
+    assert "include" not in config.to_dict() and "include" not in config.to_toml()
     (tmp_path / "resolved.toml").write_text(config.to_toml())
-    assert read_config(tmp_path / "resolved.toml").resolved() == config.resolved()
+    assert read_config(tmp_path / "resolved.toml").to_dict() == config.to_dict()
 
 
 def test_keys_of_the_including_file_win_and_tables_of_another_kind_replace(tmp_path):

@@ -32,7 +32,7 @@ def test_it_takes_what_a_part_may_have(errors):
     """What is included has the other keys; a column's name alone stands for a table."""
     for part in ({}, {"include": "a.toml", "drive": {"motor_inertia": 0.1}}, {"log": {"theta_e": "x", "u": 3}}):
         assert errors(part) == []
-    assert errors(Config.model_validate(small(axes=[listed(ALPHA, 1.0)])).resolved()) == []
+    assert errors(Config.model_validate(small(axes=[listed(ALPHA, 1.0)])).to_dict()) == []
 
 
 @pytest.mark.parametrize(

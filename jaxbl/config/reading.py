@@ -248,7 +248,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
     """
-    data = config.resolved()
+    data = config.to_dict()
     paths = numeric_paths(config)
     for path, value in values.items():
         if path not in paths:

@@ -119,7 +119,7 @@ class Config(Table):
             half_gap=float(law.half_gap),
         )
 
-    def resolved(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the config as plain data with defaults filled in."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
@@ -135,7 +135,7 @@ class Config(Table):
 
     def to_toml(self) -> str:
         """The whole config as TOML that :func:`.reading.read_config` takes."""
-        return tomli_w.dumps(self.resolved())
+        return tomli_w.dumps(self.to_dict())
 
 
 _MOST_SUBSTEPS = next(parameter.maximum for field, parameter in parameters(Run) if field.name == "substeps")

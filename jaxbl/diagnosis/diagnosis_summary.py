@@ -199,7 +199,7 @@ def extended_study(
     tables: Sequence[Mapping[str, Any]] = (),
 ) -> Config:
     """The study with effects more, some of them tables of torques, and with these numbers."""
-    data = config.resolved()
+    data = config.to_dict()
     added = [*({"kind": name, **one} for name, one in numbers.items()), *tables]
     data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
     return with_values(read_config(data), values)
@@ -215,7 +215,7 @@ def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
 
 def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> dict[str, Any]:
     """The best model with another effect, as tables of a study."""
-    data = extended_study(config, rival.numbers, free_values(own, rival.theta)).resolved()
+    data = extended_study(config, rival.numbers, free_values(own, rival.theta)).to_dict()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
 
 

@@ -147,7 +147,7 @@ def write_gap_experiment(
 def with_gap(model: Config, path: str, half: float) -> Config:
     """A study with a half gap, rad, in the number that a path names."""
     if path.startswith("effects."):
-        data = model.resolved()
+        data = model.to_dict()
         gap = f"transmission.{Backlash.kind}"
         effects = [one for one in data.get("effects", []) if one["kind"] != gap]
         data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda one: one["kind"])
@@ -185,7 +185,7 @@ def next_experiment(
         travel: of the motor that is allowed, rad (the load may move as far over the gear); left out: those of the log.
     """
     rival = summary["rival"]
-    data = model.resolved() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
+    data = model.to_dict() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
     with jax.enable_x64(True):
         models = [on_record(each, record) for each in (model, read_config(data))]
         return _parting(models, record, torque, travel)

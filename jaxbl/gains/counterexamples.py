@@ -83,7 +83,7 @@ def _causes(study: Config, level: str, side: str, rows: pd.DataFrame, stages: St
     for number, (_, part) in enumerate(kept.groupby(structural, sort=False) if structural else [((), kept)]):
         name = f"{level}-{side}-{number}"
         fixed = {path: part[path].iloc[0] for path in structural}
-        mended = _mended(_with(study.resolved(), fixed)["run"], level)
+        mended = _mended(_with(study.to_dict(), fixed)["run"], level)
         together = {path: value for change in mended.values() for path, value in change.items()}
         frames = {cause: repeated(study, part, fixed, change, stages, f"{name}-{cause}") for cause, change in mended.items()}
         mends = {cause: frame[f"{side}.converged"].to_numpy(bool) for cause, frame in frames.items() if frame is not None}
@@ -105,11 +105,11 @@ def repeated(
     study: Config, rows: pd.DataFrame, fixed: dict[str, Any], change: dict[str, Any], stages: Stages, name: str
 ) -> pd.DataFrame | None:
     """Some runs once more with some keys changed, as a study of listed points; None where that changes nothing."""
-    unchanged = _with(study.resolved(), fixed)
+    unchanged = _with(study.to_dict(), fixed)
     data = _with(unchanged, change)
     paths = [axis.path for axis in study.axes if axis.path not in fixed and axis.path not in change]
     dropped = [axis.path for axis in study.axes if axis.path in change and axis.path not in fixed]
-    before, after = (read_config({**tables, "axes": []}).resolved() for tables in (unchanged, data))
+    before, after = (read_config({**tables, "axes": []}).to_dict() for tables in (unchanged, data))
     if not dropped and before == after:
         return None
     points = rows[paths].drop_duplicates()

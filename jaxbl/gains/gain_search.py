@@ -211,7 +211,7 @@ class GainSearch:
     def _run_study(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
         """Run one stage. Its axes are the scenarios' columns and `axes`: columns by label, which advance together."""
         config = self.scenarios.config
-        data = config.resolved()
+        data = config.to_dict()
         for key in ("notes", "figures", "tune", "uncertainty", "axes"):
             data.pop(key, None)
         data["title"] = f"{config.title} ({name})" if config.title else name

@@ -28,7 +28,7 @@ from .worst_case import half_cycle
 def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str, Any]]:
     """Bounds, margins and peak ratios of the marked gains, on the study's drive with ideal encoders (`ideal`)."""
     found = []
-    base = ideal.resolved()
+    base = ideal.to_dict()
     drive = config.build().drive
     # the observer does not act on the drive: one run has the disturbance of all gains
     trace = run(read_config(base | {"axes": [], "sweep": {}})).trace if config.verify.marks else None

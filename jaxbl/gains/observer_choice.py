@@ -237,7 +237,7 @@ class _Search:
         # gains that were rounded to the same number are run once
         keys = list(zip(*columns.values(), strict=True))
         unique = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-        data = group.places[0].scenarios.config.resolved()
+        data = group.places[0].scenarios.config.to_dict()
         for key in ("notes", "figures", "tune", "uncertainty", "axes"):
             data.pop(key, None)
         data["title"] = f"{self.config.title} ({name})" if self.config.title else name

@@ -31,7 +31,7 @@ def scenarios_of(config: Config, table: TuneTable) -> Scenarios:
     """
     if not table.worst_over_uncertainty:
         return Scenarios(config, ["nominal"], {})
-    data, relative = config.resolved(), config.uncertainty.relative
+    data, relative = config.to_dict(), config.uncertainty.relative
     effects: list[dict[str, Any]] = data.setdefault("effects", [])
     found: dict[str, list[tuple[int, str, float]]] = {}
     for number, side in itertools.product(("inertia", "viscous"), config.build().sides):

@@ -169,7 +169,7 @@ def judged_sides(config: Config) -> list[str]:
 
 def _only(config: Config, **updates: Any) -> Config:
     """The study without what its runs do not depend on, and with other tables."""
-    data = config.resolved()
+    data = config.to_dict()
     for key in ("figures", "verify"):
         data.pop(key, None)
     data |= updates
@@ -180,7 +180,7 @@ def _only(config: Config, **updates: Any) -> Config:
 
 def _ideal(config: Config) -> Config:
     """The study with ideal encoders and the implicit observer, at one seed."""
-    observer = config.resolved()["observer"] | {"discretisation": "implicit"}
+    observer = config.to_dict()["observer"] | {"discretisation": "implicit"}
     dropped = ("encoders.", "observer.discretisation", "run.sample_period", "run.substeps")
     axes = [axis.model_dump(exclude_none=True) for axis in config.axes if not axis.path.startswith(dropped)]
     labels = [axis.get("zip") for axis in axes]
@@ -189,7 +189,7 @@ def _ideal(config: Config) -> Config:
             del axis["zip"]
             if "values" in axis:
                 axis["values"] = list(dict.fromkeys(axis["values"]))
-    swept = config.resolved()["sweep"] | {"seeds": 1}
+    swept = config.to_dict()["sweep"] | {"seeds": 1}
     return _only(config, encoders={}, observer=observer, axes=axes, sweep=swept)
 
 

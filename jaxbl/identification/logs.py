@@ -60,7 +60,7 @@ class LogTask:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl"), _SUMMARIES], sort_keys=True)
+        text = json.dumps([self.config.to_dict(), sorted(self.missing), version("jaxbl"), _SUMMARIES], sort_keys=True)
         total = hashlib.sha256(text.encode())
         for record in (self.record, self.holdout):
             if record is not None:

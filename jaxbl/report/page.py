@@ -124,7 +124,7 @@ def _model_text(found: "Identification | Diagnosis") -> str:
     """The fitted study as TOML; for want of an excitation with the torque of `trace.parquet` beside it, at its period."""
     from jaxbl.identification.logs import run_of
 
-    data = found.model.resolved()
+    data = found.model.to_dict()
     if found.replays:
         data["run"] |= run_of(found.model, found.record)
         data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}

@@ -35,7 +35,7 @@ def write_watch_report(found: Watch, folder: Path, steps: list[NextStep] | None 
                 first, last = (_at(one, side, name) for one in (found.summary["first"], found.summary["last"]))
                 rows.append([f"{side}: {label}", *first, *last, units[side][name]])
     columns = ["number", "first value", "standard error", "last value", "standard error", "unit"]
-    config = tomli_w.dumps(found.task.config.resolved())
+    config = tomli_w.dumps(found.task.config.to_dict())
     lead, remarks = watch_lines(found.summary), found.summary["notes"]
     title = found.task.config.title or f"Watch of {Path(found.task.name).name}"
     lines = write_report(

@@ -222,7 +222,7 @@ def _compare_versions(first: StudyResult, second: StudyResult) -> dict[str, tupl
 
 
 def _config_without(config: Config, keys: tuple[str, ...]) -> dict[str, Any]:
-    return {key: table for key, table in config.resolved().items() if key not in keys}
+    return {key: table for key, table in config.to_dict().items() if key not in keys}
 
 
 def _flatten_tables(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -66,7 +66,7 @@ def identity(config: Config, command: str = "sweep") -> str:
 
     Title, notes, figures, chunk size, and tables and keys that only other commands read decide nothing.
     """
-    data = config.resolved()
+    data = config.to_dict()
     data["sweep"].pop("chunk", None)
     if data["sweep"].pop("metrics", None) is not None and command == "sweep":
         data["sweep"]["metrics"] = config.sweep.requested_metrics

@@ -75,4 +75,4 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     longer = extended_study(task.config, {}, {}, found.effects())
     (effect,) = longer.effects
     assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)
-    assert read_config(longer.resolved()).build().effects[0].positions == pytest.approx(effect.positions)
+    assert read_config(longer.to_dict()).build().effects[0].positions == pytest.approx(effect.positions)

@@ -34,14 +34,14 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
         data[table][key] = value
     study = tmp_path / "axis.toml"
     study.write_text(tomli_w.dumps(data))
-    before = read_config(study).resolved()["observer"]
+    before = read_config(study).to_dict()["observer"]
     command("tune", study, "--out", tmp_path / "tuned", "--quiet")
 
     tuned = tmp_path / "tuned_axis.toml"
     gains_alone = {key: value for key, value in data.items() if key not in ("observer", "tune")}
     tuned.write_text(tomli_w.dumps({"include": ["axis.toml", "tuned/gains.toml"]} | gains_alone))
     config = read_config(tuned)
-    after = config.resolved()["observer"]
+    after = config.to_dict()["observer"]
     assert all(after[side]["alpha"] != before[side]["alpha"] for side in ("motor", "load"))
 
     log = tmp_path / "log.csv"

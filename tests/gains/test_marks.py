@@ -65,7 +65,7 @@ def test_alpha_above_the_disturbance_but_too_small_a_lambda(marks):
 
 def moved(position_error):
     """The explanation of the small gains from a position error."""
-    data = STUDY.resolved() | {"verify": {"marks": MARKS[1:2]}}
+    data = STUDY.to_dict() | {"verify": {"marks": MARKS[1:2]}}
     data["observer"]["motor"] |= {"position_error": position_error, "velocity_error": 0.0}
     study = read_config(data)
     (one,) = judge_marks(study, study, Stages(study, "verify"))
@@ -88,6 +88,6 @@ def test_a_larger_start_ends_in_a_limit_cycle():
 
 
 def test_without_alpha_there_is_nothing_to_explain():
-    study = read_config(STUDY.resolved() | {"verify": {"marks": [{"name": "none", "lambda": 1.0, "alpha": 0.0}]}})
+    study = read_config(STUDY.to_dict() | {"verify": {"marks": [{"name": "none", "lambda": 1.0, "alpha": 0.0}]}})
     (one,) = judge_marks(study, study, Stages(study, "verify"))
     assert one["on_this_disturbance"] is None

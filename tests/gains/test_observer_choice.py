@@ -71,7 +71,7 @@ def test_the_search_agrees_with_brute_force(chosen):
     """A sweep of its own over a fine grid finds no gains that are much better."""
     config = read_config(study())
     found = chosen.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
-    data = config.resolved()
+    data = config.to_dict()
     data.pop("tune")
     data["observer"] = {"kind": "luenberger", "motor": found["gains"] | {"velocity_error": 0.1}}
     axes = {"bandwidth": np.geomspace(1.0, 3e3, 60), "damping": np.geomspace(0.003, 10.0, 40)}
@@ -89,7 +89,7 @@ def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
     assert chosen.summary["holdout"]["seeds"] == [2, 9]
     logs = {}
     for kind, one in point["kinds"].items():
-        data = read_config(study()).resolved()
+        data = read_config(study()).to_dict()
         data.pop("tune")
         data |= {"excitation": SINE, "sweep": {"seeds": 8, "first_seed": 2}}
         data["observer"] = {"kind": kind, "motor": one["gains"] | {"velocity_error": 0.1}}
@@ -109,7 +109,7 @@ def test_the_chosen_observer_can_be_included(chosen, tmp_path):
     kind = chosen.summary["for_both_sides"]
     assert kind == chosen.summary["points"][0]["sides"]["motor"]["best"]
     (tmp_path / "gains.toml").write_text(observer_toml(chosen.summary), encoding="utf-8")
-    data = read_config(study()).resolved()
+    data = read_config(study()).to_dict()
     data.pop("tune")
     data.pop("observer")
     (tmp_path / "study.toml").write_text('include = "gains.toml"\n' + tomli_w.dumps(data), encoding="utf-8")

@@ -51,9 +51,7 @@ def test_points_beyond_noise_are_named_with_their_place_and_direction():
     frame = compare(first, second).frame(RMSE)
     assert (frame["differs"] == (frame[ALPHA] > 5.0)).all()
     # without pairs this noise hides the change
-    later = made(
-        first.config.resolved() | {"sweep": {"seeds": 6, "first_seed": 50}}, motor__velocity_rmse=noisy(far, seed=2)
-    )
+    later = made(first.config.to_dict() | {"sweep": {"seeds": 6, "first_seed": 50}}, motor__velocity_rmse=noisy(far, seed=2))
     later.source["seed"] += 50
     apart = compare(first, later)
     assert (apart.seeds, apart.paired) == (0, False)

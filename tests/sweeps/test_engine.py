@@ -75,7 +75,7 @@ def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference,
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_both_backends_give_the_same_figures(study, precision):
-    config = read_config(study.resolved() | {"run": study.resolved()["run"] | {"precision": precision}})
+    config = read_config(study.to_dict() | {"run": study.to_dict()["run"] | {"precision": precision}})
     fused, scanned = (sweep(config, backend=backend).frame for backend in ("fused", "scan"))
     rtol = 1e-6 if precision == "float64" else 1e-2
     for name in fused.columns:
@@ -159,7 +159,7 @@ def test_seeds_alone_are_scanned():
 
 
 def with_chunk(config, chunk):
-    return read_config(config.resolved() | {"sweep": {**config.resolved()["sweep"], "chunk": chunk}})
+    return read_config(config.to_dict() | {"sweep": {**config.to_dict()["sweep"], "chunk": chunk}})
 
 
 def test_layouts():
@@ -323,7 +323,7 @@ def test_float32_and_float64_agree_on_what_converges_in_the_demo():
 
 
 def with_precision(config, precision):
-    data = config.resolved()
+    data = config.to_dict()
     data["run"]["precision"], data["sweep"]["seeds"] = precision, 1
     return read_config(data)
 

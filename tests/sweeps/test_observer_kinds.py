@@ -107,7 +107,7 @@ def test_tune_says_which_observers_it_is_for():
 def test_gains_of_any_kind_can_be_included(tmp_path):
     """A file of gains alone, as the explorer saves them, under a study that names the kind."""
     (tmp_path / "gains.toml").write_text("[observer.motor]\nbandwidth = 70.0\n[observer.load]\nbandwidth = 80.0\n")
-    data = read_config(study(observer={"kind": "extended_state", "motor": GAINS, "load": GAINS})).resolved()
+    data = read_config(study(observer={"kind": "extended_state", "motor": GAINS, "load": GAINS})).to_dict()
     data["observer"] = {"kind": "extended_state"}
     (tmp_path / "study.toml").write_text('include = "gains.toml"\n' + tomli_w.dumps(data))
     observer = read_config(tmp_path / "study.toml").build().observer

@@ -58,7 +58,7 @@ def test_what_a_study_leaves(finished):
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["finished"]
     assert (manifest["parts"], manifest["rows"]) == (3, 9)
-    assert read_config(folder / "study.toml").resolved() == read_config(study()).resolved()
+    assert read_config(folder / "study.toml").to_dict() == read_config(study()).to_dict()
     parts = [pd.read_parquet(folder / "points" / f"part-0000{i}.parquet") for i in range(3)]
     assert list(parts[0].columns[:3]) == [ALPHA, "seed", "finite"]
     pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), result.frame)
@@ -144,7 +144,7 @@ def test_only_title_notes_and_figures_changed_is_the_same_study(copy, computed):
     config = read_config(study({"title": "other", "notes": ["a"]}, figures=[FIGURE]))
     sweep(config, copy)
     assert computed == []
-    assert open_study(copy).config.resolved() == config.resolved()
+    assert open_study(copy).config.to_dict() == config.to_dict()
 
 
 def test_overwriting_is_asked_for(copy, computed):
@@ -490,4 +490,4 @@ def test_the_metrics_asked_for_are_a_sweeps_own():
     for command in ("simulate", "verify", "tune"):
         assert of(command, "converged") == of(command)
     # folders that are there stay what they are
-    assert "metrics" not in read_config(rigid()).resolved()["sweep"]
+    assert "metrics" not in read_config(rigid()).to_dict()["sweep"]

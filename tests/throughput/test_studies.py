@@ -14,7 +14,7 @@ from jaxbl.throughput.studies import STUDIES
 def test_those_of_the_repository(name):
     drawn = {"title": "", "notes": [], "figures": []}
     repository = read_config(f"sweeps/{name}.toml").model_copy(update=drawn)
-    assert read_config(STUDIES[name]).model_copy(update=drawn).resolved() == repository.resolved()
+    assert read_config(STUDIES[name]).model_copy(update=drawn).to_dict() == repository.to_dict()
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C++ compiler")

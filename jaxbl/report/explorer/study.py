@@ -154,7 +154,7 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
         "file": "study.toml",
         "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
         "gains": _gains(config),
-        "effects": config.resolved()["effects"],
+        "effects": config.to_dict()["effects"],
     }
 
 

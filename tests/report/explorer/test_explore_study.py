@@ -212,7 +212,7 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
         assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
     config = read_config(tmp_path / "out" / "point.toml")
     assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
-    drawn = config.resolved()["effects"]
+    drawn = config.to_dict()["effects"]
     assert [one.get("torque", one.get("harmonic")) for one in drawn] == [0.02, 0.25, 3]
 
 
