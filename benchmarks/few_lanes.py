@@ -57,7 +57,7 @@ def main() -> None:
 def measured(work: Workload, folder: Path, given: argparse.Namespace) -> list[float]:
     """Least time of each, us."""
     runners = [
-        CppChain(work, given.threads, folder, own=True),
+        CppChain(work, given.threads, folder, makes_inputs=True),
         FusedChain(work, given.threads),
         CppChain(work, given.threads, folder),
         Kept(work, given.threads),

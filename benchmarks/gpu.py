@@ -30,7 +30,7 @@ from jaxbl.fused.jaxprs import join_multiply_add, trace_inlined
 from jaxbl.fused.lane_simulator import DeviceSimulator
 from jaxbl.fused.pallas import multiply_add
 from jaxbl.simulate import scan
-from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, identified_figures
+from jaxbl.throughput.workload import CHAIN_METRICS, METRIC_NAMES, RANGES, SEED, Workload, chain_constants, metrics_from_sums
 
 _THREADS = 128
 
@@ -52,13 +52,13 @@ def chain_by_hand(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     torque, noise = (cupy.asarray(column) for column in work.inputs())
     given = cupy.asarray(np.stack(list(work.values().values())))
     out = cupy.zeros((9, work.lanes), work.dtype)
-    numbers = np.array(tuple(constants().values()), np.dtype([(name, "f8") for name in constants()]))
+    numbers = np.array(tuple(chain_constants().values()), np.dtype([(name, "f8") for name in chain_constants()]))
 
     def run() -> dict[str, np.ndarray]:
         sizes = np.int32(work.steps), np.int32(work.start), np.int32(work.window)
         grid = -(-work.lanes // _THREADS)
         kernel((grid,), (_THREADS,), (numbers, *sizes, torque, noise, np.int32(work.lanes), given, out))
-        return identified_figures(work, list(cupy.asnumpy(out)))
+        return metrics_from_sums(work, list(cupy.asnumpy(out)))
 
     return run
 
@@ -68,7 +68,7 @@ def chain_scanned(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     experiment = work.experiment()
 
     def lane(values: dict[str, Any]) -> dict[str, Any]:
-        return scan(set_leaves(experiment, values), jnp.asarray(SEED), (FIGURES,))[0]
+        return scan(set_leaves(experiment, values), jnp.asarray(SEED), (CHAIN_METRICS,))[0]
 
     values = jax.tree.map(jnp.asarray, work.values())
     compiled = jax.jit(jax.vmap(lane)).lower(values).compile()
@@ -77,15 +77,15 @@ def chain_scanned(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 
 def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The chain by the fused kernel."""
-    simulator, values = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
+    simulator, values = DeviceSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes), work.values()
     return lambda: simulator(values, SEED)
 
 
 def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
-    simulator = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
+    simulator = DeviceSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes)
     given = jax.device_put((simulator.pad_lanes(work.values()), simulator.join_spans(simulator.compute_inputs(SEED))))
-    names = sorted(NAMES)
+    names = sorted(METRIC_NAMES)
     return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, simulator.kernel(*given), strict=True)}
 
 

@@ -42,7 +42,7 @@ class Drawn(NamedTuple):
 
     random: np.random.Generator
     torque: float
-    speed: float
+    find_speed: float
     inertia: float
     reduced: float
     ratio: float
@@ -90,7 +90,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
     "smooth gap, drag": (
         "sigmoid_backlash",
         (),
-        lambda d: [_effect("motor.quadratic_drag", drag=d.torque / d.speed**2 * d.within(0.03, 0.3))],
+        lambda d: [_effect("motor.quadratic_drag", drag=d.torque / d.find_speed**2 * d.within(0.03, 0.3))],
     ),
     "hardening gear with a gap, damping": (
         "linear_shaft",
@@ -129,7 +129,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
                 torque=d.torque * d.within(0.03, 0.2),
                 length=d.within(0.01, 0.1),
                 breakaway_ratio=d.within(1.0, 1.6),
-                stribeck_velocity=d.speed * d.within(0.01, 0.1),
+                stribeck_velocity=d.find_speed * d.within(0.01, 0.1),
             ),
             _effect("actuator.back_emf", resistance=1.0, torque_constant=1.0),
         ],
@@ -152,7 +152,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
                 "load.stribeck_friction",
                 torque=d.torque * d.ratio * 0.1,
                 breakaway_torque=d.torque * d.ratio * d.within(0.1, 0.2),
-                stribeck_velocity=d.speed / d.ratio * d.within(0.02, 0.2),
+                stribeck_velocity=d.find_speed / d.ratio * d.within(0.02, 0.2),
             ),
         ],
     ),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxbl.files import write_atomic
 from jaxbl.lines import format_table
-from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
+from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
 from .figures import COLOURS, Drawn, style, subplots
 from .page import save_all
@@ -20,12 +20,12 @@ def draw_throughput(result: BenchResult) -> list[Drawn]:
 
 def _bars(result: BenchResult) -> Drawn:
     names = list(dict.fromkeys(row.name for row in result.rows))
-    names.sort(key=lambda name: result.speed(name, "float32") or result.speed(name, "float64") or 0.0)
+    names.sort(key=lambda name: result.find_speed(name, "float32") or result.find_speed(name, "float64") or 0.0)
     figure, (ax,) = subplots(8.0, 0.42 * len(names) + 1.1)
     height = 0.38
     for shift, precision, alpha in ((height / 2, "float32", 1.0), (-height / 2, "float64", 0.45)):
         for i, name in enumerate(names):
-            speed = result.speed(name, precision)
+            speed = result.find_speed(name, precision)
             if speed is not None:
                 colour = COLOURS[1] if name.startswith("jaxbl") else COLOURS[0]
                 ax.barh(i + shift, speed, height, color=colour, alpha=alpha)
@@ -44,7 +44,7 @@ def _bars(result: BenchResult) -> Drawn:
 
 def _curve(result: BenchResult) -> Drawn:
     figure, (ax,) = subplots(7.0, 3.8)
-    for name, colour in ((CEILING, COLOURS[0]), (OURS, COLOURS[1]), (SCAN, COLOURS[2])):
+    for name, colour in ((CPP_NAME, COLOURS[0]), (FUSED_NAME, COLOURS[1]), (SCAN_NAME, COLOURS[2])):
         for precision, line in zip(PRECISIONS, ("-", "--"), strict=True):
             points = [point for point in result.curve if (point["name"], point["precision"]) == (name, precision)]
             lanes, speeds = [p["lanes"] for p in points], [p["lane_steps_per_second"] for p in points]
@@ -63,7 +63,7 @@ def _curve(result: BenchResult) -> Drawn:
 def _table(result: BenchResult, precision: str) -> list[list[str]]:
     """Header and rows of the table of one precision, as text."""
     rows = [[precision, "lanes", "best", "median", "of C++", "first", "off by"]]
-    ceiling = result.speed(CEILING, precision)
+    ceiling = result.find_speed(CPP_NAME, precision)
     for row in result.rows:
         if row.precision == precision:
             share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"

@@ -12,20 +12,20 @@ from jaxbl.drive import set_leaves
 from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.simulate import scan
 
-from .workload import FIGURES, RANGES, SEED, Chunked, Workload
+from .workload import CHAIN_METRICS, RANGES, SEED, ChunkedProgram, Workload
 
 LANES = 2**12
 """That a device scans at once: what they carry then stays in a core's cache (benchmarks/NOTES.md)."""
 
 
-class ScanChain(Chunked):
+class ScanChain(ChunkedProgram):
     """`lax.scan` and `vmap`, in chunks that stay in the caches, devices side by side."""
 
     def __init__(self, workload: Workload, devices: int):
         experiment = workload.experiment()
 
         def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
-            return scan(set_leaves(experiment, values), seed, (FIGURES,))[0]
+            return scan(set_leaves(experiment, values), seed, (CHAIN_METRICS,))[0]
 
         lanes, mesh = PartitionSpec("lanes"), Mesh(np.array(jax.local_devices(backend="cpu")[:devices]), ("lanes",))
         sweep = jax.shard_map(
@@ -39,7 +39,7 @@ class FusedChain:
     """The loop over time in registers, threads side by side; input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
-        self._simulator = HostSimulator(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
+        self._simulator = HostSimulator(workload.experiment(), (CHAIN_METRICS,), tuple(RANGES), workload.lanes, threads)
         self._values, self._seeds = workload.values(), count(SEED)
 
     def __call__(self) -> dict[str, np.ndarray]:

@@ -21,17 +21,17 @@ from jaxbl.errors import NoResult
 from jaxbl.workers import Progress, count_cores
 
 from .jaxbl_chain import FusedChain, ScanChain
-from .rivals.cpp_chain import CppChain, NoCompiler, compiler, library
+from .rivals.cpp_chain import CppChain, NoCompiler, compile_library, find_compiler
 from .rivals.cpp_studies import CppStudy
 from .rivals.diffrax_chain import DiffraxChain
-from .rivals.numba_chain import NumbaChain, forget
+from .rivals.numba_chain import NumbaChain, clear_compiled
 from .rivals.python_chain import PythonChain
-from .studies import STUDIES, FusedStudy, study
+from .studies import STUDIES, FusedStudy, prepare_study
 from .workload import Workload
 
 Runner = Callable[[], dict[str, np.ndarray]]
 
-CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
+CPP_NAME, FUSED_NAME, SCAN_NAME = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
 PRECISIONS = ("float32", "float64")
 _REFERENCE_LANES = 64
 """Lanes, spread over all, that are compared with the reference: it is slow."""
@@ -49,41 +49,41 @@ class Entry(NamedTuple):
     name: str
     make: Callable[[Workload], Runner]
     lanes: int  # that it is given, as many as it can bear
-    needs: str | None = None  # a module it cannot do without
+    module: str | None = None  # a module it cannot do without
     tolerance: float = 0.0  # of its own method, where it does not take the reference's steps
 
 
-def entries(folder: Path, count: int, devices: int) -> list[Entry]:
-    """All of them; `folder` keeps the compiled kernel, `count` are cores, `devices` JAX's."""
-    many, few = 2**17, 2**14
+def make_entries(folder: Path, threads: int, devices: int) -> list[Entry]:
+    """All of them; `folder` keeps the compiled kernel, `threads` are cores, `devices` JAX's."""
+    many_lanes, few_lanes = 2**17, 2**14
     return [
-        Entry(CEILING, lambda w: CppChain(w, count, folder), many),
-        Entry("c++, one core", lambda w: CppChain(w, 1, folder), many),
-        Entry(OURS, lambda w: FusedChain(w, count), many),
-        Entry("jaxbl fused, one core", lambda w: FusedChain(w, 1), many),
-        Entry(SCAN, lambda w: ScanChain(w, devices), few),
-        Entry("jaxbl scan, one device", lambda w: ScanChain(w, 1), few),
-        Entry("numba, blocks of lanes", lambda w: NumbaChain(w, count, blocked=True), many, "numba"),
-        Entry("numba, prange", lambda w: NumbaChain(w, count, blocked=False), few, "numba"),
-        Entry("diffrax, Euler, one device", DiffraxChain, few, "diffrax"),
+        Entry(CPP_NAME, lambda w: CppChain(w, threads, folder), many_lanes),
+        Entry("c++, one core", lambda w: CppChain(w, 1, folder), many_lanes),
+        Entry(FUSED_NAME, lambda w: FusedChain(w, threads), many_lanes),
+        Entry("jaxbl fused, one core", lambda w: FusedChain(w, 1), many_lanes),
+        Entry(SCAN_NAME, lambda w: ScanChain(w, devices), few_lanes),
+        Entry("jaxbl scan, one device", lambda w: ScanChain(w, 1), few_lanes),
+        Entry("numba, blocks of lanes", lambda w: NumbaChain(w, threads, blocked=True), many_lanes, "numba"),
+        Entry("numba, prange", lambda w: NumbaChain(w, threads, blocked=False), few_lanes, "numba"),
+        Entry("diffrax, Euler, one device", DiffraxChain, few_lanes, "diffrax"),
         Entry("NumPy, lane arrays", PythonChain, 2**12),
         Entry("NumPy, one lane", PythonChain, 1),
-        Entry("Python numbers, one lane", partial(PythonChain, numbers=True), 1),
-        Entry("OpenSMC, one lane", partial(PythonChain, numbers=True, library=True), 1, "opensmc"),
-        Entry("SciPy RK45, one lane", partial(PythonChain, numbers=True, solver="RK45"), 1, tolerance=1e-3),
-        Entry("SciPy LSODA, one lane", partial(PythonChain, numbers=True, solver="LSODA"), 1, tolerance=1e-3),
+        Entry("Python numbers, one lane", partial(PythonChain, scalar=True), 1),
+        Entry("OpenSMC, one lane", partial(PythonChain, scalar=True, uses_opensmc=True), 1, "opensmc"),
+        Entry("SciPy RK45, one lane", partial(PythonChain, scalar=True, solver="RK45"), 1, tolerance=1e-3),
+        Entry("SciPy LSODA, one lane", partial(PythonChain, scalar=True, solver="LSODA"), 1, tolerance=1e-3),
     ]
 
 
 @dataclass
-class Row:
-    """What an entry took for a workload.
+class BenchRow:
+    """Times of an entry for a workload.
 
     Attributes:
-        first_seconds: of making it and calling it once: tracing and compilation included.
-        deviation: largest median deviation of its figures from the reference, relative.
-        seconds: of each round.
-        lane_steps_per_second, median_lane_steps_per_second: by the least of them, and by their median.
+        first_seconds: to make the entry and call it once, with tracing and compilation.
+        deviation: largest relative median deviation of its metrics from the reference.
+        seconds: time of each round.
+        lane_steps_per_second, median_lane_steps_per_second: from the least and from the median time.
     """
 
     name: str
@@ -118,17 +118,17 @@ class BenchResult:
     """
 
     machine: dict[str, Any]
-    rows: list[Row]
+    rows: list[BenchRow]
     curve: list[dict[str, Any]]
-    study: list[dict[str, Any]]
+    prepare_study: list[dict[str, Any]]
     studies: list[dict[str, Any]]
     left_out: dict[str, str]
     failures: list[str] = field(default_factory=list)
 
-    def speed(self, name: str, precision: str) -> float | None:
-        """Lane-steps per second of an entry, None if it did not run."""
-        found = [row.lane_steps_per_second for row in self.rows if (row.name, row.precision) == (name, precision)]
-        return found[0] if found else None
+    def find_speed(self, name: str, precision: str) -> float | None:
+        """Return the lane-steps per second of an entry, None if it did not run."""
+        speeds = [row.lane_steps_per_second for row in self.rows if (row.name, row.precision) == (name, precision)]
+        return speeds[0] if speeds else None
 
 
 def bench(*, quick: bool = False, progress: Progress | None = None) -> BenchResult:
@@ -145,175 +145,179 @@ def bench(*, quick: bool = False, progress: Progress | None = None) -> BenchResu
     """
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with TemporaryDirectory() as folder, jax.default_device(jax.local_devices(backend="cpu")[0]):
-        found = _bench(Path(folder), count_cores(), quick, progress)
-    found.machine["load"] = load
-    return found
+        result = _measure(Path(folder), count_cores(), quick, progress)
+    result.machine["load"] = load
+    return result
 
 
-def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> BenchResult:
+def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None) -> BenchResult:
     devices = len(jax.local_devices(backend="cpu"))
-    able, left_out = _able(entries(folder, count, devices), folder)
+    runnable, left_out = _select_runnable(make_entries(folder, threads, devices), folder)
     steps, rounds = (1500, 3) if quick else (4000, 7)
-    jobs = [(entry, precision) for precision in PRECISIONS for entry in able if _is_run(entry, precision, quick)]
-    lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
-    compared = list(STUDIES) if any(entry.name == CEILING for entry in able) else []
-    parts, done = (1 + rounds) * len(jobs) + len(lanes) + 1 + len(compared), 0
+    jobs = [(entry, precision) for precision in PRECISIONS for entry in runnable if _is_timed(entry, precision, quick)]
+    curve_lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
+    compared = list(STUDIES) if any(entry.name == CPP_NAME for entry in runnable) else []
+    parts, done = (1 + rounds) * len(jobs) + len(curve_lanes) + 1 + len(compared), 0
 
-    def tick(count: int = 1) -> None:
+    def tick(finished: int = 1) -> None:
         nonlocal done
-        done += count
+        done += finished
         if progress is not None:
             progress(done, parts)
 
     checked: list[tuple[Any, ...]] = []
     runners: list[Runner] = []
     failures: list[str] = []
-    wrong: set[str] = set()
-    reference = cache(_reference)
+    wrong_names: set[str] = set()
+    reference = cache(_reference_metrics)
     for precision in PRECISIONS:
-        with _in(precision):
+        with _enable_precision(precision):
             Workload(1, steps, precision).inputs()
     for entry, precision in jobs:
-        work = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
-        with _in(precision):
-            start = time.perf_counter()
-            runner = entry.make(work)
-            figures = runner()
-            first = time.perf_counter() - start
+        workload = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
+        with _enable_precision(precision):
+            start_time = time.perf_counter()
+            runner = entry.make(workload)
+            metrics = runner()
+            first_seconds = time.perf_counter() - start_time
         try:
-            deviation = _check(entry, precision, figures, reference(work.lanes, steps))
+            deviation = _check_entry(entry, precision, metrics, reference(workload.lanes, steps))
         except NoResult as error:
             failures.append(str(error))
-            wrong.add(entry.name)
+            wrong_names.add(entry.name)
             tick(1 + rounds)
             continue
         runners.append(runner)
-        checked.append((entry.name, precision, work.lanes, steps, first, deviation))
+        checked.append((entry.name, precision, workload.lanes, steps, first_seconds, deviation))
         tick()
     if not checked:
         raise NoResult(failures[0])
     seconds: list[list[float]] = [[] for _ in checked]
     for _ in range(rounds):
         for (_, precision, *_), runner, durations in zip(checked, runners, seconds, strict=True):
-            with _in(precision):
-                durations.append(_seconds(runner))
+            with _enable_precision(precision):
+                durations.append(_time_call(runner))
             tick()
     del runners, runner
-    rows = [Row(*columns, seconds=durations) for columns, durations in zip(checked, seconds, strict=True)]
-    right = [entry for entry in able if entry.name not in wrong]
+    rows = [BenchRow(*columns, seconds=durations) for columns, durations in zip(checked, seconds, strict=True)]
+    right_entries = [entry for entry in runnable if entry.name not in wrong_names]
     curve = []
-    for many in lanes:
-        curve += _curve(right, many, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
+    for lanes in curve_lanes:
+        curve += _measure_curve(right_entries, lanes, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
         tick()
-    small = _small_study(count, devices, {entry.name for entry in right}, 1000)
+    small_study = _time_small_study(threads, devices, {entry.name for entry in right_entries}, 1000)
     tick()
     studies = []
     for name in compared:
         try:
-            studies.append(compare(name, folder, count, 6000 if quick else 10_000, rounds))
+            studies.append(compare_study(name, folder, threads, 6000 if quick else 10_000, rounds))
         except NoResult as error:
             failures.append(str(error))
         tick()
-    return BenchResult(_machine(count), rows, curve, small, studies, left_out, failures)
+    return BenchResult(_describe_machine(threads), rows, curve, small_study, studies, left_out, failures)
 
 
-def _is_run(entry: Entry, precision: str, quick: bool) -> bool:
+def _is_timed(entry: Entry, precision: str, quick: bool) -> bool:
     # one lane in float32 proves nothing: rounding decides signs, and there are no others to take the median of
     if entry.lanes == 1:
         return precision == "float64"
     return not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
 
 
-def _seconds(runner: Callable[[], Any]) -> float:
-    begun = time.perf_counter()
+def _time_call(runner: Callable[[], Any]) -> float:
+    start = time.perf_counter()
     runner()
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
-def _in(precision: str) -> Any:
+def _enable_precision(precision: str) -> Any:
     return jax.enable_x64(precision == "float64")
 
 
-def _able(found: Sequence[Entry], folder: Path) -> tuple[list[Entry], dict[str, str]]:
+def _select_runnable(entries: Sequence[Entry], folder: Path) -> tuple[list[Entry], dict[str, str]]:
     left_out = {}
     try:
-        library(folder)
-    except NoCompiler as why:
-        left_out = {entry.name: str(why) for entry in found if entry.name.startswith("c++")}
-    for entry in found:
-        if entry.needs is not None and importlib.util.find_spec(entry.needs) is None:
-            left_out[entry.name] = f"no {entry.needs}; pip install 'jaxbl[bench]'"
-    return [entry for entry in found if entry.name not in left_out], left_out
+        compile_library(folder)
+    except NoCompiler as reason:
+        left_out = {entry.name: str(reason) for entry in entries if entry.name.startswith("c++")}
+    for entry in entries:
+        if entry.module is not None and importlib.util.find_spec(entry.module) is None:
+            left_out[entry.name] = f"no {entry.module}; pip install 'jaxbl[bench]'"
+    return [entry for entry in entries if entry.name not in left_out], left_out
 
 
-def _spread(lanes: int) -> np.ndarray:
+def _spread_lanes(lanes: int) -> np.ndarray:
     """Lanes from all over, the first and the last among them."""
     return np.unique(np.linspace(0, lanes - 1, _REFERENCE_LANES).round().astype(int))
 
 
-def _reference(lanes: int, steps: int) -> dict[str, np.ndarray]:
+def _reference_metrics(lanes: int, steps: int) -> dict[str, np.ndarray]:
     """Figures of some of so many lanes by the plainest entry, in float64."""
-    with _in("float64"):
-        return PythonChain(Workload(lanes, steps, "float64"), chosen=_spread(lanes))()
+    with _enable_precision("float64"):
+        return PythonChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
 
 
-def _check(entry: Entry, precision: str, figures: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
-    worst = 0.0
-    for name, values in figures.items():
-        found, true = np.asarray(values, float)[_spread(len(values))], reference[name]
-        apart = float(np.median(np.abs(found / true - 1.0)))
-        if not apart <= max(entry.tolerance, _TOLERANCE[precision][name.partition(".")[2]]):
-            raise NoResult(f"{entry.name}, {precision}: {name} is off by {apart:.2g} of it; wrong results are not timed")
-        worst = max(worst, apart)
-    return worst
+def _check_entry(entry: Entry, precision: str, metrics: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
+    largest = 0.0
+    for name, values in metrics.items():
+        sampled, expected = np.asarray(values, float)[_spread_lanes(len(values))], reference[name]
+        deviation = float(np.median(np.abs(sampled / expected - 1.0)))
+        if not deviation <= max(entry.tolerance, _TOLERANCE[precision][name.partition(".")[2]]):
+            raise NoResult(f"{entry.name}, {precision}: {name} is off by {deviation:.2g} of it; wrong results are not timed")
+        largest = max(largest, deviation)
+    return largest
 
 
-def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[dict[str, Any]]:
+def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[dict[str, Any]]:
     points = []
     for precision in precisions:
-        chosen = [e for e in able if e.name in (CEILING, OURS, SCAN) and (e.name != SCAN or lanes <= 2**17)]
-        with _in(precision):
-            runners = [entry.make(Workload(lanes, steps, precision)) for entry in chosen]
-            best = [float("inf")] * len(chosen)
+        curve_entries = [
+            e for e in entries if e.name in (CPP_NAME, FUSED_NAME, SCAN_NAME) and (e.name != SCAN_NAME or lanes <= 2**17)
+        ]
+        with _enable_precision(precision):
+            runners = [entry.make(Workload(lanes, steps, precision)) for entry in curve_entries]
+            best = [float("inf")] * len(curve_entries)
             # short ones are repeated, and several times in a row: threads that wait for more work disturb the next entry
-            short = round(1e8 / lanes / steps)
-            for _ in range(max(5, min(15, short))):
+            repeats = round(1e8 / lanes / steps)
+            for _ in range(max(5, min(15, repeats))):
                 for i, runner in enumerate(runners):
-                    best[i] = min(best[i], *(_seconds(runner) for _ in range(max(1, min(4, short)))))
-        for entry, least in zip(chosen, best, strict=True):
+                    best[i] = min(best[i], *(_time_call(runner) for _ in range(max(1, min(4, repeats)))))
+        for entry, seconds in zip(curve_entries, best, strict=True):
             point = {"name": entry.name, "precision": precision, "lanes": lanes, "steps": steps}
-            points.append(point | {"lane_steps_per_second": lanes * steps / least})
+            points.append(point | {"lane_steps_per_second": lanes * steps / seconds})
     return points
 
 
-def _small_study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
+def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -> list[dict[str, Any]]:
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
-    work = Workload(lanes, 3000, "float32")
-    with _in(work.precision), TemporaryDirectory() as folder:
-        work.inputs()
-        for entry in entries(Path(folder), count, devices):
+    workload = Workload(lanes, 3000, "float32")
+    with _enable_precision(workload.precision), TemporaryDirectory() as folder:
+        workload.inputs()
+        for entry in make_entries(Path(folder), threads, devices):
             if (
-                entry.name not in able
+                entry.name not in names
                 or entry.lanes <= lanes
                 or entry.name in ("c++, one core", "jaxbl fused, one core", "jaxbl scan, one device")
             ):
                 continue
             jax.clear_caches()
-            forget()
-            library.cache_clear()
-            row = {"name": entry.name, "precision": work.precision, "lanes": lanes, "steps": work.steps}
-            rows.append(row | {"seconds": _seconds(lambda entry=entry: entry.make(work)())})
+            clear_compiled()
+            compile_library.cache_clear()
+            row = {"name": entry.name, "precision": workload.precision, "lanes": lanes, "steps": workload.steps}
+            rows.append(row | {"seconds": _time_call(lambda entry=entry: entry.make(workload)())})
     return rows
 
 
-def compare(name: str, folder: Path, count: int, steps: int, rounds: int, lanes: int | None = None) -> dict[str, Any]:
+def compare_study(
+    name: str, folder: Path, threads: int, steps: int, rounds: int, lanes: int | None = None
+) -> dict[str, Any]:
     """A study as it stands by this package and in C++, after a look at whether both give the same figures.
 
     Args:
         name: of the study.
         folder: for the compiled kernel.
-        count: threads.
+        threads: threads.
         steps: samples of a run.
         rounds: that are timed, in turns.
         lanes: left out, all of the study's.
@@ -322,36 +326,38 @@ def compare(name: str, folder: Path, count: int, steps: int, rounds: int, lanes:
         NoResult: they do not.
     """
     # a noisy observer amplifies rounding: number by number the figures are the same only over a short run
-    short = study(name, _SHORT, lanes, start=0.1)
-    deviation = check_study(name, FusedStudy(short)(), CppStudy(short, count, folder, own=False)())
-    work = study(name, steps, lanes)
-    runners = [FusedStudy(work), *(CppStudy(work, count, folder, vectors) for vectors in _VECTORS)]
+    short_study = prepare_study(name, _SHORT_STEPS, lanes, identifier_start=0.1)
+    deviation = check_run_metrics(
+        name, FusedStudy(short_study)(), CppStudy(short_study, threads, folder, makes_noise=False)()
+    )
+    full_study = prepare_study(name, steps, lanes)
+    runners = [FusedStudy(full_study), *(CppStudy(full_study, threads, folder, vectors) for vectors in _VECTOR_COUNTS)]
     check_medians(name, *(runner() for runner in runners[:2]))
-    least = [float("inf")] * len(runners)
+    best = [float("inf")] * len(runners)
     for _ in range(rounds):
         for i, runner in enumerate(runners):
-            least[i] = min(least[i], _seconds(runner))
-    row = {"name": name, "lanes": work.lanes, "seeds": work.seeds, "steps": steps, "deviation": deviation}
-    return row | {"jaxbl": work.lane_steps / least[0], "c++": work.lane_steps / min(least[1:])}
+            best[i] = min(best[i], _time_call(runner))
+    row = {"name": name, "lanes": full_study.lanes, "seeds": full_study.seeds, "steps": steps, "deviation": deviation}
+    return row | {"jaxbl": full_study.lane_steps / best[0], "c++": full_study.lane_steps / min(best[1:])}
 
 
-_SHORT = 400
+_SHORT_STEPS = 400
 """Samples of the run by which the figures of a study are compared number by number."""
 _NAN_SHARE = 1e-3
 """Largest share of runs (1) in which a figure is NaN in only one implementation. At the border of convergence rounding
 decides whether a run has a convergence time; it does for 3e-4 of the runs of gain_map."""
-_VECTORS = 1, 2, 4
+_VECTOR_COUNTS = 1, 2, 4
 """That the kernel of a study takes at a time: the fastest counts."""
 
 
-def check_study(name: str, found: dict[str, Any], reference: dict[str, np.ndarray]) -> float:
+def check_run_metrics(name: str, metrics: dict[str, Any], reference: dict[str, np.ndarray]) -> float:
     """Compare the figures of a study with those of the reference, run by run.
 
     A run in which both are NaN counts as equal. Runs in which only one is NaN are counted, and left out of the median.
 
     Args:
         name: of the study.
-        found: by figure, an array with a number for each run.
+        metrics: by figure, an array with a number for each run.
         reference: the same by the other implementation.
 
     Returns:
@@ -361,37 +367,39 @@ def check_study(name: str, found: dict[str, Any], reference: dict[str, np.ndarra
         NoResult: a median, or the share of runs in which only one number is NaN, is too large.
     """
     largest = 0.0
-    for figure, column in reference.items():
-        values, true = np.asarray(found[figure], float), np.asarray(column, float)
-        both_nan = np.isnan(values) & np.isnan(true)
-        only_one_nan = np.isnan(values) ^ np.isnan(true)
+    for metric, column in reference.items():
+        values, expected = np.asarray(metrics[metric], float), np.asarray(column, float)
+        both_nan = np.isnan(values) & np.isnan(expected)
+        only_one_nan = np.isnan(values) ^ np.isnan(expected)
         nan_share = float(np.mean(only_one_nan))
         if nan_share > _NAN_SHARE:
             raise NoResult(
-                f"{name}: {figure} is NaN in only one implementation in {nan_share:.2g} of the runs, "
+                f"{name}: {metric} is NaN in only one implementation in {nan_share:.2g} of the runs, "
                 f"more than {_NAN_SHARE:g}; wrong results are not timed"
             )
-        deviations = np.abs(values - true) / np.maximum(np.abs(true), np.finfo(float).tiny)
+        deviations = np.abs(values - expected) / np.maximum(np.abs(expected), np.finfo(float).tiny)
         median = float(np.median(np.where(both_nan, 0.0, deviations)[~only_one_nan]))
         # a short run determines the law's parameters badly
-        if not median <= (1e-5 if figure.endswith(("_error", "excitation")) else _TOLERANCE["float64"]["velocity_rmse"]):
-            raise NoResult(f"{name}: {figure} is off by {median:.2g} of it; wrong results are not timed")
+        if not median <= (1e-5 if metric.endswith(("_error", "excitation")) else _TOLERANCE["float64"]["velocity_rmse"]):
+            raise NoResult(f"{name}: {metric} is off by {median:.2g} of it; wrong results are not timed")
         largest = max(largest, median)
     return largest
 
 
-def check_medians(name: str, found: dict[str, Any], reference: dict[str, np.ndarray]) -> None:
+def check_medians(name: str, metrics: dict[str, Any], reference: dict[str, np.ndarray]) -> None:
     """Raises `NoResult` where the median of a figure over all runs is not that of the reference; errors of identified
     parameters, which are about zero, do not count."""
-    for figure, true in reference.items():
-        if figure.endswith("_error"):
+    for metric, expected in reference.items():
+        if metric.endswith("_error"):
             continue
-        one, other = (float(np.nanmedian(np.asarray(values, float))) for values in (found[figure], true))
-        if not abs(one - other) <= 0.05 * abs(other):
-            raise NoResult(f"{name}: {figure} has a median of {one:.3g}, not {other:.3g}; wrong results are not timed")
+        median, expected_median = (float(np.nanmedian(np.asarray(values, float))) for values in (metrics[metric], expected))
+        if not abs(median - expected_median) <= 0.05 * abs(expected_median):
+            raise NoResult(
+                f"{name}: {metric} has a median of {median:.3g}, not {expected_median:.3g}; wrong results are not timed"
+            )
 
 
-def _machine(count: int) -> dict[str, Any]:
+def _describe_machine(threads: int) -> dict[str, Any]:
     packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
     lines: list[str] = []
     with suppress(OSError):
@@ -399,9 +407,9 @@ def _machine(count: int) -> dict[str, Any]:
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "processor": names[0] if names else platform.processor(),
-        "cores": count,
+        "cores": threads,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages if importlib.util.find_spec(name) is not None},
-        "compiler": Path(found).name if (found := compiler()) else None,
+        "compiler": Path(path).name if (path := find_compiler()) else None,
     }

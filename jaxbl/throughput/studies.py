@@ -61,7 +61,7 @@ STUDIES: dict[str, dict[str, Any]] = {
 """As in the repository's `sweeps/`, without what is drawn."""
 
 
-class Study(NamedTuple):
+class BenchStudy(NamedTuple):
     """One of them, with runs of so many samples: what is shared, and each lane's values `(lanes,)` by path."""
 
     name: str
@@ -75,49 +75,55 @@ class Study(NamedTuple):
 
     @property
     def lanes(self) -> int:
-        """Of each seed."""
+        """Number of lanes of each seed."""
         return len(next(iter(self.values.values())))
 
     @property
     def lane_steps(self) -> int:
-        """Of a call."""
+        """Number of lane-steps of a call."""
         return self.lanes * self.seeds * self.config.run.steps
 
 
-def study(name: str, steps: int, lanes: int | None = None, start: float | None = None) -> Study:
-    """One of :data:`STUDIES` with runs of so many samples, all of its lanes or so many spread over all, and identifiers that
-    begin at another time (s)."""
+def prepare_study(name: str, steps: int, lanes: int | None = None, identifier_start: float | None = None) -> BenchStudy:
+    """Prepare one of :data:`STUDIES` with runs of `steps` samples.
+
+    Args:
+        name: of the study.
+        steps: samples of a run.
+        lanes: number of lanes, spread over all of the study; None for all.
+        identifier_start: time at which identifiers begin, s; None for that of the study.
+    """
     config = read_config(STUDIES[name])
-    shortened = {"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
-    if start is not None:
+    changes = {"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
+    if identifier_start is not None:
         assert config.identifier is not None
-        shortened["identifier"] = config.identifier.model_copy(update={"start": start})
-    config = config.model_copy(update=shortened)
+        changes["identifier"] = config.identifier.model_copy(update={"start": identifier_start})
+    config = config.model_copy(update=changes)
     points = Points(config)
     with precision(config):
-        chosen = (
+        indices = (
             np.arange(points.group_size)
             if lanes is None
             else np.linspace(0, points.group_size - 1, lanes).round().astype(int)
         )
-        return Study(name, config, prepare(config), points.columns(chosen))
+        return BenchStudy(name, config, prepare(config), points.columns(indices))
 
 
 class FusedStudy:
-    """By the program of a sweep on all cores, all of a study in one chunk; other seeds at each call."""
+    """The program of a sweep on all cores, with a study in one chunk; each call takes other seeds."""
 
-    def __init__(self, of: Study):
-        self._study, self._round = of, 0
-        devices, layout = jax.local_devices(backend="cpu"), Layout(of.seeds, of.lanes)
-        with precision(of.config):
+    def __init__(self, study: BenchStudy):
+        self._study, self._round = study, 0
+        devices, layout = jax.local_devices(backend="cpu"), Layout(study.seeds, study.lanes)
+        with precision(study.config):
             self._program: Program = compile_program(
-                of.experiment, layout, devices, "fused", of.values, require_backend=True
+                study.experiment, layout, devices, "fused", study.values, require_backend=True
             )
 
     def __call__(self) -> dict[str, np.ndarray]:
         """Figures `(seeds, lanes)` by name."""
-        first = self._round * self._study.seeds
+        first_seed = self._round * self._study.seeds
         self._round += 1
         with precision(self._study.config):
-            figures, _ = self._program.run(self._study.values, np.arange(first, first + self._study.seeds))
-        return figures
+            metrics, _ = self._program.run(self._study.values, np.arange(first_seed, first_seed + self._study.seeds))
+        return metrics

@@ -31,39 +31,41 @@ RANGES = {
     "encoders.noise": (1e-5, 1e-3),
 }
 """What differs from lane to lane, from and to; spread by the logarithm."""
-_PERIOD, _MISS = 1e-3, 0.5
+_SAMPLE_PERIOD, _VELOCITY_ERROR = 1e-3, 0.5
 """Sample period (s), velocity error of the motor's observer at t = 0 (rad/s)."""
 DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
-INPUT = {"amplitude": 0.1, "frequency": 0.16}
+SINE = {"amplitude": 0.1, "frequency": 0.16}
 """The sine that is the input, N m and Hz."""
 _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
 """The paper's drive and law (N m/rad, 1/rad), and the low-pass of the equivalent control (s)."""
 
 
-def _rates(experiment: Experiment, total: dict[str, Any], index: Any, signals: Any) -> dict[str, Any]:
-    inside = (index >= window_start(experiment.run.steps)).astype(signals.time.dtype)
-    new = {}
+def _update_sums(experiment: Experiment, sums: dict[str, Any], index: Any, signals: Any) -> dict[str, Any]:
+    counts = (index >= window_start(experiment.run.steps)).astype(signals.time.dtype)
+    updated = {}
     for side in SIDES:
         error = signals.side(side).true.velocity - signals.side(side).velocity_estimate
-        new[side] = total[side] + inside * error * error
-    return new
+        updated[side] = sums[side] + counts * error * error
+    return updated
 
 
-def _figures(experiment: Experiment, total: dict[str, Any], state: State) -> dict[str, Any]:
+def _metrics(experiment: Experiment, sums: dict[str, Any], state: State) -> dict[str, Any]:
     assert experiment.identifier is not None and experiment.transmission is not None and state.identifier is not None
     count = experiment.run.steps - window_start(experiment.run.steps)
-    found = experiment.identifier.estimate(state.identifier, experiment.transmission)
-    figures = {}
+    identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
+    metrics = {}
     for side in SIDES:
-        figures[f"{side}.velocity_rmse"] = jnp.sqrt(total[side] / count)
+        metrics[f"{side}.velocity_rmse"] = jnp.sqrt(sums[side] / count)
         for name in ("stiffness", "dead_zone"):
-            figures[f"{side}.{name}"] = found[side][name]
-    return figures
+            metrics[f"{side}.{name}"] = identified[side][name]
+    return metrics
 
 
-FIGURES = Reducer(lambda experiment: dict.fromkeys(SIDES, jnp.zeros_like(experiment.run.sample_period)), _rates, _figures)
+CHAIN_METRICS = Reducer(
+    lambda experiment: dict.fromkeys(SIDES, jnp.zeros_like(experiment.run.sample_period)), _update_sums, _metrics
+)
 """Rms velocity error over the last quarter (rad/s), and what is identified (N m/rad, rad), of both sides."""
-NAMES = tuple(f"{side}.{name}" for side in SIDES for name in ("velocity_rmse", "stiffness", "dead_zone"))
+METRIC_NAMES = tuple(f"{side}.{name}" for side in SIDES for name in ("velocity_rmse", "stiffness", "dead_zone"))
 
 
 class Workload(NamedTuple):
@@ -88,7 +90,9 @@ class Workload(NamedTuple):
         return window_start(self.steps)
 
     def values(self) -> dict[str, np.ndarray]:
-        """By config path, `(lanes,)`: a low-discrepancy sequence over `RANGES`, of which fewer lanes are the first ones.
+        """Draw the values of the lanes by config path, `(lanes,)`: a low-discrepancy sequence over `RANGES`.
+
+        Fewer lanes have the first values of more lanes.
 
         Reference: M. Roberts' sequence, powers of the generalised golden ratio.
         """
@@ -96,11 +100,11 @@ class Workload(NamedTuple):
         for _ in range(64):
             golden = (1.0 + golden) ** (1.0 / (len(RANGES) + 1))
         index = np.arange(1, self.lanes + 1)
-        found = {}
+        values = {}
         for i, (path, (low, high)) in enumerate(RANGES.items(), 1):
             share = (0.5 + index * golden**-i) % 1.0
-            found[path] = (low * (high / low) ** share).astype(self.dtype)
-        return found
+            values[path] = (low * (high / low) ** share).astype(self.dtype)
+        return values
 
     def experiment(self) -> Experiment:
         """With array leaves of the precision; lanes set those of `RANGES`."""
@@ -109,25 +113,25 @@ class Workload(NamedTuple):
             transmission=SigmoidBacklash(_STIFFNESS, 0.02, _SLOPE),
             effects=(),
             initial=Initial(),
-            excitation=Sine(**INPUT),
+            excitation=Sine(**SINE),
             encoders=Encoders(1e-4),
             observer=Observers(
-                ExplicitSuperTwisting(lambda_=4.0, alpha=9.0, velocity_error=_MISS),
+                ExplicitSuperTwisting(lambda_=4.0, alpha=9.0, velocity_error=_VELOCITY_ERROR),
                 ExplicitSuperTwisting(lambda_=0.5, alpha=0.2),
             ),
             equivalent_control=EquivalentControl(_LOW_PASS),
-            identifier=Identifier(self.start * _PERIOD),
-            run=Run(_PERIOD, self.steps, 1),
+            identifier=Identifier(self.start * _SAMPLE_PERIOD),
+            run=Run(_SAMPLE_PERIOD, self.steps, 1),
         )
         return as_arrays(experiment, self.dtype)
 
     def inputs(self) -> tuple[np.ndarray, np.ndarray]:
         """Torque (N m) `(steps,)` and unit noise `(steps, 2)` of motor and load, for entries that do not make them."""
-        return _inputs(self.steps, self.precision)
+        return _make_inputs(self.steps, self.precision)
 
 
 @cache
-def _inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
+def _make_inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
     work = Workload(1, steps, precision)
     experiment = work.experiment()
     indices = jnp.arange(steps, dtype=jnp.int32)
@@ -136,45 +140,48 @@ def _inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(torque, work.dtype), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
 
 
-class Chunked:
+class ChunkedProgram:
     """A function of values by path, compiled for chunks of one size; the last one is filled up."""
 
-    def __init__(self, function: Callable[..., Any], workload: Workload, size: int, *rest: Any):
-        self._lanes, self._rest = workload.lanes, rest
-        count = -(-workload.lanes // size) * size
-        padded = {path: np.pad(column, (0, count - len(column)), "edge") for path, column in workload.values().items()}
+    def __init__(self, function: Callable[..., Any], workload: Workload, size: int, *shared_arguments: Any):
+        self._lanes, self._shared_arguments = workload.lanes, shared_arguments
+        padded_lanes = -(-workload.lanes // size) * size
+        padded = {
+            path: np.pad(column, (0, padded_lanes - len(column)), "edge") for path, column in workload.values().items()
+        }
         self._chunks = [
-            {path: jnp.asarray(column[at : at + size]) for path, column in padded.items()} for at in range(0, count, size)
+            {path: jnp.asarray(column[start : start + size]) for path, column in padded.items()}
+            for start in range(0, padded_lanes, size)
         ]
-        self.compiled = jax.jit(function).lower(self._chunks[0], *rest).compile()
+        self.compiled = jax.jit(function).lower(self._chunks[0], *shared_arguments).compile()
 
     def __call__(self) -> dict[str, np.ndarray]:
-        parts = [self.compiled(values, *self._rest) for values in self._chunks]
-        return {name: np.concatenate([np.asarray(part[name]) for part in parts])[: self._lanes] for name in parts[0]}
+        chunks = [self.compiled(values, *self._shared_arguments) for values in self._chunks]
+        return {name: np.concatenate([np.asarray(chunk[name]) for chunk in chunks])[: self._lanes] for name in chunks[0]}
 
 
-def constants() -> dict[str, float]:
+def chain_constants() -> dict[str, float]:
     """The numbers that all lanes share, for those who write the chain themselves."""
     return {
-        "period": _PERIOD,
+        "period": _SAMPLE_PERIOD,
         **DRIVE,
         "stiffness": _STIFFNESS,
         "slope": _SLOPE,
-        "share": -math.expm1(-_PERIOD / _LOW_PASS),
-        "motor_error": _MISS,
+        "share": -math.expm1(-_SAMPLE_PERIOD / _LOW_PASS),
+        "motor_error": _VELOCITY_ERROR,
     }
 
 
-def identified_figures(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
+def metrics_from_sums(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
     """Figures `(lanes,)` from the nine sums over the run that rivals keep: of products of both regressors (3), of regressors
     and torques (2 a side), of squared velocity errors (1 each)."""
-    first, both, second, *right = (np.asarray(column, np.float64) for column in sums)
-    determinant = first * second - both * both
-    figures = {}
+    twist_squares, products, bend_squares, *side_sums = (np.asarray(column, np.float64) for column in sums)
+    determinant = twist_squares * bend_squares - products * products
+    metrics = {}
     for i, side in enumerate(SIDES):
-        one, two = right[2 * i : 2 * i + 2]
-        stiffness = (second * one - both * two) / determinant
-        figures[f"{side}.velocity_rmse"] = np.sqrt(right[4 + i] / (workload.steps - workload.window))
-        figures[f"{side}.stiffness"] = stiffness
-        figures[f"{side}.dead_zone"] = (first * two - both * one) / determinant / stiffness
-    return figures
+        twist_torque, bend_torque = side_sums[2 * i : 2 * i + 2]
+        stiffness = (bend_squares * twist_torque - products * bend_torque) / determinant
+        metrics[f"{side}.velocity_rmse"] = np.sqrt(side_sums[4 + i] / (workload.steps - workload.window))
+        metrics[f"{side}.stiffness"] = stiffness
+        metrics[f"{side}.dead_zone"] = (twist_squares * bend_torque - products * twist_torque) / determinant / stiffness
+    return metrics

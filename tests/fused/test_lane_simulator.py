@@ -24,7 +24,7 @@ from jaxbl.fused.shared_part import SharedPartLoop
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import ALL_METRICS, metrics_reducer
-from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
+from jaxbl.throughput.workload import CHAIN_METRICS, RANGES, SEED, Workload
 
 HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
         "transmission.damping", "actuator.lag", "actuator.saturation"]  # fmt: skip
@@ -142,8 +142,8 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     values = work.values()
     with jax.enable_x64(precision == "float64"):
         whole = work.experiment()
-        fused = HostSimulator(whole, (FIGURES,), tuple(RANGES), work.lanes, 2)(values, SEED)
-        expected = scanned(whole, values, FIGURES, SEED)
+        fused = HostSimulator(whole, (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)(values, SEED)
+        expected = scanned(whole, values, CHAIN_METRICS, SEED)
     for name, figure in fused.items():
         assert figure.dtype == precision
         if precision == "float64":
@@ -212,14 +212,14 @@ def test_what_is_joined_for_a_gpu_computes_the_same(half):
 
 def test_values_of_another_number_of_lanes_are_refused():
     work = Workload(40, 70, "float64")
-    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    simulator = HostSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)
     with pytest.raises(ValueError, match=r"encoders\.noise: 40 lanes need as many values, not an array of shape \(3,\)"):
         simulator(work.values() | {"encoders.noise": np.ones(3)}, SEED)
 
 
 def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     work = Workload(4000, 3000, "float64")
-    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    simulator = HostSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)
     loop, calls = simulator._loop, []
 
     def failing(*arguments, **options):
@@ -330,7 +330,7 @@ def test_all_lanes_may_leave(monkeypatch):
 
 def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
     work = Workload(40, 300, "float64")
-    simulator = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    simulator = HostSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)
     drawn = []
     ahead = simulator._run_shared_part
     monkeypatch.setattr(

@@ -5,22 +5,22 @@ import json
 import pytest
 
 from jaxbl.report.bench import throughput_lines, write_bench_report
-from jaxbl.throughput.run import CEILING, OURS, SCAN, BenchResult, Row
+from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, SCAN_NAME, BenchResult, BenchRow
 
 
 @pytest.fixture
 def result():
     rows = []
     for precision, speed in (("float32", 2e9), ("float64", 5e8)):
-        for name, share in ((CEILING, 1.0), (OURS, 0.8), (SCAN, 0.2), ("diffrax, Euler, one device", 1e-5)):
-            row = Row(name, precision, 1000, 100, 1.5, 1e-12, seconds=[1e5 / speed / share, 2e5 / speed / share])
+        for name, share in ((CPP_NAME, 1.0), (FUSED_NAME, 0.8), (SCAN_NAME, 0.2), ("diffrax, Euler, one device", 1e-5)):
+            row = BenchRow(name, precision, 1000, 100, 1.5, 1e-12, seconds=[1e5 / speed / share, 2e5 / speed / share])
             rows.append(row)
     curve = [
         {"name": name, "precision": "float32", "lanes": lanes, "steps": 100, "lane_steps_per_second": 1e6 * lanes}
-        for name in (CEILING, OURS)
+        for name in (CPP_NAME, FUSED_NAME)
         for lanes in (64, 128, 256)
     ]
-    study = [{"name": OURS, "precision": "float32", "lanes": 1000, "steps": 3000, "seconds": 1.25}]
+    study = [{"name": FUSED_NAME, "precision": "float32", "lanes": 1000, "steps": 3000, "seconds": 1.25}]
     machine = {"processor": "a processor", "cores": 2, "versions": {"jax": "1.0"}}
     row = {"name": "gain_map", "lanes": 12288, "seeds": 4, "steps": 8000, "deviation": 1e-12, "jaxbl": 9e7, "c++": 1e8}
     return BenchResult(machine, rows, curve, study, [row], {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
@@ -29,7 +29,7 @@ def result():
 def test_files_and_figures(result, tmp_path):
     write_bench_report(result, tmp_path)
     found = json.loads((tmp_path / "bench.json").read_text())
-    row = next(r for r in found["rows"] if (r["name"], r["precision"]) == (OURS, "float64"))
+    row = next(r for r in found["rows"] if (r["name"], r["precision"]) == (FUSED_NAME, "float64"))
     assert row["lane_steps_per_second"] == pytest.approx(4e8)
     assert row["median_lane_steps_per_second"] == pytest.approx(4e8 / 1.5)
     assert {"name", "precision", "lanes", "steps", "lane_steps_per_second"} <= set(row)
@@ -39,7 +39,7 @@ def test_files_and_figures(result, tmp_path):
 def test_the_table_says_who_where_and_how_far_from_the_ceiling(result):
     lines = throughput_lines(result)
     assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
-    ours = next(line for line in lines if line.startswith(OURS))
+    ours = next(line for line in lines if line.startswith(FUSED_NAME))
     assert lines[3].split() == ["float32", "lanes", "best", "median", "of", "C++", "first", "off", "by"]
     assert ours.split()[4:] == ["1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
     # those of both precisions below one another, within a terminal

@@ -11,8 +11,16 @@ import pytest
 
 from jaxbl.errors import NoResult
 from jaxbl.throughput import run
-from jaxbl.throughput.run import PRECISIONS, Entry, _able, _check, _is_run, _reference, entries
-from jaxbl.throughput.workload import NAMES, RANGES, Workload
+from jaxbl.throughput.run import (
+    PRECISIONS,
+    Entry,
+    _check_entry,
+    _is_timed,
+    _reference_metrics,
+    _select_runnable,
+    make_entries,
+)
+from jaxbl.throughput.workload import METRIC_NAMES, RANGES, Workload
 from jaxbl.workers import count_cores
 
 STEPS = 1500
@@ -29,24 +37,24 @@ def _short_curve(curve, able, lanes, *rest):
 
 @functools.cache
 def reference(lanes):
-    return _reference(lanes, STEPS)
+    return _reference_metrics(lanes, STEPS)
 
 
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [(e.name, p) for e in entries(Path(), 2, 2) for p in PRECISIONS if _is_run(e, p, quick=False)],
+    [(e.name, p) for e in make_entries(Path(), 2, 2) for p in PRECISIONS if _is_timed(e, p, quick=False)],
 )
 def test_figures_are_those_of_the_reference(name, precision, folder):
-    able, left_out = _able(entries(folder, 2, 2), folder)
+    able, left_out = _select_runnable(make_entries(folder, 2, 2), folder)
     if name in left_out:
         pytest.skip(left_out[name])
     entry = next(entry for entry in able if entry.name == name)
     with jax.enable_x64(precision == "float64"):
         figures = entry.make(Workload(min(entry.lanes, 70), STEPS, precision))()
-    assert set(figures) == set(NAMES)
+    assert set(figures) == set(METRIC_NAMES)
     assert all(len(values) == min(entry.lanes, 70) for values in figures.values())
     # which raises where they are not
-    _check(entry, precision, figures, reference(min(entry.lanes, 70)))
+    _check_entry(entry, precision, figures, reference(min(entry.lanes, 70)))
 
 
 def test_a_wrong_result_is_not_timed():
@@ -54,18 +62,20 @@ def test_a_wrong_result_is_not_timed():
     wrong = {name: 1.01 * values for name, values in true.items()}
     entry = Entry("someone", lambda workload: lambda: wrong, 64)
     with pytest.raises(NoResult, match=r"someone, float64: .* is off by 0.01"):
-        _check(entry, "float64", wrong, true)
+        _check_entry(entry, "float64", wrong, true)
     missing = true | {"motor.stiffness": np.full(64, np.nan)}
     with pytest.raises(NoResult, match=r"motor\.stiffness"):
-        _check(entry, "float64", missing, true)
+        _check_entry(entry, "float64", missing, true)
 
 
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
-    used, parts, asked, curve = [], [], [], run._curve
+    used, parts, asked, curve = [], [], [], run._measure_curve
 
     def only_ours(folder, count, devices):
         used.append(count)
-        return [entry._replace(lanes=2**13) for entry in entries(folder, count, devices) if entry.name == run.OURS]
+        return [
+            entry._replace(lanes=2**13) for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME
+        ]
 
     def few(able, lanes, *rest):
         asked.append(lanes)
@@ -84,11 +94,11 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
 
 def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
     def wrong(workload):
-        return lambda: {name: np.zeros(workload.lanes) for name in NAMES}
+        return lambda: {name: np.zeros(workload.lanes) for name in METRIC_NAMES}
 
     def ours_and_a_wrong_one(folder, count, devices):
-        ours = next(entry for entry in entries(folder, count, devices) if entry.name == run.OURS)
-        return [ours._replace(lanes=2**10), Entry(run.CEILING, wrong, 2**10)]
+        ours = next(entry for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME)
+        return [ours._replace(lanes=2**10), Entry(run.CPP_NAME, wrong, 2**10)]
 
     def compare(name, *_):
         if name == "gain_map":
@@ -97,23 +107,24 @@ def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
 
     monkeypatch.setattr(run, "entries", ours_and_a_wrong_one)
     monkeypatch.setattr(run, "compare", compare)
-    monkeypatch.setattr(run, "_curve", functools.partial(_short_curve, run._curve))
+    monkeypatch.setattr(run, "_curve", functools.partial(_short_curve, run._measure_curve))
     monkeypatch.setattr("jax.config.update", lambda *_: None)
     code, lines, _ = call("bench", "--quick")
     saved = json.loads((tmp_path / "results" / "bench" / "bench.json").read_text())
     assert code == 1
-    assert {row["name"] for row in saved["rows"]} == {point["name"] for point in saved["curve"]} == {run.OURS}
+    assert {row["name"] for row in saved["rows"]} == {point["name"] for point in saved["curve"]} == {run.FUSED_NAME}
     assert [row["name"] for row in saved["studies"]] == ["dead_zone_noise"]
     assert len(saved["failures"]) == 3
     assert all(
-        f"{run.CEILING}, {precision}: " in failure for precision, failure in zip(PRECISIONS, saved["failures"], strict=False)
+        f"{run.CPP_NAME}, {precision}: " in failure
+        for precision, failure in zip(PRECISIONS, saved["failures"], strict=False)
     )
-    assert any(line.startswith(run.OURS) for line in lines)
+    assert any(line.startswith(run.FUSED_NAME) for line in lines)
     assert lines[-3:] == saved["failures"]
 
 
 def test_no_right_result_is_an_error(monkeypatch):
-    entry = Entry("someone", lambda workload: lambda: {name: np.zeros(workload.lanes) for name in NAMES}, 64)
+    entry = Entry("someone", lambda workload: lambda: {name: np.zeros(workload.lanes) for name in METRIC_NAMES}, 64)
     monkeypatch.setattr(run, "entries", lambda *_: [entry])
     with pytest.raises(NoResult, match="someone, float32"):
         run.bench(quick=True)
@@ -123,11 +134,11 @@ def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
     find = importlib.util.find_spec
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None if name == "numba" else find(name))
     monkeypatch.setenv("CXX", "no-such-compiler")
-    able, left_out = _able(entries(folder, 2, 2), folder / "none")
+    able, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "none")
     assert "install g++" in left_out["c++, one core"]
     assert "jaxbl[bench]" in left_out["numba, prange"]
     monkeypatch.setenv("CXX", "false")
-    _, left_out = _able(entries(folder, 2, 2), folder / "broken")
+    _, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "broken")
     assert "cannot compile chain.cpp: exit code 1" in left_out["c++, one core"]
     assert {"jaxbl fused, all cores", "NumPy, one lane"} <= {entry.name for entry in able}
 

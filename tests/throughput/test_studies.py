@@ -5,8 +5,8 @@ import pytest
 
 from jaxbl.config import read_config
 from jaxbl.errors import NoResult
-from jaxbl.throughput.rivals.cpp_chain import compiler
-from jaxbl.throughput.run import _NAN_SHARE, check_medians, check_study, compare
+from jaxbl.throughput.rivals.cpp_chain import find_compiler
+from jaxbl.throughput.run import _NAN_SHARE, check_medians, check_run_metrics, compare_study
 from jaxbl.throughput.studies import STUDIES
 
 
@@ -17,11 +17,11 @@ def test_those_of_the_repository(name):
     assert read_config(STUDIES[name]).model_copy(update=drawn).to_dict() == repository.to_dict()
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 @pytest.mark.parametrize("name", list(STUDIES))
 def test_the_same_figures_in_cpp(name, tmp_path_factory):
     # beyond 5 s, where the identifiers begin
-    row = compare(name, tmp_path_factory.getbasetemp(), 2, 6000, 1, lanes=64)
+    row = compare_study(name, tmp_path_factory.getbasetemp(), 2, 6000, 1, lanes=64)
     assert row["deviation"] < 1e-5
     assert row["lanes"] == 64
     assert min(row["jaxbl"], row["c++"]) > 0.0
@@ -29,10 +29,10 @@ def test_the_same_figures_in_cpp(name, tmp_path_factory):
 
 def test_other_figures_are_not_timed():
     true = {"motor.velocity_rmse": np.array([1.0, 2.0, np.nan])}
-    assert check_study("study", true, true) == 0.0
+    assert check_run_metrics("study", true, true) == 0.0
     for wrong, fault in (([1.001, 2.002, np.nan], "off by 0.001"), ([np.nan, np.nan, np.nan], "NaN in only one")):
         with pytest.raises(NoResult, match=rf"study: motor.velocity_rmse is {fault}"):
-            check_study("study", {"motor.velocity_rmse": np.array(wrong)}, true)
+            check_run_metrics("study", {"motor.velocity_rmse": np.array(wrong)}, true)
     check_medians("study", {"motor.velocity_rmse": np.array([1.01, 2.01, 7.0])[:2]}, true)
     with pytest.raises(NoResult, match=r"motor.velocity_rmse has a median of 3, not 1.5"):
         check_medians("study", {"motor.velocity_rmse": np.array([3.0, 3.0, np.nan])}, true)
@@ -41,7 +41,7 @@ def test_other_figures_are_not_timed():
 def test_runs_at_the_border_of_convergence_may_flip():
     def check(ours, reference):
         name = "motor.convergence_time"
-        return check_study("study", {name: np.array(ours)}, {name: np.array(reference)})
+        return check_run_metrics("study", {name: np.array(ours)}, {name: np.array(reference)})
 
     times, runs = np.linspace(1.0, 2.0, 4000), round(4000 * _NAN_SHARE)
     flipped = times.copy()

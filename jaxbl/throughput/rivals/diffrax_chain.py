@@ -15,10 +15,10 @@ from jaxbl.drive import set_leaves
 from jaxbl.simulate import advance_sample, compute_metrics, initial_carry
 
 from ..jaxbl_chain import LANES
-from ..workload import FIGURES, Chunked, Workload
+from ..workload import CHAIN_METRICS, ChunkedProgram, Workload
 
 
-class DiffraxChain(Chunked):
+class DiffraxChain(ChunkedProgram):
     """One workload, compiled."""
 
     def __init__(self, workload: Workload):
@@ -30,13 +30,13 @@ class DiffraxChain(Chunked):
         period = experiment.run.sample_period
 
         def lane(values: dict[str, Any]) -> dict[str, Any]:
-            own = set_leaves(experiment, values)
-            start, tree = jax.tree.flatten(initial_carry(own, (FIGURES,)))
+            lane_experiment = set_leaves(experiment, values)
+            start, tree = jax.tree.flatten(initial_carry(lane_experiment, (CHAIN_METRICS,)))
 
             def rates(t: Any, y: tuple[Any, ...], args: Any) -> tuple[Any, ...]:
                 index = jnp.round(t / period).astype(jnp.int32)
-                noise = dict(zip(own.sides, units[index], strict=True))
-                new, _ = advance_sample(own, (FIGURES,), tree.unflatten(y), index, noise)
+                noise = dict(zip(lane_experiment.sides, units[index], strict=True))
+                new, _ = advance_sample(lane_experiment, (CHAIN_METRICS,), tree.unflatten(y), index, noise)
                 return tuple((after - before) / period for after, before in zip(jax.tree.leaves(new), y, strict=True))
 
             solution = diffrax.diffeqsolve(
@@ -51,6 +51,6 @@ class DiffraxChain(Chunked):
                 adjoint=diffrax.ForwardMode(),
             )
             last: Any = solution.ys
-            return compute_metrics(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
+            return compute_metrics(lane_experiment, (CHAIN_METRICS,), tree.unflatten([x[0] for x in last]))
 
         super().__init__(jax.vmap(lane), workload, LANES)

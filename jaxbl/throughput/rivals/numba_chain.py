@@ -9,10 +9,10 @@ from functools import cache
 
 import numpy as np
 
-from ..workload import Workload, identified_figures
-from .python_chain import chain, moreau, numbers_of, super_twisting
+from ..workload import Workload, metrics_from_sums
+from .python_chain import chain_loop, constants_as, moreau_step, super_twisting_step
 
-WIDTH = 64
+BLOCK_LANES = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
 
 
@@ -21,42 +21,44 @@ class NumbaChain:
 
     def __init__(self, workload: Workload, threads: int, blocked: bool):
         self._workload, self._threads = workload, threads
-        self._function = _blocked(workload.precision) if blocked else _plain()
+        self._function = _compile_block_loop(workload.precision) if blocked else _compile_lane_loop()
         torque, noise = workload.inputs()
         self._inputs = [np.ascontiguousarray(column) for column in (torque, *noise.T)]
-        padded = -(-workload.lanes // WIDTH) * WIDTH
+        padded = -(-workload.lanes // BLOCK_LANES) * BLOCK_LANES
         self._values = np.stack([np.resize(column, padded) for column in workload.values().values()])
-        self._constants = numbers_of(workload.dtype.type)
+        self._constants = constants_as(workload.dtype.type)
 
     def __call__(self) -> dict[str, np.ndarray]:
         import numba
 
-        w = self._workload
+        workload = self._workload
         numba.set_num_threads(min(self._threads, numba.config.NUMBA_NUM_THREADS))  # pyright: ignore
-        sums = self._function(w.steps, w.start, w.window, *self._inputs, self._constants, self._values)
-        return identified_figures(w, list(sums[:, : w.lanes]))
+        sums = self._function(workload.steps, workload.start, workload.window, *self._inputs, self._constants, self._values)
+        return metrics_from_sums(workload, list(sums[:, : workload.lanes]))
 
 
-def forget() -> None:
+def clear_compiled() -> None:
     """Compile anew next time."""
-    _plain.cache_clear()
-    _blocked.cache_clear()
+    _compile_lane_loop.cache_clear()
+    _compile_block_loop.cache_clear()
 
 
 @cache
-def _plain() -> Callable[..., np.ndarray]:
+def _compile_lane_loop() -> Callable[..., np.ndarray]:
     from numba import njit, prange
 
     compiled = njit(error_model="numpy")
-    plant, observe = compiled(moreau(math.tanh)), compiled(super_twisting(math.sqrt, np.sign))
-    one = compiled(chain(math.tanh, plant, observe, observe))
+    plant, observe = compiled(moreau_step(math.tanh)), compiled(super_twisting_step(math.sqrt, np.sign))
+    run_lane = compiled(chain_loop(math.tanh, plant, observe, observe))
 
     @njit(parallel=True, error_model="numpy")
     def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
         out = np.zeros((9, values.shape[1]))
         for lane in prange(values.shape[1]):
             v = values[:, lane]
-            sums = one(steps, start, window, torque, motor_noise, load_noise, c, v[0], v[1], v[2], v[3], v[4], v[5], 0.0)
+            sums = run_lane(
+                steps, start, window, torque, motor_noise, load_noise, c, v[0], v[1], v[2], v[3], v[4], v[5], 0.0
+            )
             for k in range(9):
                 out[k, lane] = sums[k]
         return out
@@ -65,11 +67,11 @@ def _plain() -> Callable[..., np.ndarray]:
 
 
 @cache
-def _blocked(precision: str) -> Callable[..., np.ndarray]:
+def _compile_block_loop(precision: str) -> Callable[..., np.ndarray]:
     from numba import njit, prange
 
-    tanh = _tanh(precision)
-    n = WIDTH
+    tanh = _compile_tanh(precision)
+    n = BLOCK_LANES
 
     @njit(parallel=True, error_model="numpy", fastmath={"contract"})
     def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
@@ -77,13 +79,13 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
         out = np.zeros((9, lanes))
         h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = c[:6]
         stiffness, slope, share, miss, zero, half, four = c[6:]
-        one, bow = half + half, half * slope
+        unity, bow = half + half, half * slope
         motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
         load_mass, load_drag = load_inertia / h, half * load_viscous
         half = half * h
-        motor_keep, motor_gain = (motor_mass - motor_drag) / (motor_mass + motor_drag), one / (motor_mass + motor_drag)
-        load_keep, load_gain = (load_mass - load_drag) / (load_mass + load_drag), one / (load_mass + load_drag)
-        motor_inverse, load_friction, load_share = one / motor_inertia, load_viscous / load_inertia, load_inertia / ratio
+        motor_keep, motor_gain = (motor_mass - motor_drag) / (motor_mass + motor_drag), unity / (motor_mass + motor_drag)
+        load_keep, load_gain = (load_mass - load_drag) / (load_mass + load_drag), unity / (load_mass + load_drag)
+        motor_inverse, load_friction, load_share = unity / motor_inertia, load_viscous / load_inertia, load_inertia / ratio
         for block in prange(lanes // n):
             # one buffer: of its parts the compiler knows that they do not overlap
             s = np.zeros(27 * n, values.dtype)
@@ -94,7 +96,7 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
                 s[13 * n + j] = -miss
             for i in range(steps):
                 u, motor_unit, load_unit = torque[i], motor_noise[i], load_noise[i] / ratio
-                counts, inside = (one if i >= start else zero), (one if i >= window else zero)
+                counts, inside = (unity if i >= start else zero), (unity if i >= window else zero)
                 for j in range(n):
                     motor, motor_rate, load, load_rate = s[6 * n + j], s[7 * n + j], s[8 * n + j], s[9 * n + j]
                     motor_guess, load_guess = s[13 * n + j], s[14 * n + j]
@@ -110,8 +112,8 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
                     s[6 * n + j], s[7 * n + j] = motor + half * motor_rate, motor_rate
                     s[8 * n + j], s[9 * n + j] = load + half * load_rate, load_rate
                     motor_miss, load_miss = motor_read - s[11 * n + j], load_read - s[12 * n + j]
-                    motor_sign = (one if motor_miss > zero else zero) - (one if motor_miss < zero else zero)
-                    load_sign = (one if load_miss > zero else zero) - (one if load_miss < zero else zero)
+                    motor_sign = (unity if motor_miss > zero else zero) - (unity if motor_miss < zero else zero)
+                    load_sign = (unity if load_miss > zero else zero) - (unity if load_miss < zero else zero)
                     motor_now, load_now = s[j] * motor_sign, s[2 * n + j] * load_sign
                     s[11 * n + j] += h * (motor_guess + s[n + j] * motor_sign * np.sqrt(abs(motor_miss)))
                     s[12 * n + j] += h * (load_guess + s[3 * n + j] * load_sign * np.sqrt(abs(load_miss)))
@@ -142,7 +144,7 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
     return run
 
 
-def _tanh(precision: str) -> Callable[[float], float]:
+def _compile_tanh(precision: str) -> Callable[[float], float]:
     """tanh by rational functions, without calls, so that it can be computed in vectors."""
     from numba import njit
 

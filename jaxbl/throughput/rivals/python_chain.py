@@ -10,57 +10,57 @@ from typing import Any
 
 import numpy as np
 
-from ..workload import Workload, constants, identified_figures
+from ..workload import Workload, chain_constants, metrics_from_sums
 
-_ARRAYS = np.tanh, np.sqrt, np.sign
-_NUMBERS = math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0)
+_ARRAY_FUNCTIONS = np.tanh, np.sqrt, np.sign
+_NUMBER_FUNCTIONS = math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0)
 
 
-def numbers_of(kind: Callable[[float], Any]) -> tuple[Any, ...]:
+def constants_as(kind: Callable[[float], Any]) -> tuple[Any, ...]:
     """The chain's constants as `kind`, and 0, 1/2 and 4: a literal would make float64 of numba's float32."""
-    return tuple(kind(value) for value in (*constants().values(), 0.0, 0.5, 4.0))
+    return tuple(kind(value) for value in (*chain_constants().values(), 0.0, 0.5, 4.0))
 
 
 class PythonChain:
     """One workload as a loop over time.
 
     Args:
-        workload: of one lane where `numbers` is asked for.
-        numbers: in Python's own in place of arrays of lanes.
-        solver: method of SciPy's `solve_ivp` that takes the plant from sample to sample; needs `numbers`.
-        library: observers are OpenSMC's; needs `numbers`.
-        chosen: indices of the lanes to run; left out, all.
+        workload: of one lane where `scalar` is asked for.
+        scalar: in Python's own in place of arrays of lanes.
+        solver: method of SciPy's `solve_ivp` that takes the plant from sample to sample; needs `scalar`.
+        uses_opensmc: observers are OpenSMC's; needs `scalar`.
+        lanes: indices of the lanes to run; left out, all.
     """
 
     def __init__(
         self,
         workload: Workload,
-        numbers: bool = False,
+        scalar: bool = False,
         solver: str | None = None,
-        library: bool = False,
-        chosen: np.ndarray | slice = slice(None),
+        uses_opensmc: bool = False,
+        lanes: np.ndarray | slice = slice(None),
     ):
-        self._workload, self._solver, self._library = workload, solver, library
+        self._workload, self._solver, self._uses_opensmc = workload, solver, uses_opensmc
         torque, noise = workload.inputs()
-        self._numbers = numbers
-        self._inputs = [x.tolist() if numbers else x for x in (torque, *noise.T)]
-        values = [column[chosen] for column in workload.values().values()]
-        self._values: list[Any] = [column.item() for column in values] if numbers else values
-        self._constants = numbers_of(float if numbers else workload.dtype.type)
+        self._scalar = scalar
+        self._inputs = [x.tolist() if scalar else x for x in (torque, *noise.T)]
+        values = [column[lanes] for column in workload.values().values()]
+        self._values: list[Any] = [column.item() for column in values] if scalar else values
+        self._constants = constants_as(float if scalar else workload.dtype.type)
 
     def __call__(self) -> dict[str, np.ndarray]:
-        w, (tanh, sqrt, sign) = self._workload, _NUMBERS if self._numbers else _ARRAYS
-        plant = moreau(tanh) if self._solver is None else _solved(self._solver)
-        motor = load = super_twisting(sqrt, sign)
-        if self._library:
-            motor, load = _OpenSMC(sign).observe, _OpenSMC(sign).observe
-        run = chain(tanh, plant, motor, load)
-        total = 0.0 if self._numbers else np.zeros(len(self._values[0]))
-        sums = run(w.steps, w.start, w.window, *self._inputs, self._constants, *self._values, total)
-        return identified_figures(w, [np.atleast_1d(column) for column in sums])
+        workload, (tanh, sqrt, sign) = self._workload, _NUMBER_FUNCTIONS if self._scalar else _ARRAY_FUNCTIONS
+        plant = moreau_step(tanh) if self._solver is None else _scipy_step(self._solver)
+        motor = load = super_twisting_step(sqrt, sign)
+        if self._uses_opensmc:
+            motor, load = _OpenSmcObserver(sign).observe, _OpenSmcObserver(sign).observe
+        run = chain_loop(tanh, plant, motor, load)
+        total = 0.0 if self._scalar else np.zeros(len(self._values[0]))
+        sums = run(workload.steps, workload.start, workload.window, *self._inputs, self._constants, *self._values, total)
+        return metrics_from_sums(workload, [np.atleast_1d(column) for column in sums])
 
 
-def chain(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable) -> Callable:
+def chain_loop(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable) -> Callable:
     """From inputs, constants and a lane's values to its nine sums, which begin with `total`."""
 
     def run(
@@ -111,7 +111,7 @@ def chain(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load
     return run
 
 
-def moreau(tanh: Callable) -> Callable:
+def moreau_step(tanh: Callable) -> Callable:
     """One step of the plant: drift, kick, drift."""
 
     def step(motor, motor_rate, load, load_rate, torque, gap, of_plant):
@@ -126,23 +126,23 @@ def moreau(tanh: Callable) -> Callable:
     return step
 
 
-def super_twisting(sqrt: Callable, sign: Callable) -> Callable:
+def super_twisting_step(sqrt: Callable, sign: Callable) -> Callable:
     """One step of an explicit observer (7)-(8): position and velocity for the next sample, and the equivalent control."""
 
-    def observe(seen, guess, reading, nominal, alpha, lambda_, h):
-        error = reading - seen
+    def observe(position, velocity, reading, nominal, alpha, lambda_, h):
+        error = reading - position
         switch = sign(error)
         control = alpha * switch
-        return seen + h * (guess + lambda_ * switch * sqrt(abs(error))), guess + h * (nominal + control), control
+        return position + h * (velocity + lambda_ * switch * sqrt(abs(error))), velocity + h * (nominal + control), control
 
     return observe
 
 
-def _solved(method: str) -> Callable:
+def _scipy_step(method: str) -> Callable:
     """The plant from sample to sample by SciPy."""
     from scipy.integrate import solve_ivp
 
-    c = constants()
+    c = chain_constants()
 
     def rates(t: float, x: np.ndarray, torque: float, gap: float) -> list[float]:
         motor, motor_rate, load, load_rate = x.tolist()
@@ -154,26 +154,26 @@ def _solved(method: str) -> Callable:
 
     def step(motor, motor_rate, load, load_rate, torque, gap, of_plant):
         start = motor, motor_rate, load, load_rate
-        found = solve_ivp(rates, (0.0, c["period"]), start, method, args=(torque, gap), rtol=1e-6, atol=1e-9)
-        return found.y[:, -1].tolist()
+        solution = solve_ivp(rates, (0.0, c["period"]), start, method, args=(torque, gap), rtol=1e-6, atol=1e-9)
+        return solution.y[:, -1].tolist()
 
     return step
 
 
-class _OpenSMC:
+class _OpenSmcObserver:
     """OpenSMC's Levant differentiator of first order: a super-twisting observer without a model, which is added."""
 
     def __init__(self, sign: Callable):
         self._sign, self._estimator = sign, None
 
-    def observe(self, seen, guess, reading, nominal, alpha, lambda_, h):
+    def observe(self, position_estimate, velocity_estimate, reading, nominal, alpha, lambda_, h):
         if self._estimator is None:
             from opensmc.estimators.levant import LevantDifferentiator
 
             # its gains are lambdas[0] sqrt(L) and lambdas[1] L
             self._estimator = LevantDifferentiator(order=1, L=1.0, lambdas=[lambda_, alpha], dt=h)
-            self._estimator._z = np.array([seen, guess])
+            self._estimator._z = np.array([position_estimate, velocity_estimate])
         self._estimator.estimate(0.0, None, None, y=reading)
         self._estimator._z[1] += h * nominal
         position, velocity = self._estimator._z.tolist()
-        return position, velocity, alpha * self._sign(reading - seen)
+        return position, velocity, alpha * self._sign(reading - position_estimate)
