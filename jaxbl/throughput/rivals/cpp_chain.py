@@ -64,8 +64,10 @@ PADDING = 64
 
 
 class CppChain:
-    """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing. `makes_inputs`: it makes input and noise
-    by itself, of another seed each time; else they are given."""
+    """A workload, ready to run. The arrays are the kernel's, so that a run allocates nothing.
+
+    `makes_inputs`: True to make input and noise in C++, with another seed each time; False to take jaxbl's.
+    """
 
     def __init__(self, workload: Workload, threads: int, folder: Path, *, makes_inputs: bool = False):
         self.workload, self.threads, self._makes_inputs, self._seeds = workload, threads, makes_inputs, count(SEED)
@@ -85,8 +87,8 @@ class CppChain:
     def __call__(self) -> dict[str, np.ndarray]:
         workload = self.workload
         self._function(
-            ctypes.byref(self._constants), workload.steps, workload.start, workload.window, self._torque.ctypes, self._noise.ctypes,
-            self._padded, *self._table, self.threads, self._makes_inputs, next(self._seeds),
+            ctypes.byref(self._constants), workload.steps, workload.start, workload.window, self._torque.ctypes,
+            self._noise.ctypes, self._padded, *self._table, self.threads, self._makes_inputs, next(self._seeds),
         )  # fmt: skip
         return metrics_from_sums(workload, [sums[: workload.lanes] for sums in self._out])
 

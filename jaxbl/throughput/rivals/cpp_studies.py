@@ -42,7 +42,7 @@ class _StudyConstants(ctypes.Structure):
 class CppStudy:
     """A study, ready to run by so many threads, `vectors` of lanes at a time; the input is given.
 
-    `makes_noise`: True to draw noise in C++, with other seeds at each call; False to take jaxbl's noise of the study's seeds.
+    `makes_noise`: True to draw noise in C++, with other seeds at each call; False to take jaxbl's noise.
     """
 
     def __init__(self, study: BenchStudy, threads: int, folder: Path, vectors: int = 2, *, makes_noise: bool = True):
