@@ -120,7 +120,7 @@ class BenchResult:
     machine: dict[str, Any]
     rows: list[BenchRow]
     curve: list[dict[str, Any]]
-    prepare_study: list[dict[str, Any]]
+    study: list[dict[str, Any]]
     studies: list[dict[str, Any]]
     left_out: dict[str, str]
     failures: list[str] = field(default_factory=list)
