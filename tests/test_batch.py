@@ -81,7 +81,7 @@ def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):
         (tmp_path / name).write_text("")
     work, _ = read_batch(Path(), Path("a.toml"), Path("out"), overwrite=False)
     seen = []
-    monkeypatch.setattr(batch, "_diagnosed", _found)
+    monkeypatch.setattr(batch, "_diagnose_log", _found)
     rows = run_batch(work, Path("out"), None, lambda *done: seen.append(done), client)
     assert [row["log"] for row in rows] == ["a.csv", "b.csv", "c.csv"]
     assert seen == [(0, 3), (1, 3), (2, 3), (3, 3)]

@@ -984,7 +984,7 @@ def steps_in(lines):
 @pytest.mark.slow
 def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
     study = write(tmp_path, tunable() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
-    monkeypatch.setattr(setup, "_shipped", lambda name: study)
+    monkeypatch.setattr(setup, "_find_shipped_study", lambda name: study)
     code, lines, _ = call("demo", "--out", "results/a map")
     assert code == 0 and lines[-1] == "results/a map/report.html"
     steps = steps_in(lines)

@@ -64,7 +64,9 @@ def test_a_damaged_table_is_computed_anew(tmp_path):
 def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
     """The third one has another drive, and figures of all are those of studies by themselves."""
     compiled = []
-    monkeypatch.setattr(programs, "_fused", lambda *given, real=programs._fused: compiled.append(given) or real(*given))
+    monkeypatch.setattr(
+        programs, "_compile_fused", lambda *given, real=programs._compile_fused: compiled.append(given) or real(*given)
+    )
     axes = [[listed(ALPHA, *alphas), listed(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
     inertias = 0.05, 0.05, 0.06
     studies = [rigid({"drive.motor_inertia": one}, axes=each) for one, each in zip(inertias, axes, strict=True)]

@@ -81,8 +81,8 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
         asked.append(lanes)
         return curve(able, min(lanes, 512), *rest)
 
-    monkeypatch.setattr(run, "entries", only_ours)
-    monkeypatch.setattr(run, "_curve", few)
+    monkeypatch.setattr(run, "make_entries", only_ours)
+    monkeypatch.setattr(run, "_measure_curve", few)
     result = run.bench(quick=True, progress=lambda done, all_: parts.append((done, all_)))
     assert set(used) == {result.machine["cores"]} == {count_cores()}
     assert parts[-1][0] == parts[-1][1]
@@ -105,9 +105,9 @@ def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
             raise NoResult("gain_map: motor.velocity_rmse is off by 0.1 of it")
         return {"name": name, "lanes": 4, "seeds": 2, "steps": 10, "deviation": 0.0, "jaxbl": 1e8, "c++": 1e8}
 
-    monkeypatch.setattr(run, "entries", ours_and_a_wrong_one)
-    monkeypatch.setattr(run, "compare", compare)
-    monkeypatch.setattr(run, "_curve", functools.partial(_short_curve, run._measure_curve))
+    monkeypatch.setattr(run, "make_entries", ours_and_a_wrong_one)
+    monkeypatch.setattr(run, "compare_study", compare)
+    monkeypatch.setattr(run, "_measure_curve", functools.partial(_short_curve, run._measure_curve))
     monkeypatch.setattr("jax.config.update", lambda *_: None)
     code, lines, _ = call("bench", "--quick")
     saved = json.loads((tmp_path / "results" / "bench" / "bench.json").read_text())
@@ -125,7 +125,7 @@ def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
 
 def test_no_right_result_is_an_error(monkeypatch):
     entry = Entry("someone", lambda workload: lambda: {name: np.zeros(workload.lanes) for name in METRIC_NAMES}, 64)
-    monkeypatch.setattr(run, "entries", lambda *_: [entry])
+    monkeypatch.setattr(run, "make_entries", lambda *_: [entry])
     with pytest.raises(NoResult, match="someone, float32"):
         run.bench(quick=True)
 
