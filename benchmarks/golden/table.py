@@ -124,7 +124,9 @@ _LAWS = {
     "sigmoid.toml": 'include = "sweeps/gain_map.toml"\n',
     "rigid.toml": 'include = "sweeps/direct_drive.toml"\n',
 }
-_EFFECTS = {"geared_effects": "inputs/effects/geared.toml", "rigid_effects": "inputs/effects/rigid.toml"}
+_INPUTS = "inputs"
+"""Folder of the input files, the same for both sides."""
+_EFFECTS = {"geared_effects": f"{_INPUTS}/effects/geared.toml", "rigid_effects": f"{_INPUTS}/effects/rigid.toml"}
 _DRIVES = {file.removesuffix(".toml"): file for file in _LAWS} | _EFFECTS
 
 
@@ -222,8 +224,8 @@ GOLDENS: dict[str, Golden] = {
     ),
     "simulate": Golden(
         (
-            "simulate inputs/effects/geared.toml --out geared",
-            "simulate inputs/effects/rigid.toml --out rigid",
+            f"simulate {_INPUTS}/effects/geared.toml --out geared",
+            f"simulate {_INPUTS}/effects/rigid.toml --out rigid",
             "simulate sweeps/paper_table1.toml --every 50 --out paper",
         ),
         inputs=("effects",),
@@ -246,9 +248,9 @@ GOLDENS: dict[str, Golden] = {
     ),
     "recordings": Golden(
         (
-            *(f"identify {logs} --model inputs/recorded/{name}.toml --out {name}" for name, logs in _MACHINES.items()),
+            *(f"identify {logs} --model {_INPUTS}/recorded/{name}.toml --out {name}" for name, logs in _MACHINES.items()),
             "inspect recordings/servoproject_dual_encoder/outputEncoderData.txt"
-            " --model inputs/recorded/dual.toml --out dual",
+            f" --model {_INPUTS}/recorded/dual.toml --out dual",
         ),
         IDENTIFIED,
         inputs=("recorded",),

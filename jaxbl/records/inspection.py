@@ -268,8 +268,8 @@ def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:
     """A fit of one rigid body says little of a motor whose load follows only loosely."""
     if judgement.answer == "no" or judgement.quantity == "constant torque":
         return judgement
-    why = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
-    return replace(judgement, answer="weak", why=why)
+    reason = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
+    return replace(judgement, answer="weak", reason=reason)
 
 
 def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:
