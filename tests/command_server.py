@@ -207,6 +207,8 @@ def _execute(arguments, cwd, environment):
     sys.stdout.reconfigure(write_through=bool(environment.get("PYTHONUNBUFFERED")))
     # commands look whether they were started by another process of theirs
     sys.modules.pop("multiprocessing.spawn", None)
+    # it is run anew below, with its handler of interrupts
+    sys.modules.pop("jaxbl.__main__", None)
     new = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path and path not in sys.path]
     if new:
         sys.path[1:1] = new
