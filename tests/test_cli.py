@@ -1004,7 +1004,7 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
         code, lines, _ = call(*words, *(["--static", "page"] if words[0] == "explore" else []))
         assert code == 0 and Path(lines[-1]).is_file()
     # the last one asks; who has such a file is not told to write it
-    with pytest.raises(InputError, match="these numbers are missing"):
+    with pytest.raises(InputError, match="numbers are missing"):
         call(*shlex.split(steps[-1][0])[1:])
     write(tmp_path, name="drive.toml")
     assert len(steps_in(call("demo", "--out", "results/a map")[1])) == 3

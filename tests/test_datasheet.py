@@ -266,7 +266,7 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
         ),
         (
             ["--kind", "linear"],
-            "init: these numbers are missing, here with examples: --mass '8 kg', --motor-friction '6 N', ",
+            "init: numbers are missing, here with examples: --mass '8 kg', --motor-friction '6 N', ",
         ),
     ],
 )
