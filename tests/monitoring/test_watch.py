@@ -27,7 +27,7 @@ from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch, watch_co
 from jaxbl.monitoring.window import Number
 
 LIMIT = 1.25 * HALF_GAP
-WINDOW = {"window": 4.0, "every": 0.5}
+WINDOW = {"window": 4.0, "interval": 0.5}
 OPTIONS = ("--window", "4", "--every", "0.5")
 SECONDS = 16.0
 GROWN = 1.0 + np.clip((np.arange(0.0, SECONDS, 1e-3) - 5.0) / 4.0, 0.0, 1.0)
@@ -306,7 +306,7 @@ BAD = {
     "window longer than the log": (axis(), {"window": 100.0}, "has 9.999 s, window is 100 s"),
     "no window": (axis(), {"window": 0.0}, "window is 0; it should be positive"),
     "limit": (axis(), {"alarm_gap": -1.0}, "alarm-gap is -1; it should be positive"),
-    "values too often": (axis(), {"every": 1e-4}, "every is 0.0001 s; it should be at least the sampling period"),
+    "values too often": (axis(), {"interval": 1e-4}, "every is 0.0001 s; it should be at least the sampling period"),
     "period": (
         small({"run.sample_period": 2e-3}),
         {},

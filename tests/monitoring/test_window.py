@@ -117,7 +117,7 @@ def test_what_determines_nothing_gives_nothing():
     flank["motor.torque"] = late(hinge(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
     found = window_of(flank).estimate().get("motor")
     assert found is None or found.numbers["half_gap"].error > HALF_GAP
-    infinite = rows | {"motor.torque": np.is_full(10_000, np.inf)}
+    infinite = rows | {"motor.torque": np.full(10_000, np.inf)}
     assert "motor" not in window_of(infinite).estimate()
 
 
