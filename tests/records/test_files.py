@@ -201,7 +201,7 @@ def test_columns_that_are_not_there_or_not_numbers(case, tmp_path):
     content, column, message = COLUMNS[case]
     (tmp_path / "log.csv").write_text(content)
     with pytest.raises(InputError, match=message):
-        read_log_file(tmp_path / "log.csv").numbers(column)
+        read_log_file(tmp_path / "log.csv").load_numbers(column)
 
 
 EPOS = """Date:;2020-07-09 22:31:10
@@ -337,7 +337,7 @@ def test_a_letter_of_another_encoding_far_behind_the_head(tmp_path):
     rows = "".join(f"{i},{2 * i},a\n" for i in range(40_000))
     (tmp_path / "log.csv").write_bytes(f"t,u,note\n{rows}1,2,5 \u00b0C\n".encode("latin-1"))
     assert len(rows) > files._HEAD
-    assert read_log_file(tmp_path / "log.csv", {"t", "u"}).numbers("u")[-1] == 2.0
+    assert read_log_file(tmp_path / "log.csv", {"t", "u"}).load_numbers("u")[-1] == 2.0
 
 
 def test_a_decimal_comma_that_comes_late(tmp_path):
