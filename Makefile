@@ -9,7 +9,7 @@ demo: .venv/installed
 
 # one worker a core: more threads of linear algebra would only wait for one another
 test: .venv/installed-dev
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # results of the tree beside those of the base commit, and what moved: make goldens ONLY="export_code tune"
 goldens: .venv/installed-dev

@@ -1,34 +1,15 @@
 """Results that several files of tests read, made once a worker. A test that writes into a folder of them takes a copy."""
 
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid
 
-SHARED = ("verified",)
-"""Names of the fixtures; a file of tests reads one of them at most."""
 
-
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker runs a file as a whole, and all files that read the same shared result. Those with many slow tests come
-    first, so that workers end together."""
-    groups: dict[Path, str] = {}
-    for item in items:
-        shared = [name for name in SHARED if name in getattr(item, "fixturenames", ())]
-        if shared:
-            groups[item.path] = shared[0]
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(groups.get(item.path, str(item.path.relative_to(Path(__file__).parent)))))
-    slow = Counter(_group(item) for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: (-slow[_group(item)], _group(item)))
-
-
-def _group(item: pytest.Item) -> str:
-    mark = item.get_closest_marker("xdist_group")
-    assert mark is not None
-    return mark.args[0]
+    """Files with many slow tests first, each as a whole: workers end together."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 GAINS = [listed(LAMBDA, 0.05, 5.0, 12.0), listed(ALPHA, 1.8, 8.0)]

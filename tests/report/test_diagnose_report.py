@@ -230,7 +230,7 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     before = 0.3 * np.sign(np.sin(5.0 * time)) + noise
     parts = [(slice(0, 1500), False), (slice(1500, 2000), True)]
     pairs = {"motor": [(residual(before, rows), residual(noise, rows), held) for rows, held in parts]}
-    record = _Named(findings=_Named(channels={"theta_e": _Named(unit="rad")}), path=tmp_path / "axis.csv")
+    record = _Named(unit_of=lambda path, unit: unit, path=tmp_path / "axis.csv")
     gap = {"holdout": {"separate": False}}
     found = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
     drawn = _over_time(found)  # type: ignore[arg-type]
