@@ -23,8 +23,8 @@ from jaxbl.sweeps.metrics import Rms, RunMetric
 class CubicShaft(AbstractTransmission):
     """Flexible shaft that hardens: C = K z + K_3 z^3."""
 
-    name: ClassVar[str] = "cubic_shaft"
-    errors: ClassVar[dict] = {"stiffness_error": "stiffness", "cubic_error": "cubic"}
+    name = "cubic_shaft"
+    errors: ClassVar = {"stiffness_error": "stiffness", "cubic_error": "cubic"}
     half_gap: ClassVar[float] = 0.0
     stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
     cubic: Scalar = parameter("N m/rad³", "hardening K_3", minimum=0.0)
@@ -45,7 +45,7 @@ class CubicShaft(AbstractTransmission):
 class Triangle(AbstractExcitation):
     """Triangle wave between -amplitude and amplitude."""
 
-    name: ClassVar[str] = "triangle"
+    name = "triangle"
     amplitude: Scalar = parameter("N m", "amplitude")
     frequency: Scalar = parameter("Hz", "frequency", above=0.0)
 

@@ -8,7 +8,7 @@ where it acts. Loops for this machine's processor, which compile fast, get the m
 import dataclasses
 from collections.abc import Callable, Collection, Iterable
 from functools import cache, lru_cache
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -105,7 +105,7 @@ def _is_neutral(effect: AbstractEffect) -> bool:
 class _AddedTorque(ConstantTorque):
     """A torque on a side, beside what the model has there; a name of its own."""
 
-    kind: ClassVar[str] = "added_torque"
+    kind = "added_torque"
 
 
 def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:

@@ -64,7 +64,7 @@ EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractE
 class Sine(AbstractExcitation):
     """Sine: u = offset + amplitude sin(2 pi frequency t + phase)."""
 
-    name: ClassVar[str] = "sine"
+    name = "sine"
     amplitude: Scalar = parameter("N m", "amplitude")
     frequency: Scalar = parameter("Hz", "frequency", minimum=0.0)
     phase: Scalar = parameter("rad", "phase at t = 0", default=0.0)
@@ -86,7 +86,7 @@ class Multisine(AbstractExcitation):
     Reference: M. R. Schroeder, IEEE Trans. Inf. Theory 16 (1970).
     """
 
-    name: ClassVar[str] = "multisine"
+    name = "multisine"
     amplitude: Scalar = parameter("N m", "amplitude of the sine of equal power")
     frequency: Scalar = parameter("Hz", "fundamental frequency", above=0.0)
     # every harmonic is computed at every sample of every lane; an input with more harmonics should be recorded
@@ -107,7 +107,7 @@ class Multisine(AbstractExcitation):
 class Chirp(AbstractExcitation):
     """Chirp: a sine whose frequency moves linearly from `start_frequency` to `stop_frequency` in `sweep_time` and stays."""
 
-    name: ClassVar[str] = "chirp"
+    name = "chirp"
     amplitude: Scalar = parameter("N m", "amplitude")
     start_frequency: Scalar = parameter("Hz", "frequency at t = 0", minimum=0.0)
     stop_frequency: Scalar = parameter("Hz", "frequency at the end of the sweep", minimum=0.0)
@@ -139,7 +139,7 @@ def _hold_index(hold: Scalar, time: Float[Array, ""]) -> Array:
 class Steps(AbstractExcitation):
     """Random steps: levels that are uniform in [-amplitude, amplitude], each held for `hold` seconds."""
 
-    name: ClassVar[str] = "steps"
+    name = "steps"
     amplitude: Scalar = parameter("N m", "largest level")
     hold: Scalar = parameter("s", "time that each level is held", above=0.0)
     seed: int = option("seed of the levels", default=0, minimum=0)
@@ -159,7 +159,7 @@ class Steps(AbstractExcitation):
 class Prbs(AbstractExcitation):
     """Pseudo-random binary sequence +-amplitude: a maximum-length shift register of `order` bits, one bit per `hold`."""
 
-    name: ClassVar[str] = "prbs"
+    name = "prbs"
     amplitude: Scalar = parameter("N m", "amplitude")
     hold: Scalar = parameter("s", "time of one bit", above=0.0)
     order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
@@ -180,7 +180,7 @@ class Prbs(AbstractExcitation):
 class Recorded(AbstractExcitation):
     """Recorded torque with zero-order hold; the last sample is held on. `times` are in s, `torques` in N m."""
 
-    name: ClassVar[str] = "recorded"
+    name = "recorded"
     times: Float[Array, " samples"]
     torques: Float[Array, " samples"]
     gain: Scalar = parameter("", "factor on the recorded torque", default=1.0)

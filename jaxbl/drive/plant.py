@@ -79,8 +79,8 @@ class AbstractDrive(eqx.Module):
 class TwoInertia(AbstractDrive):
     """Motor and load, connected by a gear: J_e dv_e/dt = u - f_e v_e - C, J_s dv_s/dt = N_0 C - f_s v_s (1)."""
 
-    name: ClassVar[str] = "two_inertia"
-    sides: ClassVar[tuple[str, ...]] = ("motor", "load")
+    name = "two_inertia"
+    sides = ("motor", "load")
     motor_inertia: Scalar = parameter("kg m²", "motor inertia J_e", above=0.0)
     motor_viscous: Scalar = parameter("N m s/rad", "motor viscous friction f_e", minimum=0.0)
     load_inertia: Scalar = parameter("kg m²", "load inertia J_s", above=0.0)
@@ -95,8 +95,8 @@ class TwoInertia(AbstractDrive):
 class Rigid(AbstractDrive):
     """One inertia: J_e dv_e/dt = u - f_e v_e - (effects). Effects of motor and load act on it; all else is disturbance."""
 
-    name: ClassVar[str] = "rigid"
-    sides: ClassVar[tuple[str, ...]] = ("motor",)
+    name = "rigid"
+    sides = ("motor",)
     motor_inertia: Scalar = parameter("kg m²", "inertia (a mass in kg on a linear axis)", above=0.0)
     motor_viscous: Scalar = parameter("N m s/rad", "viscous friction", minimum=0.0)
 

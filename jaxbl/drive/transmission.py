@@ -69,8 +69,8 @@ class SigmoidBacklash(AbstractTransmission):
     As a regression, C = K z - K j_0 4 tanh(gamma z / 2) has the coefficients K and K j_0 (21), with nominal gamma.
     """
 
-    name: ClassVar[str] = "sigmoid_backlash"
-    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
+    name = "sigmoid_backlash"
+    errors: ClassVar = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
     stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
     dead_zone: Scalar = parameter("rad", "dead-zone amplitude j_0 of law (3); the half gap is 4 j_0", minimum=0.0)
     slope: Scalar = parameter("1/rad", "slope gamma of law (3)", above=0.0)
@@ -98,8 +98,8 @@ class SigmoidBacklash(AbstractTransmission):
 class LinearShaft(AbstractTransmission):
     """Flexible shaft without play (5): C = K z."""
 
-    name: ClassVar[str] = "linear_shaft"
-    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness"}
+    name = "linear_shaft"
+    errors: ClassVar = {"stiffness_error": "stiffness"}
     half_gap: ClassVar[float] = 0.0  # type: ignore[misc]
     stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
 
@@ -124,8 +124,8 @@ class DeadZone(AbstractTransmission):
     gap. Whether there is contact is taken from the nominal half gap, as gamma is nominal in law (3).
     """
 
-    name: ClassVar[str] = "dead_zone"
-    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
+    name = "dead_zone"
+    errors: ClassVar = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
     stiffness: Scalar = parameter("N m/rad", "stiffness K in contact", above=0.0)
     half_gap: Scalar = parameter("rad", "half of the free play, on the motor side", minimum=0.0)
 

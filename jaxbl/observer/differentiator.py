@@ -196,8 +196,8 @@ def _make_differentiator(n: int, unit: str) -> type[AbstractDifferentiator]:
     @OBSERVERS.add
     class Differentiator(base):
         __doc__ = AbstractDifferentiator.__doc__
-        name: ClassVar[str] = f"differentiator_{n}"
-        order: ClassVar[int] = n
+        name = f"differentiator_{n}"
+        order = n
         lipschitz: Scalar = parameter(unit, "bound L of the highest derivative that is not estimated", minimum=0.0)
 
     Differentiator.__name__ = Differentiator.__qualname__ = f"Differentiator{n}"

@@ -69,8 +69,8 @@ class Luenberger(AbstractLinearObserver):
     Reference: D. G. Luenberger, IEEE Trans. Mil. Electron. 8 (1964).
     """
 
-    name: ClassVar[str] = "luenberger"
-    has_disturbance: ClassVar[bool] = False
+    name = "luenberger"
+    has_disturbance = False
     bandwidth: Scalar = parameter("rad/s", "natural frequency of the observer's poles", above=0.0)
     damping: Scalar = parameter("", "damping ratio of the observer's poles", default=1.0, above=0.0)
 
@@ -100,7 +100,7 @@ class ExtendedState(AbstractLinearObserver):
     American Control Conf. (2006).
     """
 
-    name: ClassVar[str] = "extended_state"
+    name = "extended_state"
     bandwidth: Scalar = parameter("rad/s", "natural frequency of the observer's poles", above=0.0)
 
     @classmethod
@@ -122,7 +122,7 @@ class Kalman(AbstractLinearObserver):
     three noises matter. It is solved by doubling: E. K.-W. Chu et al., Int. J. Control 77 (2004).
     """
 
-    name: ClassVar[str] = "kalman"
+    name = "kalman"
     position_noise: Scalar = parameter("rad", "rms error of the measured position", above=0.0)
     disturbance_noise: Scalar = parameter(
         "rad/s³/√Hz", "density of the white noise whose integral is the disturbance", above=0.0
@@ -245,7 +245,7 @@ class DirtyDerivative(AbstractObserver):
     by backward Euler.
     """
 
-    name: ClassVar[str] = "dirty_derivative"
+    name = "dirty_derivative"
     time_constant: Scalar = parameter("s", "time constant of the low-pass on each difference", minimum=0.0)
 
     @classmethod

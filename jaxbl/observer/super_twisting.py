@@ -20,7 +20,7 @@ class AbstractSuperTwisting(AbstractObserver):
         discretisation: key `discretisation` of the config.
     """
 
-    name: ClassVar[str] = "super_twisting"
+    name = "super_twisting"
     discretisation: ClassVar[str]
     lambda_: Scalar = parameter("√rad/s", "gain lambda of the square-root term (8)", minimum=0.0)
     alpha: Scalar = parameter("rad/s²", "gain alpha of the switching term (8)", minimum=0.0)
@@ -45,7 +45,7 @@ OBSERVERS.add(AbstractSuperTwisting)
 class ExplicitSuperTwisting(AbstractSuperTwisting):
     """Forward Euler of (7)-(8). The estimate at a sample is the prediction for it, without its measurement."""
 
-    discretisation: ClassVar[str] = "explicit"
+    discretisation = "explicit"
 
     def step(self, state, measured, acceleration, period):
         error = measured - state.position
@@ -72,7 +72,7 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
     Reference: V. Acary, B. Brogliato, Y. Orlov, IEEE Trans. Autom. Control 57 (2012), for the method.
     """
 
-    discretisation: ClassVar[str] = "implicit"
+    discretisation = "implicit"
 
     def step(self, state, measured, acceleration, period):
         innovation = measured - state.position

@@ -1,7 +1,5 @@
 """Effects of the actuator, which turns the commanded torque into the one that acts."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from ..parameters import Scalar, parameter
@@ -21,9 +19,9 @@ _LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
 class Delay(ActuatorEffect):
     """Dead time of the torque: u(t - T), exact for an input held from sample to sample. Before t = 0 the input was zero."""
 
-    kind: ClassVar[str] = "delay"
-    state_from_input: ClassVar[bool] = True
-    rank: ClassVar[int] = 0
+    kind = "delay"
+    state_from_input = True
+    rank = 0
     delay: Scalar = shape(
         "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0
     )
@@ -57,8 +55,8 @@ class Delay(ActuatorEffect):
 class GainError(ActuatorEffect):
     """Relative error e of the torque constant: u (1 + e)."""
 
-    kind: ClassVar[str] = "gain_error"
-    rank: ClassVar[int] = 1
+    kind = "gain_error"
+    rank = 1
     relative: Scalar = size("", "relative error e of the torque", minimum=-1.0)
 
     def actuate(self, state, torque, step):
@@ -69,8 +67,8 @@ class GainError(ActuatorEffect):
 class Saturation(ActuatorEffect):
     """Torque limit: clip(u, -limit, limit)."""
 
-    kind: ClassVar[str] = "saturation"
-    rank: ClassVar[int] = 2
+    kind = "saturation"
+    rank = 2
     limit: Scalar = shape(
         "N m", "largest torque", lambda log: [share * log.torque for share in _LIMITS], neutral=1e30, above=0.0
     )
@@ -83,9 +81,9 @@ class Saturation(ActuatorEffect):
 class Lag(ActuatorEffect):
     """First-order lag of the torque: T du_a/dt = u - u_a, exact for a held input; u_a is zero at t = 0."""
 
-    kind: ClassVar[str] = "lag"
-    state_from_measurement: ClassVar[bool] = True
-    rank: ClassVar[int] = 3
+    kind = "lag"
+    state_from_measurement = True
+    rank = 3
     time_constant: Scalar = shape(
         "s", "time constant T", lambda log: [samples * log.period for samples in _LAGS], neutral=1e-30, above=0.0
     )
@@ -110,10 +108,10 @@ class BackEmf(ActuatorEffect):
     For a log in V, `[log] u` has the factor 1. A diagnosis does not try it: back-EMF acts as viscous friction of the motor.
     """
 
-    kind: ClassVar[str] = "back_emf"
-    rank: ClassVar[int] = 4
-    input_unit: ClassVar[str] = "V"
-    velocity_dependent: ClassVar[bool] = True
+    kind = "back_emf"
+    rank = 4
+    input_unit = "V"
+    velocity_dependent = True
     resistance: Scalar = parameter("ohm", "resistance R of the winding", above=0.0)
     torque_constant: Scalar = parameter("N m/A", "torque constant k_t, which is that of the back-EMF in V s/rad", above=0.0)
 

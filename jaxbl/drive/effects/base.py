@@ -306,7 +306,7 @@ class AbstractEffect(eqx.Module):
 class SideEffect(AbstractEffect):
     """An effect on the motor or the load; `side` says on which."""
 
-    places: ClassVar[tuple[str, ...]] = ("motor", "load")
+    places = ("motor", "load")
     side: str = eqx.field(static=True, kw_only=True)
 
     @property
@@ -317,7 +317,7 @@ class SideEffect(AbstractEffect):
 class TransmissionEffect(AbstractEffect):
     """An effect in the gear."""
 
-    places: ClassVar[tuple[str, ...]] = ("transmission",)
+    places = ("transmission",)
 
 
 class ActuatorEffect(AbstractEffect):
@@ -330,7 +330,7 @@ class ActuatorEffect(AbstractEffect):
         input_unit: unit of the input, if the effect determines it; otherwise "".
     """
 
-    places: ClassVar[tuple[str, ...]] = ("actuator",)
+    places = ("actuator",)
     rank: ClassVar[int] = 0
     input_unit: ClassVar[str] = ""
 
@@ -343,7 +343,7 @@ class EncoderEffect(AbstractEffect):
         in_log: a sentence that says how a log is corrected for it, since models of logs have no such effects.
     """
 
-    places: ClassVar[tuple[str, ...]] = ("encoder",)
+    places = ("encoder",)
     encoder: ClassVar[str] = "load"
     in_log: ClassVar[str] = "its readings have it already"
 

@@ -4,8 +4,6 @@ They change readings, not the motion. A log is corrected for them when it is rea
 them.
 """
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from ..parameters import Scalar, parameter
@@ -16,9 +14,9 @@ from .base import EFFECTS, EncoderEffect
 class Offset(EncoderEffect):
     """Zero point of the motor's encoder: the reading is theta_e + offset."""
 
-    kind: ClassVar[str] = "offset"
-    encoder: ClassVar[str] = "motor"
-    in_log: ClassVar[str] = "[log] theta_e.offset takes it off"
+    kind = "offset"
+    encoder = "motor"
+    in_log = "[log] theta_e.offset takes it off"
     offset: Scalar = parameter("rad", "reading at position 0")
 
     def read(self, position, velocity):
@@ -29,8 +27,8 @@ class Offset(EncoderEffect):
 class Skew(EncoderEffect):
     """Clock of the load's encoder: readings are older than their time stamps, theta - skew dtheta/dt."""
 
-    kind: ClassVar[str] = "skew"
-    in_log: ClassVar[str] = "[log] theta_s.skew takes it off"
+    kind = "skew"
+    in_log = "[log] theta_s.skew takes it off"
     skew: Scalar = parameter("s", "age of a reading at its stamp; short beside the changes of the velocity")
 
     def read(self, position, velocity):
@@ -41,7 +39,7 @@ class Skew(EncoderEffect):
 class EncoderEccentricity(EncoderEffect):
     """Eccentric disk of the load's encoder: theta + A sin(n theta + phase)."""
 
-    kind: ClassVar[str] = "eccentricity"
+    kind = "eccentricity"
     amplitude: Scalar = parameter("rad", "amplitude A")
     harmonic: Scalar = parameter("1/turn", "periods n a turn; 2 of a tilted disk", default=1.0, above=0.0)
     phase: Scalar = parameter("rad", "phase at theta = 0", default=0.0)

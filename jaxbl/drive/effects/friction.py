@@ -13,8 +13,8 @@ from .base import EFFECTS, SideEffect, held, shape, size
 class CoulombFriction(SideEffect):
     """Dry friction of constant level: F_c sign(v) in motion; at rest it holds against torques up to F_c."""
 
-    kind: ClassVar[str] = "coulomb_friction"
-    exclusive: ClassVar[str | None] = "dry friction"
+    kind = "coulomb_friction"
+    exclusive = "dry friction"
     torque: Scalar = size("N m", "friction torque F_c", minimum=0.0)
 
     def dry_friction(self, state, motion):
@@ -25,9 +25,9 @@ class CoulombFriction(SideEffect):
 class StribeckFriction(SideEffect):
     """Dry friction whose level falls with speed, from break-away F_s to F_c: F_c + (F_s - F_c) exp(-(v / v_s)^2)."""
 
-    kind: ClassVar[str] = "stribeck_friction"
-    velocity_dependent: ClassVar[bool] = True
-    exclusive: ClassVar[str | None] = "dry friction"
+    kind = "stribeck_friction"
+    velocity_dependent = True
+    exclusive = "dry friction"
     special_cases: ClassVar = {"coulomb_friction": lambda numbers: {"torque": numbers["torque"]}}
     torque: Scalar = size("N m", "sliding friction torque F_c", minimum=0.0)
     breakaway_torque: Scalar = size("N m", "break-away torque F_s", minimum=0.0)
@@ -71,9 +71,9 @@ class PreslidingFriction(SideEffect):
     al., A new model for control of systems with friction, IEEE TAC 40 (1995).
     """
 
-    kind: ClassVar[str] = "presliding_friction"
-    velocity_dependent: ClassVar[bool] = True
-    exclusive: ClassVar[str | None] = "dry friction"
+    kind = "presliding_friction"
+    velocity_dependent = True
+    exclusive = "dry friction"
     special_cases: ClassVar = {"coulomb_friction": lambda numbers: {"torque": numbers["torque"]}}
     torque: Scalar = size("N m", "sliding friction torque F_c", minimum=0.0)
     length: Scalar = shape(
@@ -122,9 +122,9 @@ class DriftingFriction(SideEffect):
     manipulators, IROS (2015): one thermal time constant.
     """
 
-    kind: ClassVar[str] = "drifting_friction"
-    in_time: ClassVar[bool] = True
-    exclusive: ClassVar[str | None] = "dry friction"
+    kind = "drifting_friction"
+    in_time = True
+    exclusive = "dry friction"
     special_cases: ClassVar = {
         "coulomb_friction": lambda numbers: {"torque": 0.5 * (numbers["torque"] + numbers["initial_torque"])}
     }
@@ -151,9 +151,9 @@ class DriftingFriction(SideEffect):
 class ViscousFriction(SideEffect):
     """Error f of the nominal viscous friction: torque f v."""
 
-    kind: ClassVar[str] = "viscous_friction"
-    velocity_dependent: ClassVar[bool] = True
-    corrects: ClassVar[str | None] = "viscous"
+    kind = "viscous_friction"
+    velocity_dependent = True
+    corrects = "viscous"
     viscous: Scalar = size("N m s/rad", "viscous friction on top of the nominal one; may be negative")
 
     def resist(self, state, motion):
@@ -169,8 +169,8 @@ class AsymmetricFriction(SideEffect):
     torque.
     """
 
-    kind: ClassVar[str] = "asymmetric_friction"
-    velocity_dependent: ClassVar[bool] = True
+    kind = "asymmetric_friction"
+    velocity_dependent = True
     viscous_difference: Scalar = size("N m s/rad", "viscous friction forwards less that backwards, d_f")
     torque_difference: Scalar = held("N m", "dry friction forwards less that backwards, d_F", 0.0)
 
@@ -182,8 +182,8 @@ class AsymmetricFriction(SideEffect):
 class QuadraticDrag(SideEffect):
     """Fluid drag: torque b v |v|."""
 
-    kind: ClassVar[str] = "quadratic_drag"
-    velocity_dependent: ClassVar[bool] = True
+    kind = "quadratic_drag"
+    velocity_dependent = True
     drag: Scalar = size("N m s²/rad²", "drag coefficient b", minimum=0.0)
 
     def resist(self, state, motion):

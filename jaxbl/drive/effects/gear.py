@@ -1,7 +1,5 @@
 """Effects of the gear beyond its law: free play, hardening, damping, hysteresis, kinematic error, friction under load."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from ..parameters import Scalar
@@ -22,7 +20,7 @@ def _trial_harmonics(log: Scales) -> list[float]:
 class Backlash(TransmissionEffect):
     """A hard gap in series with the law: deflection z - clip(z, -b, b), where b is the half gap."""
 
-    kind: ClassVar[str] = "backlash"
+    kind = "backlash"
     half_gap: Scalar = shape(
         "rad",
         "half of the free play, on the motor side",
@@ -47,7 +45,7 @@ class Backlash(TransmissionEffect):
 class Hardening(TransmissionEffect):
     """Stiffness that grows with the deflection z: torque K_3 z^3 beside the law."""
 
-    kind: ClassVar[str] = "hardening"
+    kind = "hardening"
     cubic_stiffness: Scalar = size("N m/rad³", "cubic stiffness K_3")
 
     def transmit(self, state, deflection, rate):
@@ -58,8 +56,8 @@ class Hardening(TransmissionEffect):
 class Damping(TransmissionEffect):
     """Damping of the shaft: torque D dz/dt beside the law, where z is the elastic deflection (none inside a hard gap)."""
 
-    kind: ClassVar[str] = "damping"
-    velocity_dependent: ClassVar[bool] = True
+    kind = "damping"
+    velocity_dependent = True
     damping: Scalar = size("N m s/rad", "damping D", minimum=0.0)
 
     def transmit(self, state, deflection, rate):
@@ -71,7 +69,7 @@ class Hysteresis(TransmissionEffect):
     """Friction within the shaft (Bouc-Wen, n = 2): torque T w beside the law. With the deflection z, dw/dz is 1 / length
     while w returns to 0, and (1 - w²) / length while it grows. For small swings the stiffness is higher by T / length."""
 
-    kind: ClassVar[str] = "hysteresis"
+    kind = "hysteresis"
     torque: Scalar = size("N m", "largest hysteretic torque T", minimum=0.0)
     length: Scalar = shape(
         "rad",
@@ -101,7 +99,7 @@ class Eccentricity(TransmissionEffect):
     """Eccentric gear: transmission error A sin(n theta_s + phase). The torque ratio changes with it, so that no power is
     lost. For an eccentric pinion, which turns with the motor, n is the gear ratio."""
 
-    kind: ClassVar[str] = "eccentricity"
+    kind = "eccentricity"
     # a small part of the twist, for which the torque is linear in the amplitude
     amplitude: Scalar = size("rad", "amplitude A, on the motor side", trial=lambda log: 0.02 * log.twist)
     harmonic: Scalar = harmonic("periods n a load turn", _trial_harmonics, default=1.0)
@@ -122,7 +120,7 @@ class LoadFriction(TransmissionEffect):
     actuators, arXiv:2410.08650 (2024): their load-dependent friction.
     """
 
-    kind: ClassVar[str] = "load_friction"
+    kind = "load_friction"
     coefficient: Scalar = size("", "friction torque over transmitted torque, mu", minimum=0.0)
 
     def gear_friction(self, state, torque):

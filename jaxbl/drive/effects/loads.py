@@ -44,7 +44,7 @@ def _base_harmonics(log: Scales) -> list[float]:
 class ConstantTorque(SideEffect):
     """Constant resisting torque, e.g. an offset of the amplifier or a weight on a drum."""
 
-    kind: ClassVar[str] = "constant_torque"
+    kind = "constant_torque"
     torque: Scalar = size("N m", "resisting torque; may be negative")
 
     def resist(self, state, motion):
@@ -55,8 +55,8 @@ class ConstantTorque(SideEffect):
 class Inertia(SideEffect):
     """Error of the nominal inertia, which is added to it."""
 
-    kind: ClassVar[str] = "inertia"
-    corrects: ClassVar[str | None] = "inertia"
+    kind = "inertia"
+    corrects = "inertia"
     inertia: Scalar = size("kg m²", "inertia on top of the nominal one; may be negative")
 
     def added_inertia(self):
@@ -67,8 +67,8 @@ class Inertia(SideEffect):
 class Gravity(SideEffect):
     """Eccentric mass: torque m g l sin(theta - phase)."""
 
-    kind: ClassVar[str] = "gravity"
-    places: ClassVar[tuple[str, ...]] = ("load",)
+    kind = "gravity"
+    places = ("load",)
     # over a small angle it is the torque at position 0
     special_cases: ClassVar = {"constant_torque": lambda numbers: {"torque": -numbers["torque"] * np.sin(numbers["phase"])}}
     torque: Scalar = size("N m", "largest gravity torque m g l")
@@ -82,9 +82,9 @@ class Gravity(SideEffect):
 class PeriodicDisturbance(SideEffect):
     """Torque that is periodic in time: A sin(2 pi f t + phase)."""
 
-    kind: ClassVar[str] = "periodic_disturbance"
-    in_time: ClassVar[bool] = True
-    places: ClassVar[tuple[str, ...]] = ("load",)
+    kind = "periodic_disturbance"
+    in_time = True
+    places = ("load",)
     # at frequency 0
     special_cases: ClassVar = {
         "constant_torque": lambda numbers: {"torque": numbers["amplitude"] * np.sin(numbers["phase"])}
@@ -101,8 +101,8 @@ class PeriodicDisturbance(SideEffect):
 class Cogging(SideEffect):
     """Cogging of the motor: torque A sin(n theta + phase)."""
 
-    kind: ClassVar[str] = "cogging"
-    places: ClassVar[tuple[str, ...]] = ("motor",)
+    kind = "cogging"
+    places = ("motor",)
     amplitude: Scalar = size("N m", "amplitude A")
     harmonic: Scalar = harmonic("periods n a turn", _cogging_harmonics)
     phase: Scalar = angle("phase at theta = 0")
@@ -122,8 +122,8 @@ def _largest_wave(numbers: Numbers) -> Numbers:
 class CoggingHarmonics(SideEffect):
     """Cogging with multiples: torque sum_k s_k sin(k n theta) + c_k cos(k n theta), k = 1, 2, 3."""
 
-    kind: ClassVar[str] = "cogging_harmonics"
-    places: ClassVar[tuple[str, ...]] = ("motor",)
+    kind = "cogging_harmonics"
+    places = ("motor",)
     special_cases: ClassVar = {"cogging": _largest_wave}
     # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
     harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=lambda log: len(_cogging_harmonics(log)))
@@ -150,8 +150,8 @@ class CoggingHarmonics(SideEffect):
 class TorqueRipple(SideEffect):
     """Ripple in proportion to the motor's torque: u (1 + a sin(n theta + phase))."""
 
-    kind: ClassVar[str] = "torque_ripple"
-    places: ClassVar[tuple[str, ...]] = ("motor",)
+    kind = "torque_ripple"
+    places = ("motor",)
     amplitude: Scalar = size("", "relative amplitude a")
     harmonic: Scalar = harmonic("periods n a turn", _ripple_harmonics)
     phase: Scalar = angle("phase at theta = 0")
@@ -165,10 +165,10 @@ class Flexibility(SideEffect):
     """Further inertia J behind a spring and a damper: J d²phi/dt² = -J (w² q + 2 D w dq/dt) with q = phi - theta and
     w = 2 pi f. The opposite torque acts on its side. At t = 0 it stands still, and the spring is relaxed."""
 
-    kind: ClassVar[str] = "flexibility"
-    places: ClassVar[tuple[str, ...]] = ("load",)
-    velocity_dependent: ClassVar[bool] = True
-    state_from_measurement: ClassVar[bool] = True
+    kind = "flexibility"
+    places = ("load",)
+    velocity_dependent = True
+    state_from_measurement = True
     # behind a stiff spring
     special_cases: ClassVar = {"inertia": lambda numbers: {"inertia": numbers["inertia"]}}
     inertia: Scalar = size("kg m²", "inertia J behind the spring", minimum=0.0)

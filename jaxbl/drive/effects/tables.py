@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -15,8 +15,8 @@ class Tabulated(SideEffect):
     """A torque from tables over position, over speed, or the sum of both. It is linear between points, and constant beyond
     the first and last ones."""
 
-    kind: ClassVar[str] = "tabulated"
-    velocity_dependent: ClassVar[bool] = True
+    kind = "tabulated"
+    velocity_dependent = True
     positions: tuple[Scalar, ...] = table("rad", "points of the table over position, increasing")
     position_torques: tuple[Scalar, ...] = table("N m", "resisting torque at these positions")
     turn: bool = option("the position within a turn counts, from 0 to 2 pi rad", default=False)
