@@ -1,4 +1,4 @@
-"""Logs that need a library of the extra `logs`: MDF4, TDMS, MCAP, ROS bags. Only columns that are asked for are loaded."""
+"""Logs that need a library of the extra `logs`: MDF4, TDMS, MCAP, ROS bags. A column is loaded when it is used."""
 
 # the libraries are optional, and have no annotations
 # pyright: reportMissingImports=false
@@ -6,6 +6,7 @@
 import json
 from array import array
 from collections.abc import Callable, Collection, Iterator
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,27 +15,30 @@ import numpy as np
 
 from jaxbl.errors import InputError
 
+ColumnName = str | int
+"""Name of a column, or its number, counted from 0."""
 
-class Columns(dict[str | int, Any]):
+
+class Columns(dict[ColumnName, Any]):
     """Columns of a file by name: arrays or :class:`Column`.
 
     Attributes:
-        units: those that the file itself says, by column; `jaxbl inspect --write` puts them into `[log]`.
+        units: units that the file itself gives, by column; `jaxbl inspect --write` puts them into `[log]`.
         notes: remarks on how it was read, in sentences.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.units: dict[str | int, str] = {}
+        self.units: dict[ColumnName, str] = {}
         self.notes: list[str] = []
 
 
 class Column:
-    """Values of a column that are loaded as they are asked for.
+    """Values of a column that are loaded when they are used.
 
     Attributes:
-        load: called without arguments, gives them, shape (rows,).
-        rows: how many there are.
+        load: function without arguments that returns the values, shape (rows,).
+        rows: number of values.
     """
 
     def __init__(self, load: Callable[[], Any], rows: int):
@@ -54,83 +58,86 @@ def _import_library(name: str, kind: str, package: str = "") -> Any:
         raise InputError(f"is {kind}, which needs the package {package or name}: pip install 'jaxbl[logs]'") from None
 
 
-def read_tdms(path: Path) -> dict[str | int, Any]:
-    """Channels of a TDMS file by name, by `group/channel` where a name occurs twice; `t` from their increment, s."""
+def read_tdms(path: Path) -> Columns:
+    """Read channels of a TDMS file by name, by `group/channel` if a name occurs twice; `t` from their increment, s."""
     library = _import_library("nptdms", "TDMS")
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
     names = [channel.name for channel in channels]
 
-    def loaded(group: str, name: str) -> np.ndarray:
+    def load_channel(group: str, name: str) -> np.ndarray:
         with library.TdmsFile.open(path) as file:
             return file[group][name][:]
 
-    found: dict[str | int, Any] = {}
+    columns = Columns()
     for channel in channels:
         name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
-        found[name] = Column(lambda one=channel: loaded(one.group_name, one.name), len(channel))
-    timed = next((one.properties | {"rows": len(one)} for one in channels if "wf_increment" in one.properties), None)
-    if timed is not None and "t" not in found:
-        start, step, rows = timed.get("wf_start_offset", 0.0), timed["wf_increment"], timed["rows"]
-        found["t"] = Column(lambda: start + step * np.arange(rows), rows)
-    return found
+        columns[name] = Column(partial(load_channel, channel.group_name, channel.name), len(channel))
+    timed_channel = next((channel for channel in channels if "wf_increment" in channel.properties), None)
+    if timed_channel is not None and "t" not in columns:
+        properties, rows = timed_channel.properties, len(timed_channel)
+        start, step = properties.get("wf_start_offset", 0.0), properties["wf_increment"]
+        columns["t"] = Column(lambda: start + step * np.arange(rows), rows)
+    return columns
 
 
-def read_mdf(path: Path) -> dict[str | int, Any]:
-    """Channels of an MDF file by name; `t` are the times of the group with the most samples, s.
+def read_mdf(path: Path) -> Columns:
+    """Read channels of an MDF file by name; `t` are the times of the group with the most samples, s.
 
-    Channels of other groups, with times of their own, are interpolated to these.
+    Channels of other groups, which have their own times, are interpolated to these.
     """
     file = _import_library("asammdf", "MDF").MDF(path)
     groups = range(len(file.groups))
     longest = max(groups, key=lambda i: file.groups[i].channel_group.cycles_nr)
     times = np.asarray(file.get_master(longest))
 
-    def loaded(name: str, group: int, index: int) -> np.ndarray:
+    def load_channel(name: str, group: int, index: int) -> np.ndarray:
         signal = file.get(name, group=group, index=index)
-        same = group == longest or np.array_equal(signal.timestamps, times)
-        return signal.samples if same else np.interp(times, signal.timestamps, np.asarray(signal.samples, dtype=float))
+        has_these_times = group == longest or np.array_equal(signal.timestamps, times)
+        samples = signal.samples
+        return samples if has_these_times else np.interp(times, signal.timestamps, np.asarray(samples, dtype=float))
 
-    found: dict[str | int, Any] = {"t": Column(lambda: times, len(times))}
+    columns = Columns(t=Column(lambda: times, len(times)))
     for name, places in file.channels_db.items():
         group, index = max(places, key=lambda place: file.groups[place[0]].channel_group.cycles_nr)
         if index != file.masters_db.get(group) and name != "t":
-            found[name] = Column(lambda name=name, group=group, index=index: loaded(name, group, index), len(times))
-    return found
+            columns[name] = Column(partial(load_channel, name, group, index), len(times))
+    return columns
 
 
 _MAX_LIST_LENGTH = 64
-"""Entries of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
+"""Elements of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
 
 
 class _Recording(NamedTuple):
     """Messages of a recording.
 
     Attributes:
-        counts: topic -> how many.
-        messages: of some topics, in the order of time: topic, time of recording in ns, the message decoded.
+        counts: topic -> number of messages.
+        messages: function of topics that yields their messages in the order of time: topic, time of recording in ns, the
+            decoded message.
     """
 
     counts: dict[str, int]
     messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
 
 
-def read_mcap(path: Path, wanted: Collection[str | int] = ()) -> Columns:
-    """As :func:`read_bag`, of an MCAP file whose messages are JSON or ROS 2's."""
+def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+    """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
     library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
         summary = library.make_reader(file).get_summary()
     if summary is None or summary.statistics is None:
         raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
     types: dict[int, Any] = {}
-    counts, other = {}, set()
+    counts, other_topics = {}, set()
     for number, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         if channel.message_encoding == "json" or (channel.message_encoding == "cdr" and schema is not None):
             counts[channel.topic] = counts.get(channel.topic, 0) + summary.statistics.channel_message_counts.get(number, 0)
         else:
-            other.add(f"{channel.topic} ({channel.message_encoding})")
+            other_topics.add(f"{channel.topic} ({channel.message_encoding})")
 
-    def messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    def iterate_messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         with path.open("rb") as file:
             for schema, channel, message in library.make_reader(file).iter_messages(topics=list(topics)):
                 if channel.message_encoding == "json":
@@ -140,14 +147,16 @@ def read_mcap(path: Path, wanted: Collection[str | int] = ()) -> Columns:
                         types[schema.id] = _message_types(schema)
                     yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
-    found = _recording_columns(_Recording(counts, messages), wanted)
-    if other:
-        found.notes.append(f"Messages that are neither JSON nor ROS 2's are not read: {', '.join(sorted(other))}.")
-    return found
+    columns = _recording_columns(_Recording(counts, iterate_messages), selection)
+    if other_topics:
+        columns.notes.append(
+            f"Messages in other formats than JSON and ROS 2 are not read: {', '.join(sorted(other_topics))}."
+        )
+    return columns
 
 
 def _message_types(schema: Any) -> Any:
-    """What decodes messages of a schema that a file holds."""
+    """Return the type store that decodes the messages of a schema."""
     library = _import_library("rosbags.typesys", "MCAP with messages of ROS 2", "rosbags")
     store = library.get_typestore(library.Stores.EMPTY)
     text = schema.data.decode()
@@ -157,83 +166,85 @@ def _message_types(schema: Any) -> Any:
     return store
 
 
-def read_bag(path: Path, wanted: Collection[str | int] = ()) -> Columns:
-    """Numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
+def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+    """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
 
-    These are the stamps of the messages' headers where they have them, else the times of recording. Of topics that hold
-    `wanted` columns the one with the most messages gives the times; others are interpolated to them.
+    A time is the stamp in the message's header, or the time of recording if there is none. Among the topics of the
+    `selection` the one with the most messages gives the times; the others are interpolated to them.
     """
     library = _import_library("rosbags.highlevel", "a ROS bag", "rosbags")
     with library.AnyReader([path]) as reader:
         counts: dict[str, int] = {}
-        for one in reader.connections:
-            counts[one.topic] = counts.get(one.topic, 0) + one.msgcount
+        for connection in reader.connections:
+            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
 
-    def messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    def iterate_messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         with library.AnyReader([path]) as reader:
-            asked = [one for one in reader.connections if one.topic in topics]
-            for connection, time, data in reader.messages(connections=asked):
-                yield connection.topic, time, reader.deserialize(data, connection.msgtype)
+            connections = [connection for connection in reader.connections if connection.topic in topics]
+            for connection, time, message in reader.messages(connections=connections):
+                yield connection.topic, time, reader.deserialize(message, connection.msgtype)
 
-    return _recording_columns(_Recording(counts, messages), wanted)
+    return _recording_columns(_Recording(counts, iterate_messages), selection)
 
 
-def _recording_columns(source: _Recording, wanted: Collection[str | int]) -> Columns:
-    """Columns of a recording, loaded as they are asked for: all that are wanted of a topic at once."""
-    fields: dict[str, dict[str, list[str | int]]] = {}
-    for topic, count in source.counts.items():
-        first = next(source.messages([topic]), None) if count else None
-        if first is not None:
-            fields[topic] = dict(_find_numbers(first[2], []))
-    places = {f"{topic}.{name}": (topic, name) for topic, names in fields.items() for name in names}
+def _recording_columns(recording: _Recording, selection: Collection[ColumnName]) -> Columns:
+    """Return the columns of a recording; the first one that is used of a topic loads all its selected ones."""
+    fields: dict[str, dict[str, list[ColumnName]]] = {}
+    for topic, count in recording.counts.items():
+        first_message = next(recording.messages([topic]), None) if count else None
+        if first_message is not None:
+            fields[topic] = dict(_find_numbers(first_message[2], []))
+    places = {f"{topic}.{field}": (topic, field) for topic, paths in fields.items() for field in paths}
     if not places:
         raise InputError("holds no messages with numbers; a log needs them")
-    asked = {places[name][0] for name in wanted if name in places} or set(fields)
-    main = max((topic for topic in asked if fields[topic]), key=lambda topic: source.counts[topic])
-    loaded: dict[str, np.ndarray] = {}
+    selected_topics = {places[name][0] for name in selection if name in places}
+    main = max((topic for topic in selected_topics or fields if fields[topic]), key=lambda topic: recording.counts[topic])
+    loaded_values: dict[str, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
-    found = Columns()
 
-    def load(topic: str, name: str) -> np.ndarray:
-        if name not in loaded:
-            names = [one for one, place in places.items() if place[0] == topic and (one in wanted or one == name)]
-            paths = [fields[topic][places[one][1]] for one in names]
-            stamps, recorded, rows = array("q"), array("q"), array("d")
-            for _, time, message in source.messages([topic]):
+    def load_values(topic: str, name: str) -> np.ndarray:
+        if name not in loaded_values:
+            names = [
+                column for column, place in places.items() if place[0] == topic and (column in selection or column == name)
+            ]
+            paths = [fields[topic][places[column][1]] for column in names]
+            stamps, recording_times, rows = array("q"), array("q"), array("d")
+            for _, time, message in recording.messages([topic]):
                 stamps.append(_header_time(message))
-                recorded.append(time)
+                recording_times.append(time)
                 rows.extend(float(_number_at(message, path)) for path in paths)
             # a clock may begin at 0; headers that are not filled in are all 0
-            filled = len(stamps) > 1 and all(stamps[1:])
-            times[topic] = np.frombuffer(stamps if filled else recorded, dtype=np.int64)
+            has_stamps = len(stamps) > 1 and all(stamps[1:])
+            times[topic] = np.frombuffer(stamps if has_stamps else recording_times, dtype=np.int64)
             values = np.frombuffer(rows, dtype=float).reshape(-1, len(names)) if names else np.empty((len(stamps), 0))
-            loaded.update(dict(zip(names, values.T, strict=True)))
-        return loaded.get(name, np.empty(0))
+            loaded_values.update(dict(zip(names, values.T, strict=True)))
+        return loaded_values.get(name, np.empty(0))
 
-    def seconds(topic: str) -> np.ndarray:
-        for one in (main, topic):
-            if one not in times:
-                load(one, "")
+    def load_seconds(topic: str) -> np.ndarray:
+        for needed_topic in (main, topic):
+            if needed_topic not in times:
+                load_values(needed_topic, "")
         return 1e-9 * (times[topic] - times[main][0])
 
-    def column(topic: str, name: str) -> np.ndarray:
-        values = load(topic, name)
-        return values if topic == main else np.interp(seconds(main), seconds(topic), values)
+    def load_column(topic: str, name: str) -> np.ndarray:
+        values = load_values(topic, name)
+        return values if topic == main else np.interp(load_seconds(main), load_seconds(topic), values)
 
-    count = source.counts[main]
-    found["t"] = Column(lambda: seconds(main), count)
+    count = recording.counts[main]
+    columns = Columns(t=Column(lambda: load_seconds(main), count))
     for name, (topic, _) in places.items():
-        found[name] = Column(lambda topic=topic, name=name: column(topic, name), count)
-    apart = sorted({places[name][0] for name in wanted if name in places} - {main})
-    if apart:
-        found.notes.append(f"{', '.join(apart)} is interpolated to the times of {main}, of which there are most.")
-    return found
+        columns[name] = Column(partial(load_column, topic, name), count)
+    if interpolated_topics := sorted(selected_topics - {main}):
+        columns.notes.append(
+            f"{', '.join(interpolated_topics)} is interpolated to the times of {main}, which has the most messages."
+        )
+    return columns
 
 
-def _find_numbers(message: Any, path: list[str | int]) -> Iterator[tuple[str, list[str | int]]]:
-    """Names of all numbers in a message, as `pose.position.x` or `position[0]`, and the way to each."""
+def _find_numbers(message: Any, path: list[ColumnName]) -> Iterator[tuple[str, list[ColumnName]]]:
+    """Yield the names of all numbers in a message, as `pose.position.x` or `position[0]`, and the path to each."""
     if isinstance(message, bool | int | float | np.number):
-        yield "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in path).lstrip("."), path
+        yield "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip("."), path
     elif isinstance(message, list | tuple | np.ndarray):
         for i in range(len(message) if len(message) <= _MAX_LIST_LENGTH else 0):
             yield from _find_numbers(message[i], [*path, i])
@@ -244,18 +255,17 @@ def _find_numbers(message: Any, path: list[str | int]) -> Iterator[tuple[str, li
                 yield from _find_numbers(fields[name], [*path, name])
 
 
-def _number_at(message: Any, path: list[str | int]) -> Any:
-    """A number in a message; nan where it has none."""
+def _number_at(message: Any, path: list[ColumnName]) -> Any:
+    """Return a number in a message; NaN if it has none there."""
     try:
-        for one in path:
-            message = message[one] if isinstance(one, int) or isinstance(message, dict) else getattr(message, one)
+        for key in path:
+            message = message[key] if isinstance(key, int) or isinstance(message, dict) else getattr(message, key)
     except (IndexError, KeyError, AttributeError):
         return np.nan
     return message
 
 
 def _header_time(message: Any) -> int:
-    """Time in the header of a message, ns; 0 where it has none."""
-    seconds = _number_at(message, ["header", "stamp", "sec"])
-    rest = _number_at(message, ["header", "stamp", "nanosec"])
-    return 0 if np.isnan(seconds) else int(seconds) * 1_000_000_000 + (0 if np.isnan(rest) else int(rest))
+    """Return the time in the header of a message, ns; 0 if it has none."""
+    seconds, nanoseconds = (_number_at(message, ["header", "stamp", key]) for key in ("sec", "nanosec"))
+    return 0 if np.isnan(seconds) else int(seconds) * 1_000_000_000 + (0 if np.isnan(nanoseconds) else int(nanoseconds))

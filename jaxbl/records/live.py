@@ -1,7 +1,9 @@
-"""Rows that arrive one by one: a text file that grows, or datagrams. The same columns and `[log]` table as of a log that
-is read whole; a row that is unfit is counted and left out, as nobody can mend it any more.
+"""Rows that arrive one at a time: a text file that grows, or datagrams.
+
+Columns and `[log]` table are those of a whole log. Unfit rows are counted and left out, as nobody can correct them any more.
 """
 
+import itertools
 import math
 import os
 import socket
@@ -20,38 +22,38 @@ from jaxbl.errors import InputError, shorten
 from jaxbl.validation import check_file, explain_missing_file
 
 from .channels import to_si, to_signed
-from .files import LogFile, TextFormat, detect_text_format, log_suffixes
+from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, log_suffixes
+from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 LOST, GAPS, RESTARTS = "lost samples interpolated", "gaps in time", "restarts of the clock"
-"""What is counted."""
-_HEAD = 1 << 18
-"""Bytes from which the form of a file's rows is seen, and that are read at once."""
-_LONGEST_LINE = 1 << 20
-_LOOK = 0.02
-"""Seconds between looks at a file."""
-_RECEIVED = 1 << 22
-"""Bytes of datagrams that the system is asked to keep; it may keep fewer."""
-_ASKED = 0.1
-"""Seconds between looks whether a socket is to be closed."""
-_BACK = 1.0
-"""Seconds that time goes back where the sender has begun starts_segment; datagrams overtake one another by less."""
-_JUDGED, _APART, _TOLERANCE = 256, 8, 0.02
-"""Rows by which the sampling period is judged, over how many of them each interval goes, and its relative tolerance."""
-_PLAIN = bytes(range(32, 127)) + b"\t\r\n"
-"""Bytes of text; those of binary numbers are others."""
+"""Faults that are counted."""
+_READ_BYTES = 1 << 18
+"""Bytes of a file that are read at once."""
+_FILE_POLL_SECONDS = 0.02
+"""Interval at which a file is read."""
+_BUFFER_BYTES = 1 << 22
+"""Bytes of datagrams that the system is asked to buffer; it may buffer fewer."""
+_SOCKET_TIMEOUT = 0.1
+"""Seconds after which the receiving thread checks whether its socket is to be closed."""
+_RESTART_SECONDS = 1.0
+"""Seconds by which time goes back after a restart of the sender; datagrams overtake one another by less."""
+_PERIOD_ROWS, _PERIOD_STRIDE, _PERIOD_TOLERANCE = 256, 8, 0.02
+"""Rows from which the sampling period is found, rows in each interval between two of them, and relative tolerance."""
+_TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
+"""Bytes of text; a datagram with other ones holds binary numbers."""
 
 
 class Rows(NamedTuple):
     """Samples one sampling period apart.
 
     Attributes:
-        time: of the first one, s by the stamps.
+        time: stamp of the first one, s.
         torque: N m (N), shape (samples,).
         positions: of motor and load, rad (m), shape (samples,) each.
-        starts_segment: whether they do not continue the rows before.
+        starts_segment: True if they do not continue the previous rows.
     """
 
     time: float
@@ -61,246 +63,285 @@ class Rows(NamedTuple):
 
 
 class Source(Protocol):
-    """Where rows come from.
+    """A source of rows.
 
     Attributes:
         name: for messages.
-        counts: of what was left out, by what it was.
-        fault: the last line or datagram that could not be read, and why, as the rest of a sentence; "" for none.
+        counts: fault -> number of rows, lines or datagrams that were left out.
+        fault: end of a sentence on the last line or datagram that could not be read; "" if there is none.
     """
 
     name: str
     counts: Counter[str]
     fault: str
 
-    def poll(self, seconds: float) -> tuple[Sequence[str | int], np.ndarray] | None:
-        """Wait so long for rows: names of the columns, and numbers (rows, columns), NaN where there is none; None if
-        nothing has come. InputError where no row can be used."""
+    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+        """Wait at most `seconds` for rows.
+
+        Returns:
+            Names of the columns, and numbers (rows, columns), NaN for a cell without one; None if nothing has come.
+
+        Raises:
+            InputError: no row can be used.
+        """
         ...
 
     def close(self) -> None:
-        """Give the file or the address back."""
+        """Release the file or the address."""
         ...
 
 
-def stream_columns(table: LogTable) -> list[str | int]:
-    """Columns that are read from a stream, in the order of rows without a header: time, input, motor and load position,
-    then those to be subtracted and those of `where`."""
-    time = table.t or TimeTable()
-    found: list[str | int] = [] if time.period is not None else [time.column_or("t")]
-    found.append((table.u or TorqueTable()).column_or("u"))
-    ends = [table.position_source(name) for name in POSITION_CHANNELS.values()]
-    found += [one.column_or(channel) for channel, one in ends]
-    found += [one.minus for _, one in ends if isinstance(one, PositionTable) and one.minus is not None]
-    return list(dict.fromkeys([*found, *(table.where or {})]))
+def _stream_channels(table: LogTable) -> dict[str, TimeTable | TorqueTable | PositionTable | SpeedTable]:
+    """Return the tables of the channels of a stream; without `t` if the rows have no stamps."""
+    clock = table.t or TimeTable()
+    channels = {"t": clock} if clock.period is None else {}
+    return channels | {"u": table.u or TorqueTable()} | dict(map(table.position_source, POSITION_CHANNELS.values()))
 
 
-def _channel_keys(table: LogTable) -> dict[str | int, str]:
-    """Column -> the key of `[log]` that can name another one."""
-    ends = [table.position_source(name) for name in POSITION_CHANNELS.values()]
-    pairs = [("t", table.t or TimeTable()), ("u", table.u or TorqueTable()), *ends]
-    return {one.column_or(name): name for name, one in pairs}
+def stream_columns(table: LogTable) -> list[ColumnName]:
+    """Return the columns that are read from a stream, in the order of rows without a header.
+
+    Time, input, motor and load position come first, then columns to be subtracted, then those of `where`.
+    """
+    channels = _stream_channels(table)
+    columns = [channel_table.column_or(channel) for channel, channel_table in channels.items()]
+    columns += [end.minus for end in channels.values() if isinstance(end, PositionTable) and end.minus is not None]
+    return list(dict.fromkeys([*columns, *(table.where or {})]))
 
 
 def check_stream_table(table: LogTable, name: str) -> None:
-    """Refuse what a stream cannot have: it takes the whole log.
+    """Refuse keys of `[log]` that need the whole log.
 
     Raises:
-        InputError: the key of `[log]`.
+        InputError: names the key; it begins with `name`, the file of the table.
     """
     if table.absent:
         raise InputError(f"{name}: [log] absent: {', '.join(table.absent)}; a stream needs u, theta_e and theta_s")
-    ends = [(key, *table.position_source(key)) for key in POSITION_CHANNELS.values()]
-    channels = [("u", table.u or TorqueTable()), *((channel, one) for _, channel, one in ends)]
-    open_ = [f"{channel}.{key}" for channel, one in channels for key in ("skew", "drift") if getattr(one, key, None)]
-    open_ += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
-    open_ += [f"where.{key}" for key, value in (table.where or {}).items() if isinstance(value, str)]
-    if open_:
-        raise InputError(f"{name}: [log] {open_[0]} is for whole logs; leave it out for rows that arrive one by one")
+    channels = _stream_channels(table)
+    keys = [f"{channel}.{key}" for channel in channels for key in ("skew", "drift") if getattr(channels[channel], key, None)]
+    keys += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
+    keys += [f"where.{key}" for key, required in (table.where or {}).items() if isinstance(required, str)]
+    if keys:
+        raise InputError(f"{name}: [log] {keys[0]} is for whole logs; remove it to read rows that arrive one at a time")
+
+
+class _Samples(NamedTuple):
+    """Rows in SI units: stamps (s), torque and position of each side, shape (rows,) each."""
+
+    stamps: np.ndarray
+    torque: np.ndarray
+    positions: dict[str, np.ndarray]
+
+    def select(self, rows: slice | np.ndarray) -> "_Samples":
+        positions = {side: values[rows] for side, values in self.positions.items()}
+        return _Samples(self.stamps[rows], self.torque[rows], positions)
+
+    def append(self, other: "_Samples") -> "_Samples":
+        positions = {side: np.append(values, other.positions[side]) for side, values in self.positions.items()}
+        return _Samples(np.append(self.stamps, other.stamps), np.append(self.torque, other.torque), positions)
 
 
 class _ChannelReader:
-    """Columns become channels in SI units, row by row; remembers turns of wrapped positions, and integrals of speeds."""
+    """Converts rows of columns to SI units; it remembers the turns of wrapped positions, and the integrals of speeds."""
 
-    def __init__(self, table: LogTable, name: str, columns: Sequence[str | int]):
-        self._table, self._count = table, len(columns)
-        file = LogFile(Path(name), dict.fromkeys(columns, ()))
-        keys = _channel_keys(table)
-        self._at = {one: list(columns).index(file.find_column(one, keys.get(one, ""))) for one in stream_columns(table)}
-        self._before: dict[str, float] = {}
+    def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
+        self._table, self._channels = table, _stream_channels(table)
+        file = LogFile(Path(name), Columns.fromkeys(columns, ()))
+        keys = {channel_table.column_or(channel): channel for channel, channel_table in self._channels.items()}
+        self._indices = {
+            column: list(columns).index(file.find_column(column, keys.get(column, ""))) for column in stream_columns(table)
+        }
+        self._previous: dict[str, float] = {}
         self._row = 0
 
-    def take(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
-        """Times (s), torque, positions, and how many rows were unreadable; values are (rows, columns)."""
-        table = self._table
+    def convert(self, values: np.ndarray) -> tuple[_Samples, int]:
+        """Convert values (rows, columns). Returns the samples, and the number of rows that were unreadable."""
         # the same as pandas' comparison of a column with a number, true or false
-        for column, value in (table.where or {}).items():
-            values = values[values[:, self._at[column]] == value]
-        clock = table.t or TimeTable()
+        for column, required in (self._table.where or {}).items():
+            values = values[values[:, self._indices[column]] == required]
+        clock = self._table.t or TimeTable()
         if clock.period is not None:
             stamps = (self._row + np.arange(len(values))) * clock.period
             self._row += len(values)
         else:
-            stamps = values[:, self._at[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
-        torque_table = table.u or TorqueTable()
-        torque = to_si(torque_table, self._words(values, torque_table.column_or("u"), torque_table.signed_bits))
-        raw, ends = {}, {}
+            stamps = values[:, self._indices[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
+        torque_table = self._table.u or TorqueTable()
+        torque = to_si(torque_table, self._read_numbers(values, torque_table.column_or("u"), torque_table.signed_bits))
+        numbers, tables = {}, {}
         for side, name in POSITION_CHANNELS.items():
-            channel, one = table.position_source(name)
-            ends[side] = one
-            raw[side] = self._words(values, one.column_or(channel), one.signed_bits)
-            if isinstance(one, PositionTable) and one.minus is not None:
-                raw[side] = raw[side] - self._words(values, one.minus, one.signed_bits)
-        fit = np.isfinite(stamps) & np.isfinite(torque)
-        for one in raw.values():
-            fit &= np.isfinite(one)
-        stamps = stamps[fit]
-        positions = {side: self._position(side, ends[side], raw[side][fit], stamps) for side in raw}
-        return stamps, torque[fit], positions, int(len(fit) - fit.sum())
+            channel, position_table = self._table.position_source(name)
+            tables[side] = position_table
+            bits = position_table.signed_bits
+            numbers[side] = self._read_numbers(values, position_table.column_or(channel), bits)
+            if isinstance(position_table, PositionTable) and position_table.minus is not None:
+                numbers[side] = numbers[side] - self._read_numbers(values, position_table.minus, bits)
+        is_readable = np.isfinite(np.stack([stamps, torque, *numbers.values()])).all(axis=0)
+        stamps = stamps[is_readable]
+        positions = {side: self._read_position(side, tables[side], numbers[side][is_readable], stamps) for side in numbers}
+        return _Samples(stamps, torque[is_readable], positions), int(np.count_nonzero(~is_readable))
 
-    def _words(self, values: np.ndarray, column: str | int, bits: int | None) -> np.ndarray:
-        numbers = values[:, self._at[column]]
+    def _read_numbers(self, values: np.ndarray, column: ColumnName, bits: int | None) -> np.ndarray:
+        numbers = values[:, self._indices[column]]
         return numbers if bits is None else to_signed(numbers, bits)
 
-    def _position(self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    def _read_position(
+        self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray
+    ) -> np.ndarray:
         if not len(values):
             return values
         if isinstance(table, SpeedTable):
             speed = to_si(table, values)
-            speeds = np.append(self._before.get(f"{side} speed", float(speed[0])), speed)
-            times = np.append(self._before.get(f"{side} time", float(stamps[0])), stamps)
-            # over a gap, too, as if the speed had gone straight from one end to the other
+            speeds = np.append(self._previous.get(f"{side} speed", float(speed[0])), speed)
+            times = np.append(self._previous.get(f"{side} time", float(stamps[0])), stamps)
+            # over a gap, too, as if the speed had changed linearly
             steps = np.diff(times) * 0.5 * (speeds[1:] + speeds[:-1])
-            position = self._before.get(side, 0.0) + np.cumsum(steps)
-            self._before |= {side: position[-1], f"{side} speed": speed[-1], f"{side} time": stamps[-1]}
+            position = self._previous.get(side, 0.0) + np.cumsum(steps)
+            self._previous |= {side: position[-1], f"{side} speed": speed[-1], f"{side} time": stamps[-1]}
             return position
         if table.wrap is not None:
-            values = np.unwrap(np.append(self._before.get(side, float(values[0])), values), period=table.wrap)[1:]
-            self._before[side] = values[-1]
+            values = np.unwrap(np.append(self._previous.get(side, float(values[0])), values), period=table.wrap)[1:]
+            self._previous[side] = values[-1]
         return to_si(table, values)
 
 
 class Stream:
     """Rows of a source in SI units, one sampling period apart.
 
-    Up to two samples in a row that are lost are interpolated, as in a log: positions linearly, the input held. After a
-    longer gap rows begin starts_segment.
+    Up to two lost samples in a row are interpolated, as in a log: positions linearly, while the input is held. After a
+    longer gap a new segment starts.
 
     Args:
-        source: of rows.
-        table: how its columns are read.
-        period: that samples should have, s.
+        source: of the rows.
+        table: says how its columns are read.
+        period: expected sampling period, s.
     """
 
     def __init__(self, source: Source, table: LogTable, period: float):
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
-        self._channels: _ChannelReader | None = None
-        self._columns: list[str | int] = []
-        self._last: tuple[float, float, dict[str, float]] | None = None
-        self._first: list[float] = []
-        self._judged = False
+        self._reader: _ChannelReader | None = None
+        self._columns: list[ColumnName] = []
+        self._last: _Samples | None = None
+        self._first_stamps: list[float] = []
+        self._is_period_checked = False
 
     def poll(self, seconds: float) -> list[Rows]:
-        """What has come within so many seconds.
+        """Return the rows that arrive within `seconds`.
 
         Raises:
             InputError: a column is missing, or samples come at another period.
         """
-        found = self.source.poll(seconds)
-        if found is None:
+        block = self.source.poll(seconds)
+        if block is None:
             return []
-        columns, values = found
-        if self._channels is None or list(columns) != self._columns:
-            self._channels, self._columns = _ChannelReader(self._table, self.source.name, columns), list(columns)
-        stamps, torque, positions, unreadable = self._channels.take(values)
+        columns, values = block
+        if self._reader is None or list(columns) != self._columns:
+            self._reader, self._columns = _ChannelReader(self._table, self.source.name, columns), list(columns)
+        samples, unreadable = self._reader.convert(values)
         self._count(UNREADABLE, unreadable)
-        self._judge(stamps)
-        return self._in_order(stamps, torque, positions)
+        self._check_period(samples.stamps)
+        return self._split_rows(samples)
 
-    def _count(self, what: str, number: int) -> None:
+    def _count(self, fault: str, number: int) -> None:
         if number:
-            self.counts[what] += number
+            self.counts[fault] += number
 
-    def _judge(self, stamps: np.ndarray) -> None:
-        """Compare the period of the first rows with what it should be."""
-        if self._judged:
+    def _check_period(self, stamps: np.ndarray) -> None:
+        """Compare the period of the first rows with the expected one."""
+        if self._is_period_checked:
             return
-        self._first += stamps.tolist()
-        if len(self._first) < _JUDGED:
+        self._first_stamps += stamps.tolist()
+        if len(self._first_stamps) < _PERIOD_ROWS:
             return
-        self._judged, times = True, np.array(self._first)
-        found = float(np.median(times[_APART:] - times[:-_APART])) / _APART
-        if not math.isclose(found, self._period, rel_tol=_TOLERANCE):
-            raise period_error(self.source.name, found, self._period)
+        self._is_period_checked, times = True, np.array(self._first_stamps)
+        measured = float(np.median(times[_PERIOD_STRIDE:] - times[:-_PERIOD_STRIDE])) / _PERIOD_STRIDE
+        if not math.isclose(measured, self._period, rel_tol=_PERIOD_TOLERANCE):
+            raise period_error(self.source.name, measured, self._period)
         if np.mean(np.diff(times) == 0.0) > 0.5:
             raise InputError(
-                f"{self.source.name}: most stamps are that of the row before; they should be finer than the sampling "
-                "period, or [log] t = { period = ... } says that there are none"
+                f"{self.source.name}: most rows have the time stamp of the row before; stamps should be finer than the "
+                "sampling period, or [log] t = { period = ... } says that there are none"
             )
 
-    def _in_order(self, stamps: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray]) -> list[Rows]:
-        if not len(stamps):
+    def _split_rows(self, samples: _Samples) -> list[Rows]:
+        """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
+        if not len(samples.stamps):
             return []
-        latest = np.maximum.accumulate(np.concatenate([[-np.inf if self._last is None else self._last[0]], stamps]))
-        back = latest[:-1] - stamps > _BACK
-        if back.any():
-            # a clock that was set back: rows from there on begin starts_segment
-            at = int(np.argmax(back))
-            before, after = (
-                (stamps[p], torque[p], {s: x[p] for s, x in positions.items()}) for p in (slice(at), slice(at, None))
-            )
-            found = self._in_order(*before)
+        last = [] if self._last is None else self._last.stamps
+        latest = np.maximum.accumulate(np.concatenate([[-np.inf], last, samples.stamps]))[-len(samples.stamps) - 1 : -1]
+        is_restart = latest - samples.stamps > _RESTART_SECONDS
+        if is_restart.any():
+            restart = int(np.argmax(is_restart))
+            rows = self._split_rows(samples.select(slice(restart)))
             self._count(RESTARTS, 1)
             self._last = None
-            return [*found, *self._in_order(*after)]
-        fit = stamps > latest[:-1]
-        self._count(DISORDERED, int(len(fit) - fit.sum()))
-        stamps, torque = stamps[fit], torque[fit]
-        positions = {side: values[fit] for side, values in positions.items()}
-        if not len(stamps):
+            return [*rows, *self._split_rows(samples.select(slice(restart, None)))]
+        is_later = samples.stamps > latest
+        self._count(DISORDERED, int(np.count_nonzero(~is_later)))
+        samples = samples.select(is_later)
+        if not len(samples.stamps):
             return []
-        starts = np.flatnonzero(np.diff(stamps) > GAP_PERIODS * self._period) + 1
+        longest_interval = GAP_PERIODS * self._period
+        starts = np.flatnonzero(np.diff(samples.stamps) > longest_interval) + 1
         self._count(GAPS, len(starts))
-        starts_segment = self._last is None
-        if self._last is not None and stamps[0] - self._last[0] > GAP_PERIODS * self._period:
+        if self._last is not None and samples.stamps[0] - self._last.stamps[0] > longest_interval:
             self._count(GAPS, 1)
-            self._last, starts_segment = None, True
-        found = []
-        for first, end in zip([0, *starts], [*starts, len(stamps)], strict=True):
-            part = slice(first, end)
-            found.append(self._even(stamps[part], torque[part], {s: x[part] for s, x in positions.items()}, starts_segment))
-            self._last, starts_segment = None, True
-        self._last = float(stamps[-1]), float(torque[-1]), {side: float(values[-1]) for side, values in positions.items()}
-        return found
+            self._last = None
+        rows = []
+        for start, stop in itertools.pairwise([0, *starts, len(samples.stamps)]):
+            rows.append(self._interpolate_lost(samples.select(slice(start, stop))))
+            self._last = None
+        self._last = samples.select(slice(-1, None))
+        return rows
 
-    def _even(self, stamps: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], starts_segment: bool) -> Rows:
-        """Rows without a gap, lost ones put in; stamps may jitter by less than half a period."""
-        before = self._last
-        if before is not None:
-            stamps, torque = np.concatenate([[before[0]], stamps]), np.concatenate([[before[1]], torque])
-            positions = {side: np.concatenate([[before[2][side]], values]) for side, values in positions.items()}
+    def _interpolate_lost(self, samples: _Samples) -> Rows:
+        """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period."""
+        starts_segment = self._last is None
+        stamps, torque, positions = samples if self._last is None else self._last.append(samples)
         steps = np.maximum(np.round(np.diff(stamps) / self._period), 1.0)
-        at = np.concatenate([[0.0], np.cumsum(steps)])
-        every = np.arange(at[-1] + 1.0)
-        self._count(LOST, len(every) - len(at))
-        if len(every) > len(at):
-            torque = torque[np.searchsorted(at, every, side="right") - 1]
-            positions = {side: np.interp(every, at, values) for side, values in positions.items()}
-        own = slice(0 if before is None else 1, None)
-        first = float(stamps[0]) + (0.0 if before is None else self._period)
-        return Rows(first, torque[own], {side: values[own] for side, values in positions.items()}, starts_segment)
+        received = np.concatenate([[0.0], np.cumsum(steps)])
+        numbers = np.arange(received[-1] + 1.0)
+        self._count(LOST, len(numbers) - len(received))
+        if len(numbers) > len(received):
+            torque = torque[np.searchsorted(received, numbers, side="right") - 1]
+            positions = {side: np.interp(numbers, received, values) for side, values in positions.items()}
+        # a row before the first one of `samples` was returned already
+        first = 0 if starts_segment else 1
+        time = float(stamps[0]) + first * self._period
+        return Rows(time, torque[first:], {side: values[first:] for side, values in positions.items()}, starts_segment)
 
 
-def period_error(name: str, found: float, period: float) -> InputError:
-    """What to raise where samples come at another period (s) than the model's."""
+def period_error(name: str, measured: float, period: float) -> InputError:
+    """Return the error to be raised if samples come at another period (s) than the model's."""
     return InputError(
-        f"{name}: samples are {1e3 * found:.6g} ms apart, [run] sample_period of the model is {1e3 * period:.6g} ms; they "
-        "should be the same, as gains of observers are for one period"
+        f"{name}: samples are {1e3 * measured:.6g} ms apart, [run] sample_period of the model is {1e3 * period:.6g} ms; "
+        "they should be equal, as observer gains hold for one period"
     )
 
 
-class FollowedFile:
+class _TextSource:
+    """Rows of text in the format of the first ones; attributes are those of a :class:`Source`."""
+
+    def __init__(self, name: str):
+        self.name, self.counts, self.fault = name, Counter[str](), ""
+        self._format: TextFormat | None = None
+        self._header = ""
+
+    def _parse_rows(self, text_format: TextFormat, lines: list[str]) -> np.ndarray:
+        """Parse lines into numbers, shape (rows, columns). Repeated headers are left out, malformed lines are counted."""
+        rows = [line for line in lines if line != self._header]
+        values = text_format.parse_numbers(rows)
+        if len(values) < len(rows):
+            self.counts[MALFORMED] += len(rows) - len(values)
+            self.fault = f"; a line should have {text_format.count} cells"
+        return values
+
+
+def _drop_remarks(lines: list[str]) -> list[str]:
+    return [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+class FollowedFile(_TextSource):
     """Rows of a text file, from its beginning on, and those that are written to it later.
 
     Raises:
@@ -308,9 +349,9 @@ class FollowedFile:
     """
 
     def __init__(self, path: Path):
-        self.name, self.counts, self.fault = str(path), Counter[str](), ""
-        self._path, self._form, self._header = path, None, ""
-        self._rest, self._lines = b"", list[str]()
+        super().__init__(str(path))
+        self._path = path
+        self._incomplete_line, self._lines = b"", list[str]()
         try:
             check_file(path)
             self._file = path.open("rb")
@@ -321,81 +362,73 @@ class FollowedFile:
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}; name a text file") from None
 
-    def poll(self, seconds: float) -> tuple[Sequence[str | int], np.ndarray] | None:
+    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
         end = time.monotonic() + seconds
-        while not (read := self._read()) and (left := end - time.monotonic()) > 0.0:
-            time.sleep(min(_LOOK, left))
-        if not read:
+        while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
+            time.sleep(min(_FILE_POLL_SECONDS, remaining))
+        if not block:
             return None
-        if b"\0" in read and self._form is None:
+        if b"\0" in block and self._format is None:
             raise InputError(f"{self.name}: is no text: only text files are followed; leave --follow out")
-        *lines, self._rest = (self._rest + read).split(b"\n")
-        if len(self._rest) > _LONGEST_LINE:
-            raise InputError(f"{self.name}: has a line of more than {_LONGEST_LINE / 1e6:.0f} MB; it should have one a row")
+        *lines, self._incomplete_line = (self._incomplete_line + block).split(b"\n")
+        if len(self._incomplete_line) > MAX_LINE_BYTES:
+            raise InputError(f"{self.name}: has a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; it should have one a row")
         self._lines += [line.decode("utf-8-sig", errors="replace").strip("\r") for line in lines]
-        said = [line for line in self._lines if line.strip() and not line.lstrip().startswith("#")]
-        if self._form is None:
-            # the header and a row; what a comma means shows only in a row
-            if len(said) < 2:
+        rows = _drop_remarks(self._lines)
+        if self._format is None:
+            # the header and a row: the decimal sign shows only in a row
+            if len(rows) < 2:
                 return None
             try:
-                self._form = detect_text_format(said)
+                self._format = detect_text_format(rows)
             except InputError as error:
                 raise InputError(f"{self.name}: {error}") from None
-            self._header = said[0] if self._form.names is not None else ""
+            self._header = rows[0] if self._format.names is not None else ""
         self._lines = []
-        rows = [line for line in said if line != self._header]
-        values = self._form.parse_numbers(rows)
-        if len(values) < len(rows):
-            self.counts[MALFORMED] += len(rows) - len(values)
-            self.fault = f"; a line should have {self._form.count} cells"
-        return self._form.names or range(self._form.count), values
+        return self._format.names or range(self._format.count), self._parse_rows(self._format, rows)
 
     def _read(self) -> bytes:
-        read = self._file.read(_HEAD)
-        if not read:
+        block = self._file.read(_READ_BYTES)
+        if not block:
             try:
-                now = self._path.stat()
+                current = self._path.stat()
             except OSError:
                 return b""
-            own = os.fstat(self._file.fileno())
-            if now.st_ino != own.st_ino or now.st_size < self._file.tell():
-                # cut off, or another file in its place, which may be gone again
+            opened = os.fstat(self._file.fileno())
+            if current.st_ino != opened.st_ino or current.st_size < self._file.tell():
+                # cut off, or replaced by another file, which may have vanished again
                 with suppress(FileNotFoundError):
                     file = self._path.open("rb")
                     self._file.close()
-                    self._file, self._rest = file, b""
-                    read = self._file.read(_HEAD)
-        return read
+                    self._file, self._incomplete_line = file, b""
+                    block = self._file.read(_READ_BYTES)
+        return block
 
     def close(self) -> None:
         self._file.close()
 
 
-class Datagrams:
+class Datagrams(_TextSource):
     """Rows in UDP datagrams: lines of text, or binary numbers (float64, little-endian), one row after the other.
 
     Args:
-        address: `udp://HOST:PORT`, where to listen.
+        address: `udp://HOST:PORT` to listen at.
         fields: names of the columns of rows without a header.
 
     Raises:
-        InputError: no such address, or nothing can be received there.
+        InputError: there is no such address, or nothing can be received there.
     """
 
-    def __init__(self, address: str, fields: Sequence[str | int]):
-        self.name, self.counts = address, Counter[str]()
-        self.fault = ""
+    def __init__(self, address: str, fields: Sequence[ColumnName]):
+        super().__init__(address)
         self._fields = list(fields)
-        self._numbered = any(isinstance(one, int) for one in fields)
-        self._form: TextFormat | None = None
-        self._header = ""
+        self._has_numbered_fields = any(isinstance(field, int) for field in fields)
         host, port = _parse_address(address)
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
             try:
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED)
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
                 self._socket.bind(place)
             except OSError:
                 self._socket.close()
@@ -405,100 +438,96 @@ class Datagrams:
                 f"{address}: cannot listen there: {error.strerror or error}; name an address of this machine"
             ) from None
         self.port = self._socket.getsockname()[1]
-        # Linux may keep as few as some hundred datagrams, less than come at 10 kHz while values are computed
-        self._received, self._closed = deque[bytes](), threading.Event()
+        # Linux may buffer only some hundred datagrams, fewer than come at 10 kHz while values are computed
+        self._received, self._closing = deque[bytes](), threading.Event()
         self._receiver = threading.Thread(target=self._receive, name="jaxbl-datagrams", daemon=True)
         self._receiver.start()
 
     def _receive(self) -> None:
-        self._socket.settimeout(_ASKED)
-        while not self._closed.is_set():
-            # nothing has come, or an error that concerns one datagram
+        self._socket.settimeout(_SOCKET_TIMEOUT)
+        while not self._closing.is_set():
+            # nothing has come, or an error that concerns a single datagram
             with suppress(OSError):
                 self._received.append(self._socket.recv(1 << 16))
 
-    def poll(self, seconds: float) -> tuple[Sequence[str | int], np.ndarray] | None:
+    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
         time.sleep(seconds)
-        received = [self._received.popleft() for _ in range(len(self._received))]
+        datagrams = [self._received.popleft() for _ in range(len(self._received))]
         parts, lines = list[np.ndarray](), list[str]()
-        for one in received:
-            # lines of many datagrams are read at once: one by one it takes too long at 10 kHz
-            if one.translate(None, _PLAIN):
-                parts += [self._of_text(lines), self._of_bytes(one)]
+        for datagram in datagrams:
+            # lines of many datagrams are parsed at once: singly it takes too long at 10 kHz
+            if datagram.translate(None, _TEXT_BYTES):
+                parts += [self._parse_text(lines), self._parse_bytes(datagram)]
                 lines = []
             else:
-                lines += one.decode().splitlines()
-        parts = [part for part in (*parts, self._of_text(lines)) if len(part)]
-        columns = self._columns()
-        # what came before the form was known may have other columns
+                lines += datagram.decode().splitlines()
+        parts = [part for part in (*parts, self._parse_text(lines)) if len(part)]
+        columns = self._column_names()
+        # rows that came before the format was known may have other columns
         parts = [part for part in parts if part.shape[1] == len(columns)]
         return (columns, np.concatenate(parts)) if parts else None
 
-    def _columns(self) -> Sequence[str | int]:
-        if self._form is not None and self._form.names is not None:
-            return self._form.names
-        return range(self._width() if self._form is None else self._form.count) if self._numbered else self._fields
+    def _column_names(self) -> Sequence[ColumnName]:
+        if self._format is not None and self._format.names is not None:
+            return self._format.names
+        return range(self._count_columns()) if self._has_numbered_fields else self._fields
 
-    def _width(self) -> int:
-        """Columns of a row without a header, at least."""
-        return max([*(one + 1 for one in self._fields if isinstance(one, int)), len(self._fields)])
+    def _count_columns(self) -> int:
+        """Return the number of columns; before the format is known, the least number of a row without a header."""
+        if self._format is not None:
+            return self._format.count
+        return max([*(field + 1 for field in self._fields if isinstance(field, int)), len(self._fields)])
 
-    def _of_bytes(self, datagram: bytes) -> np.ndarray:
-        width = self._width() if self._form is None else self._form.count
+    def _parse_bytes(self, datagram: bytes) -> np.ndarray:
+        width = self._count_columns()
         if len(datagram) % (8 * width):
-            self._unfit(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
+            self._count_malformed(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
             return np.empty((0, width))
         return np.frombuffer(datagram, "<f8").reshape(-1, width)
 
-    def _of_text(self, lines: list[str]) -> np.ndarray:
-        """Rows of text. Lines of another form are counted; until one has the form that is needed, those before it are."""
-        lines = [one for one in lines if one.strip() and not one.lstrip().startswith("#")]
-        while lines and self._form is None and not self._begin(lines):
+    def _parse_text(self, lines: list[str]) -> np.ndarray:
+        """Parse lines into numbers, shape (rows, columns). Lines before the first one in a fit format are malformed."""
+        lines = _drop_remarks(lines)
+        while lines and self._format is None and not self._detect_format(lines):
             lines = lines[1:]
-        if self._form is None:
-            return np.empty((0, 0))
-        rows = [one for one in lines if one != self._header]
-        values = self._form.parse_numbers(rows)
-        if len(values) < len(rows):
-            self.counts[MALFORMED] += len(rows) - len(values)
-            self.fault = f"; a line should have {self._form.count} cells"
-        return values
+        return np.empty((0, 0)) if self._format is None else self._parse_rows(self._format, lines)
 
-    def _begin(self, lines: list[str]) -> bool:
-        """See from the first of some lines how rows of text are written; False where that is no row."""
+    def _detect_format(self, lines: list[str]) -> bool:
+        """Detect the format from the first of some lines; False if that line is malformed."""
         try:
-            form = detect_text_format(lines)
+            text_format = detect_text_format(lines)
         except InputError as error:
-            return self._unfit(str(error))
-        if form.names is not None:
-            missing = [one for one in self._fields if isinstance(one, str) and one not in form.names]
+            return self._count_malformed(str(error))
+        width = self._count_columns()
+        if text_format.names is not None:
+            missing = [field for field in self._fields if isinstance(field, str) and field not in text_format.names]
             if missing:
-                return self._unfit(f"no column {missing[0]!r} in {lines[0]!r}")
+                return self._count_malformed(f"no column {missing[0]!r} in {lines[0]!r}")
             self._header = lines[0]
-        elif form.count < self._width() or (form.count > self._width() and not self._numbered):
-            fields = "" if self._numbered else f": {', '.join(map(str, self._fields))}"
-            return self._unfit(f"{form.count} cells in {lines[0]!r}; there should be {self._width()}{fields}")
-        self._form = form
+        elif text_format.count < width or (text_format.count > width and not self._has_numbered_fields):
+            fields = "" if self._has_numbered_fields else f": {', '.join(map(str, self._fields))}"
+            return self._count_malformed(f"{text_format.count} cells in {lines[0]!r}; there should be {width}{fields}")
+        self._format = text_format
         return True
 
-    def _unfit(self, why: str) -> bool:
+    def _count_malformed(self, fault: str) -> bool:
         self.counts[MALFORMED] += 1
-        self.fault = f"; the last: {shorten(why, 200)}"
+        self.fault = f"; the last: {shorten(fault, 200)}"
         return False
 
     def close(self) -> None:
-        self._closed.set()
+        self._closing.set()
         self._receiver.join()
         self._socket.close()
 
 
 def _parse_address(address: str) -> tuple[str, int]:
-    wrong = InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
+    error = InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
     try:
         parts = urlsplit(address)
         host, port = parts.hostname, parts.port
     except ValueError:
-        raise wrong from None
+        raise error from None
     if parts.scheme != "udp" or not host or port is None or parts.path.strip("/") or parts.query:
-        raise wrong
+        raise error
     return host, port

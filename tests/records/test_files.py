@@ -131,7 +131,7 @@ def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkey
     frame = pd.DataFrame({"t": T, "u": U, "other": 2.0 * U})
     frame.to_csv(tmp_path / "log.csv", index=False)
     frame.to_parquet(tmp_path / "log.parquet")
-    monkeypatch.setattr(files, "_ROWS", 2)  # in three chunks
+    monkeypatch.setattr(files, "_CHUNK_ROWS", 2)  # in three chunks
     for name in ("log.csv", "log.parquet"):
         file = read_log_file(tmp_path / name, {"t", 1})
         assert list(file.columns) == ["t", "u", "other"] and isinstance(file.columns["other"], Column)
@@ -237,8 +237,8 @@ def test_exports_with_remarks_before_their_rows(tmp_path):
     np.testing.assert_array_equal(file.load_numbers(1), [0.0, -3.0, 7.0])
     assert file.units["t"] == "ms" and file.units["Torque actual value averaged"] == "%"
     assert file.notes == [
-        "Units by the file itself, which [log] has to repeat: t ms, Velocity actual value averaged rpm, Torque actual value "
-        "averaged %."
+        "The file gives these units, which [log] should repeat: t ms, Velocity actual value averaged rpm, Torque actual "
+        "value averaged %."
     ]
     (tmp_path / "scope.csv").write_text(SCOPE)
     file = read_log_file(tmp_path / "scope.csv")
@@ -246,7 +246,7 @@ def test_exports_with_remarks_before_their_rows(tmp_path):
     np.testing.assert_array_equal(file.load_numbers("position"), [0.5, 1.5, 2.5])
     # sampled at times of its own: the last is before those of the others
     np.testing.assert_array_equal(file.load_numbers("fast"), [0.0, 20.0, 20.0])
-    assert file.notes == ["'fast' has times of its own; its values are interpolated to the others' times."]
+    assert file.notes == ["'fast' was sampled at other times: it is interpolated to those of the first column."]
 
 
 def test_tdms_by_its_library(tmp_path):
@@ -305,7 +305,7 @@ def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
     assert list(file.columns) == ["t", "/axis.u", "/axis.angles[0]", "/axis.angles[1]", "/slow.v"]
     for column, values in {"t": T, "/axis.u": U, "/axis.angles[0]": T, "/slow.v": 10.0 * T}.items():
         np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-7)
-    assert file.notes == ["/slow is interpolated to the times of /axis, of which there are most."]
+    assert file.notes == ["/slow is interpolated to the times of /axis, which has the most messages."]
     wrote_bag(tmp_path / "bag")
     file = read_log_file(tmp_path / "bag", {"t", "/joint_states.position[0]"})
     for column, values in {"t": T, "/joint_states.position[0]": T, "/joint_states.effort[0]": U}.items():
@@ -336,7 +336,7 @@ def test_names_within_a_structure_are_told(tmp_path):
 def test_a_letter_of_another_encoding_far_behind_the_head(tmp_path):
     rows = "".join(f"{i},{2 * i},a\n" for i in range(40_000))
     (tmp_path / "log.csv").write_bytes(f"t,u,note\n{rows}1,2,5 \u00b0C\n".encode("latin-1"))
-    assert len(rows) > files._HEAD
+    assert len(rows) > files._HEAD_BYTES
     assert read_log_file(tmp_path / "log.csv", {"t", "u"}).load_numbers("u")[-1] == 2.0
 
 

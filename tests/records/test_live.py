@@ -128,7 +128,7 @@ def test_another_period_than_the_models_is_one_line(factor):
 def test_stamps_rounded_to_more_than_a_period_are_refused():
     rows = moved(400)
     rows[:, 0] = np.floor(rows[:, 0] / (4 * PERIOD)) * 4 * PERIOD
-    with pytest.raises(InputError, match="most stamps are that of the row before"):
+    with pytest.raises(InputError, match="most rows have the time stamp of the row before"):
         taken(rows)
 
 
