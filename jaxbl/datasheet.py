@@ -332,7 +332,7 @@ def _write_drive(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> 
 
     from .drive.effects import CoulombFriction
     from .records import NominalDrive
-    from .records.proposal import plant_steps
+    from .records.proposal import count_plant_steps
 
     value = {name: answer.value for name, answer in answers.items()}
 
@@ -388,7 +388,7 @@ def _write_drive(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> 
         "[run]",
         f"duration = {_format_number(_PERIODS / value['frequency'])} # s: {_PERIODS} periods of the input",
         line("sample_period", "sample_period", "s"),
-        f"substeps = {plant_steps(nominal, value['sample_period'])} # steps of the plant a sample, by the stiffness",
+        f"substeps = {count_plant_steps(nominal, value['sample_period'])} # steps of the plant a sample, by the stiffness",
     ]
     return "\n".join(lines) + "\n"
 

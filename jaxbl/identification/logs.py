@@ -171,7 +171,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     warning = (
         f"theta_e counts from another zero than in {first.path.name}, by the torque that repeats {waves} times a turn: "
         f"{found.value:.4g} ± {found.error:.1g} rad were added{other}."
-        + (" [log] theta_e.offset = 0 leaves it as it is." if table.omega_e is None else "")
+        + (" [log] theta_e.offset = 0 corrects nothing." if table.omega_e is None else "")
     )
     positions = {
         side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()

@@ -1,4 +1,4 @@
-"""Motor against load position: ratio, skew, lost motion."""
+"""Relation of motor and load position: ratio, skew, lost motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import lost_motion
-from .least_squares import fit_with_jackknife
+from .least_squares import fit_with_jackknife, rms, scale_columns
 from .lost_motion import LostMotion
 from .rigid_body import smooth_sign
 from .signal_quality import (
@@ -14,6 +14,7 @@ from .signal_quality import (
     ChannelStatistics,
     find_bandwidth,
     interpolate_spline,
+    long_segments,
     longest_segment,
     low_pass,
     trim_filter_ends,
@@ -22,11 +23,11 @@ from .signal_quality import (
 HARMONICS = 8
 """Terms of the cosine series over position: eccentricity and the first harmonics of gear and encoder errors."""
 UNRELATED = 0.2
-"""Share of the motor's motion that the load's leaves unexplained, beyond which the two count as unrelated."""
+"""Share of the motor's motion that the load's motion does not explain, from which on the two count as unrelated."""
 WIDE_TWIST = 0.25
-"""Share of the motor's motion that the twist takes, beyond which the load follows the motor only loosely."""
-_MIXTURES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
-"""Mixtures of velocity and acceleration, each over its rms, whose sign is tried as that of the transmitted torque."""
+"""Twist over the motor's motion, from which on the load follows the motor only loosely."""
+_FLANK_ANGLES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
+"""Angles of the mixtures of velocity and acceleration, each over its rms, whose sign may be that of the torque."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class Gearing(LostMotion):
 
     Attributes:
         ratio: motor over load motion.
-        ratio_error: standard error; beside a twist as large as the motion it takes that share of the ratio.
-        skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where the
-            log does not show it.
+        ratio_error: standard error; with a wide twist, the share of the twist in the motion counts as well.
+        skew: delay of the stamps of theta_s against its readings, s, compared with theta_e; None if the log does not show
+            it.
         skew_error: standard error.
-        residual: rms of the residual, at the motor, over the rms of theta_e about its mean; so is `twist_residual`.
-        twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
-        least_twist: range of the twist with the ratio that was found.
+        residual: rms of the residual, at the motor, over the rms of theta_e about its mean; `twist_residual` likewise.
+        twist: range of theta_e - ratio theta_s with the expected ratio, if there is one; at the motor.
+        least_twist: range of the twist with the fitted ratio.
         motion: range of theta_e.
     """
 
@@ -56,11 +57,11 @@ class Gearing(LostMotion):
 
     @property
     def is_loose(self) -> bool:
-        """Whether the twist is a large part of the motion whatever the ratio, so that the load follows only loosely."""
+        """True if the twist is a large part of the motion for any ratio, so that the load follows only loosely."""
         return min(self.twist, self.least_twist) > WIDE_TWIST * self.motion
 
     def describe_lost_motion(self, unit: str) -> str:
-        """Value, error and interval; in degrees as well."""
+        """Describe value, error and interval; for rad also in degrees."""
         low, high = self.lost_motion_interval
         digits = _decimals(self.lost_motion_error)
         text = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
@@ -72,12 +73,12 @@ class Gearing(LostMotion):
         return f"{text})"
 
     def exceeds_noise(self, noise: float) -> bool:
-        """Whether the lost motion is more than its error and the noise (:func:`twist_noise`)."""
+        """Return True if the lost motion exceeds its error and the noise (:func:`twist_noise`)."""
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
 
 
 def _decimals(error: float) -> int:
-    """Decimals that show two digits of an error."""
+    """Return the number of decimals that shows two digits of an error."""
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
@@ -91,62 +92,64 @@ def fit_gearing(
     expected: float | None = None,
     turn: float | None = None,
 ) -> Gearing | None:
-    """Regress motor on load position, its velocity, acceleration and flank; None where the motion is too small.
+    """Regress motor on load position, its velocity, acceleration and flank; None if the motion is too small.
 
-    A delay of the load's stamps adds to theta_e what is proportional to the velocity, lost motion what has the sign of the
-    transmitted torque; so they can be separated wherever the speed varies. That sign is taken as the sign of a mixture of
-    velocity (friction) and acceleration (inertia) of the load, the one that explains most. Viscous friction at the load
-    winds up the shaft in proportion to velocity too, and cannot be separated from a delay. Errors of the encoders and the
-    gear that repeat with position (eccentricity) are removed from both by a cosine series over the range of theta_s.
+    A delay of the load's stamps adds a part to theta_e that is proportional to the velocity; lost motion adds a part with
+    the sign of the transmitted torque. They can be separated if the speed varies. The sign of the torque is that of a
+    mixture of velocity (friction) and acceleration (inertia) of the load, the mixture that explains most. Viscous friction
+    at the load winds up the shaft in proportion to velocity, too, and cannot be separated from a delay. Errors of encoders
+    and gear that repeat with position (eccentricity) are removed by a cosine series over the range of theta_s.
 
-    Lost motion is found with the ratio that is `expected`, if one is. Gear and encoders repeat after a `turn` of the load;
+    Lost motion is found with the `expected` ratio, if there is one. Gear and encoders repeat after a `turn` of the load;
     None on a linear axis.
     """
     part = longest_segment(segments)
     width = _velocity_bandwidth(load[part], period)
-    usable = [s for s in segments if s.stop - s.start >= MIN_SAMPLES]
+    usable = long_segments(segments)
     fit = _fit_with_skew(times, motor, load, usable, period, width) if width and usable else None
     if fit is None:
         return None
-    target, rows, found, errors, skew, known = fit
-    # the ratio is that of the whole motion, whatever repeats within it
+    target, rows, coefficients, errors, skew, has_skew = fit
+    # the ratio is that of the whole motion, with the parts that repeat within it
     slopes, slope_errors = _fit_terms(target, rows[:, :4])
     if not np.isfinite(slopes).all():
         return None
-    left, slope = target - rows[:, :4] @ slopes, float(slopes[0])
+    residuals, slope = target - rows[:, :4] @ slopes, float(slopes[0])
     spread = float(np.std(target))
-    residual = _rms(left) / spread if spread else np.inf
-    # encoders are not late by many periods; and at one speed, to and fro, a delay looks like lost motion
-    alike = abs(float(rows[:, 1] @ rows[:, 2])) / float(np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300)
-    known = known and residual < UNRELATED and abs(skew) < 10.0 * period and alike < 0.97
+    residual = _rms(residuals) / spread if spread else np.inf
+    # encoders are not late by many periods, and at a constant speed, to and fro, a delay looks like lost motion
+    correlation = abs(float(rows[:, 1] @ rows[:, 2])) / float(
+        np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300
+    )
+    has_skew = has_skew and residual < UNRELATED and abs(skew) < 10.0 * period and correlation < 0.97
     # only a significant skew is undone
-    undone = skew if known and abs(skew) > 4.0 * errors[1] / abs(found[0]) else 0.0
+    undone_skew = skew if has_skew and abs(skew) > 4.0 * errors[1] / abs(coefficients[0]) else 0.0
     ratio = slope if expected is None else expected
-    aligned = [interpolate_spline(times[s], load[s], times[s] + undone) if undone else load[s] for s in usable]
+    aligned = [interpolate_spline(times[s], load[s], times[s] + undone_skew) if undone_skew else load[s] for s in usable]
     motor_there, load_there = np.concatenate([motor[s] for s in usable]), np.concatenate(aligned)
-    twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, slope))
+    twist, least_twist = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, slope))
     motion = float(np.ptp(motor_there))
-    wide = min(twist, least) > WIDE_TWIST * motion
-    # a load that sticks and slips, or a coarse encoder, shows its direction no sooner than the motor does
+    is_wide = min(twist, least_twist) > WIDE_TWIST * motion
+    # with stick and slip, or a coarse encoder, the load shows its direction no sooner than the motor
     slow = min(width, _velocity_bandwidth(motor[part], period) or width)
-    lost = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
+    lost = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, is_wide=is_wide)
     if lost is None:
-        # no flank is in contact for long: from the rough regression
-        lost = LostMotion.from_motion(2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2]))
-    # how the gap is crossed is not modelled: 0.5 % of the gap, as found on motions of several frequencies
+        # no flank is in contact for long: the rough regression has to do
+        lost = LostMotion.from_motion(2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2]))
+    # the crossing of the gap is not modelled: an error of 0.5 % of the gap, by motions of several frequencies
     speed = _rms(rows[:, 1])
-    skew_error = float(np.hypot(errors[1], 0.005 * lost.lost_motion / speed) / abs(found[0]))
+    skew_error = float(np.hypot(errors[1], 0.005 * lost.lost_motion / speed) / abs(coefficients[0]))
     # with a gap as large as the motion a delay cannot be found
-    known = known and not wide
+    has_skew = has_skew and not is_wide
     return Gearing(
         **vars(replace(lost, twist_residual=lost.twist_residual / spread if spread else np.inf)),
         ratio=slope,
-        ratio_error=float(np.hypot(slope_errors[0], slope * least / motion if wide else 0.0)),
-        skew=skew if known else None,
-        skew_error=skew_error if known else None,
+        ratio_error=float(np.hypot(slope_errors[0], slope * least_twist / motion if is_wide else 0.0)),
+        skew=skew if has_skew else None,
+        skew_error=skew_error if has_skew else None,
         residual=residual,
         twist=twist,
-        least_twist=least,
+        least_twist=least_twist,
         motion=motion,
     )
 
@@ -154,33 +157,37 @@ def fit_gearing(
 def _fit_with_skew(
     times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, width: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
-    """Repeats :func:`_regress_motor` until the skew of the load stays; its results, the skew, and whether there is one."""
-    skew, known, fit = 0.0, True, None
+    """Repeat :func:`_regress_motor` until the skew of the load converges.
+
+    Returns:
+        Its results, the skew, and True if there is one.
+    """
+    skew, has_skew, fit = 0.0, True, None
     # converges quadratically: five steps are ample
     for _ in range(5):
         fit = _regress_motor(times, motor, load, segments, period, 4.0 * width, skew)
         if fit is None:
             return None
         step = float(fit[2][1] / fit[2][0])
-        if not known or abs(step) < 1e-3 * period:
+        if not has_skew or abs(step) < 1e-3 * period:
             break
         skew += step
-        # a quarter of the fastest period: no delay of an encoder, but a load that moves on its own
+        # a quarter of the fastest period: a load that moves on its own, no delay of an encoder
         if abs(skew) > 0.25 / width:
-            skew, known = 0.0, False
+            skew, has_skew = 0.0, False
     assert fit is not None
-    return *fit, skew, known
+    return *fit, skew, has_skew
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How the skew of theta_s against theta_e grows over a log.
+    """Growth of the skew of theta_s against theta_e over a log.
 
     Attributes:
         value: s/s.
         error: standard error.
         skew: in the middle of the log, s.
-        reach: by how much the skew changes over half of the log, s.
+        reach: change of the skew over half of the log, s.
     """
 
     value: float
@@ -190,18 +197,18 @@ class Drift:
 
 
 _FOLDS = 10
-"""Blocks of the log, each left out in turn, on which a drift has to prove itself."""
+"""Blocks of the log, each left out in turn, on which a drift has to predict better."""
 
 
 def fit_drift(
     times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, skew: float
 ) -> Drift | None:
-    """A drift of the load's stamps that explains parts of the log left out better than the constant `skew` does; else None.
+    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`.
 
-    Arguments as of :func:`fit_gearing`.
+    Other arguments are those of :func:`fit_gearing`.
     """
     width = _velocity_bandwidth(load[longest_segment(segments)], period)
-    usable = [s for s in segments if s.stop - s.start >= MIN_SAMPLES]
+    usable = long_segments(segments)
     if not width or not usable:
         return None
     constant = _regress_motor(times, motor, load, usable, period, 4.0 * width, skew)
@@ -228,18 +235,18 @@ def fit_drift(
 
 
 def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Mean square error on each block of a regression on the others, shape (blocks,)."""
-    scaled, found = rows / (np.abs(rows).max(axis=0) + 1e-300), []
+    """Return the mean square error on each block of a regression on all other blocks, shape (blocks,)."""
+    scaled, errors = scale_columns(rows), []
     blocks = np.array_split(np.arange(len(target)), _FOLDS)
     grams, moments = [scaled[b].T @ scaled[b] for b in blocks], [scaled[b].T @ target[b] for b in blocks]
     for block, gram, moment in zip(blocks, grams, moments, strict=True):
         values = np.linalg.lstsq(sum(grams) - gram, sum(moments) - moment, rcond=1e-12)[0]
-        found.append(float(np.mean((target[block] - scaled[block] @ values) ** 2)))
-    return np.array(found)
+        errors.append(float(np.mean((target[block] - scaled[block] @ values) ** 2)))
+    return np.array(errors)
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
-    """Bandwidth of the velocity, Hz; of motion that is slower than a spectrum shows, a few times one over its duration."""
+    """Return the bandwidth of the velocity, Hz; for motion too slow for a spectrum, ten over its duration."""
     width = find_bandwidth(positions, period, differentiate=True)
     slow = 10.0 / (len(positions) * period)
     if width or len(positions) < MIN_SAMPLES:
@@ -249,12 +256,12 @@ def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
 
 
 def _fit_terms(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`fit_with_jackknife`; without the velocity, in column 1, where it is nothing but the flank."""
-    found, errors = fit_with_jackknife(target, rows)
-    if np.isfinite(found).all():
-        return found, errors
-    found, errors = fit_with_jackknife(target, np.delete(rows, 1, axis=1))
-    return np.insert(found, 1, 0.0), np.insert(errors, 1, np.inf)
+    """Fit like :func:`fit_with_jackknife`; without the velocity, in column 1, if it is proportional to the flank."""
+    coefficients, errors = fit_with_jackknife(target, rows)
+    if np.isfinite(coefficients).all():
+        return coefficients, errors
+    coefficients, errors = fit_with_jackknife(target, np.delete(rows, 1, axis=1))
+    return np.insert(coefficients, 1, 0.0), np.insert(errors, 1, np.inf)
 
 
 def _fit_lost_motion(
@@ -267,12 +274,12 @@ def _fit_lost_motion(
     ratio: float,
     turn: float | None,
     *,
-    wide: bool,
+    is_wide: bool,
 ) -> LostMotion | None:
-    """By changes of the load torque's sign, where there are any, else by the direction of motion.
+    """Fit the lost motion by the direction of motion, or by changes of the sign of the load torque.
 
-    `aligned` is theta_s without its skew, of each segment; `cutoff` that of the low-pass before differences are taken, Hz.
-    Where the twist is `wide`, a large part of the motion, errors that repeat with position cannot be separated.
+    `aligned` is theta_s without its skew, of each segment; `cutoff` is that of the low-pass before differentiation, Hz.
+    If the twist `is_wide`, a large part of the motion, errors that repeat with position cannot be separated.
     """
     from scipy.ndimage import minimum_filter1d
 
@@ -287,65 +294,68 @@ def _fit_lost_motion(
     time, twist, position, velocity, acceleration = np.concatenate(parts).T
     ends = np.cumsum([len(part) for part in parts])[:-1]
     rows = [np.ones_like(position), velocity, acceleration]
-    if not wide:
+    if not is_wide:
         low, span = float(position.min()), float(np.ptp(position))
-        around = turn is not None and span > 1.5 * turn
-        place = (position - low) * (2.0 * np.pi / turn if around and turn else np.pi / span)
+        repeats = turn is not None and span > 1.5 * turn
+        place = (position - low) * (2.0 * np.pi / turn if repeats and turn else np.pi / span)
         rows += [position - low, *(np.cos(k * place) for k in range(1, HARMONICS + 1))]
-        rows += [np.sin(k * place) for k in range(1, HARMONICS + 1)] if around else []
+        rows += [np.sin(k * place) for k in range(1, HARMONICS + 1)] if repeats else []
     terms = np.stack(rows, axis=1)
     sizes = _rms(velocity), _rms(acceleration)
-    # the filter takes as long to notice a corner of the motion
+    # the filter reacts to a corner of the motion within this time
     guard = round(0.5 / (cutoff * period))
     best = None
-    for angle in _MIXTURES:
+    for angle in _FLANK_ANGLES:
         flank = _flank_signal(angle, velocity, acceleration, sizes)
-        clear = np.abs(flank) > 0.3
-        if clear.sum() < 0.25 * len(clear):
+        is_clear = np.abs(flank) > 0.3
+        if is_clear.sum() < 0.25 * len(is_clear):
             continue
-        for part in np.split(np.arange(len(clear)), ends):
-            clear[part] = minimum_filter1d(clear[part], 2 * guard + 1, mode="nearest")
-        few = np.flatnonzero(clear)[:: max(int(clear.sum()) // 20_000, 1)]
-        if len(few) < 3 * terms.shape[1] or clear.sum() < 0.1 * len(clear):
+        for part in np.split(np.arange(len(is_clear)), ends):
+            is_clear[part] = minimum_filter1d(is_clear[part], 2 * guard + 1, mode="nearest")
+        sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
+        if len(sample) < 3 * terms.shape[1] or is_clear.sum() < 0.1 * len(is_clear):
             continue
-        chosen = np.column_stack([np.sign(flank[few]), terms[few]])
-        chosen /= np.abs(chosen).max(axis=0) + 1e-300
-        fitted = chosen @ np.linalg.lstsq(chosen, twist[few], rcond=1e-10)[0]
-        size = float(np.mean((twist[few] - fitted) ** 2))
-        if best is None or size < best[0]:
-            best = (size, flank, clear)
+        columns = scale_columns(np.column_stack([np.sign(flank[sample]), terms[sample]]))
+        fitted = columns @ np.linalg.lstsq(columns, twist[sample], rcond=1e-10)[0]
+        mean_square = float(np.mean((twist[sample] - fitted) ** 2))
+        if best is None or mean_square < best[0]:
+            best = (mean_square, flank, is_clear)
     if best is None:
-        return None if wide else lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn)
-    _, flank, clear = best
-    found = lost_motion.fit_lost_motion_by_direction(twist, terms, flank, clear)
-    if wide:
-        # a shaft winds up as its load is moved: part of this shift, and in so few cycles it is unknown how much
-        alone = lost_motion.fit_lost_motion_by_direction(twist, terms[:, :1], flank, clear)
-        return found.enclose(alone) if found and alone else found
-    if found is None or found.lost_motion_error > 0.25 * abs(found.lost_motion):
-        # at one speed, delays and wind-up look like lost motion: take a delay to be no more than a period
+        return None if is_wide else lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn)
+    _, flank, is_clear = best
+    fit = lost_motion.fit_lost_motion_by_direction(twist, terms, flank, is_clear)
+    if is_wide:
+        # the wind-up of the shaft is part of this shift, and its share is unknown in so few cycles
+        constant_fit = lost_motion.fit_lost_motion_by_direction(twist, terms[:, :1], flank, is_clear)
+        return fit.enclose(constant_fit) if fit and constant_fit else fit
+    if fit is None or fit.lost_motion_error > 0.25 * abs(fit.lost_motion):
+        # at a constant speed, delays and wind-up look like lost motion: a delay is assumed to be at most a period
         delay = ratio * period * _rms(velocity)
-        still = lost_motion.fit_lost_motion_by_direction(twist, np.delete(terms, 1, axis=1), flank, clear, beside=delay)
-        if still is not None and (found is None or still.lost_motion_error < 0.5 * found.lost_motion_error):
-            found = still
-    if found is not None and found.twist_residual < 0.25 * abs(found.lost_motion):
-        return found
-    # two flanks by the direction of motion explain little: the load may change them
-    return lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn) or found
+        fit_without_velocity = lost_motion.fit_lost_motion_by_direction(
+            twist, np.delete(terms, 1, axis=1), flank, is_clear, other_error=delay
+        )
+        if fit_without_velocity is not None and (
+            fit is None or fit_without_velocity.lost_motion_error < 0.5 * fit.lost_motion_error
+        ):
+            fit = fit_without_velocity
+    if fit is not None and fit.twist_residual < 0.25 * abs(fit.lost_motion):
+        return fit
+    # flanks by the direction of motion explain little: the load may change them
+    return lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn) or fit
 
 
 def _rms(values: np.ndarray) -> float:
-    """Root mean square; never zero, so that one can divide by it."""
-    return float(np.sqrt(np.mean(values**2))) + 1e-300
+    """Return the root mean square, which is never zero here, so that it can be a divisor."""
+    return rms(values) + 1e-300
 
 
 def _flank_signal(angle: float, velocity: np.ndarray, acceleration: np.ndarray, sizes: tuple[float, float]) -> np.ndarray:
-    """One of :data:`_MIXTURES`, by the rms of both."""
+    """Return the mixture of velocity and acceleration at one of :data:`_FLANK_ANGLES`; `sizes` are the rms of both."""
     return np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
 
 
 def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics) -> float:
-    """Noise and resolution of both encoders together, rms, at the motor, in their unit."""
+    """Return the rms noise and resolution of both encoders together, at the motor, in their unit."""
     noise = [motor.noise, ratio * load.noise, motor.resolution / 12.0**0.5, ratio * load.resolution / 12.0**0.5]
     return float(np.hypot.reduce(noise))
 
@@ -360,10 +370,11 @@ def _regress_motor(
     skew: float,
     drift: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """One regression of :func:`fit_gearing` at a given skew, and a drift (s/s) about the middle of the log, if it is sought.
+    """Regress motor on load position for :func:`fit_gearing`, at a skew (s) and a drift (s/s) about the middle of the log.
 
-    Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series; velocity times time where a
-    drift is sought), shape (rows, 5 + HARMONICS or one more); coefficients and standard errors, shape (terms,).
+    Returns:
+        Motor positions, shape (rows,). Terms, shape (rows, terms): position, velocity, flank, 1, acceleration, HARMONICS
+        terms of the series, and with a `drift` velocity times time. Coefficients and standard errors, shape (terms,).
     """
     middle = 0.5 * float(times[0] + times[-1])
     parts, smooth_motor = [], []
@@ -375,11 +386,11 @@ def _regress_motor(
         smooth_motor.append(low_pass(motor[s], cutoff, period))
     inner = [trim_filter_ends(len(signal), cutoff, period) for signal in smooth_motor]
 
-    def joined(signals: list[np.ndarray]) -> np.ndarray:
+    def join_segments(signals: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([signal[..., cut] for signal, cut in zip(signals, inner, strict=True)], axis=-1)
 
-    target = joined(smooth_motor)
-    position, velocity, acceleration = joined(parts)
+    target = join_segments(smooth_motor)
+    position, velocity, acceleration = join_segments(parts)
     sizes = _rms(velocity), _rms(acceleration)
     lowest = float(load.min())
     place = np.pi * (position - lowest) / (float(load.max()) - lowest)
@@ -388,27 +399,27 @@ def _regress_motor(
         [position - lowest, velocity, np.zeros_like(position), np.ones_like(position), acceleration, *series], axis=1
     )
     best = None
-    for angle in _MIXTURES:
+    for angle in _FLANK_ANGLES:
         mixed = [_flank_signal(angle, velocity, acceleration, sizes) for _, velocity, acceleration in parts]
-        # between the flanks the twist is anywhere in the gap
-        clear = np.abs(joined(mixed)) > 0.3
-        few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
-        if len(few) < 3 * rows.shape[1] or clear.sum() < 0.25 * len(clear):
+        # between the flanks the twist may have any value in the gap
+        is_clear = np.abs(join_segments(mixed)) > 0.3
+        sample = np.flatnonzero(is_clear)[:: max(len(position) // 20_000, 1)]
+        if len(sample) < 3 * rows.shape[1] or is_clear.sum() < 0.25 * len(is_clear):
             continue
-        flank = rows[:, 2] = joined([low_pass(smooth_sign(m), cutoff, period) for m in mixed])
-        scaled = rows[few] / (np.abs(rows[few]).max(axis=0) + 1e-300)
-        fitted = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[few], rcond=1e-12)[0]
-        size = float(np.mean((target[few] - scaled @ fitted) ** 2))
-        if best is None or size < best[0]:
-            best = (size, flank, clear)
+        flank = rows[:, 2] = join_segments([low_pass(smooth_sign(m), cutoff, period) for m in mixed])
+        scaled = scale_columns(rows[sample])
+        fitted = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[sample], rcond=1e-12)[0]
+        mean_square = float(np.mean((target[sample] - scaled @ fitted) ** 2))
+        if best is None or mean_square < best[0]:
+            best = (mean_square, flank, is_clear)
     if best is None:
         return None
     rows[:, 2] = best[1]
     if drift is not None:
-        about = np.concatenate([times[s][cut] for s, cut in zip(segments, inner, strict=True)]) - middle
-        rows = np.column_stack([rows, velocity * about])
+        time_offset = np.concatenate([times[s][cut] for s, cut in zip(segments, inner, strict=True)]) - middle
+        rows = np.column_stack([rows, velocity * time_offset])
     rows, target = rows[best[2]], target[best[2]]
-    found, errors = _fit_terms(target, rows)
-    if not np.isfinite(found).all() or found[0] == 0.0:
+    coefficients, errors = _fit_terms(target, rows)
+    if not np.isfinite(coefficients).all() or coefficients[0] == 0.0:
         return None
-    return target, rows, found, errors
+    return target, rows, coefficients, errors

@@ -1,4 +1,4 @@
-"""What a measured log can and cannot identify, judged before anything is fitted to it."""
+"""Inspect a measured log: judge which quantities it can identify, before anything is fitted to it."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -11,7 +11,7 @@ import numpy as np
 from .alignment import NominalDrive
 from .element import Element, fit_element
 from .gearing import Gearing, twist_noise
-from .least_squares import fit_with_jackknife
+from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
 from .signal_quality import low_pass
 from .table import POSITION_CHANNELS, LogTable
@@ -19,12 +19,12 @@ from .table import POSITION_CHANNELS, LogTable
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Whether a log can identify a quantity.
+    """Answer to the question if a log can identify a quantity of the drive.
 
     Attributes:
-        quantity: of the drive.
+        quantity: name of the quantity.
         answer: yes; weak: with large uncertainty, or only together with another quantity; no.
-        reason: one sentence.
+        reason: a sentence.
     """
 
     quantity: str
@@ -34,15 +34,15 @@ class Identifiability:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A log, and what it is good for.
+    """A log, and the quantities that it can identify.
 
     Attributes:
         record: the log as read.
-        log: how it was read.
+        log: its `[log]` table.
         gear_ratio: motor over load motion: the expected one, else that of the log; None with one encoder.
-        reversals: how often the direction of motion changes.
-        identifiability: what the log can identify.
-        element: what a transmission on a test rig is; None of a drive, or where the log shows nothing.
+        reversals: number of changes of the direction of motion.
+        identifiability: an answer for each quantity.
+        element: fit of a transmission on a test rig; None for a drive, or if the log shows no transmission.
     """
 
     record: Record
@@ -53,39 +53,43 @@ class Inspection:
     element: Element | None = None
 
     def describe_sizes(self) -> str:
-        """Sizes that its user knows, in one sentence: a wrong unit shows in them."""
+        """Describe the log by sizes that its user knows, in one sentence: a wrong unit shows in them."""
         record, side = self.record, main_side(self.record)
         channel = record.statistics.channels[POSITION_CHANNELS[side]]
-        turning = channel.unit == "rad"
+        is_rotary = channel.unit == "rad"
         if self.log.kind == "element":
-            moved, torque = np.ptp(element_displacement(record, self.gear_ratio)), record.torque
+            displacement, torque = np.ptp(element_displacement(record, self.gear_ratio)), record.torque
             assert torque is not None
             return (
-                f"As read: displacement over {moved:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
+                f"As read: displacement over {displacement:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
                 f"{record.statistics.channels['u'].unit}. If the rig is another, see the units in [log]."
             )
-        fastest = float(np.quantile(np.abs(compute_velocity(record)), 0.999))
-        sizes = [f"{side} up to " + (f"{fastest * 30.0 / math.pi:.3g} rpm" if turning else f"{fastest:.3g} m/s")]
+        top_speed = float(np.quantile(np.abs(compute_velocity(record)), 0.999))
+        sizes = [f"{side} up to " + (f"{top_speed * 30.0 / math.pi:.3g} rpm" if is_rotary else f"{top_speed:.3g} m/s")]
         if record.torque is not None and np.ptp(record.torque):
             sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.statistics.channels['u'].unit}")
-            found = record.statistics.dynamics
-            if found is not None and 0.0 < 4.0 * found.errors[0] < found.values[0] and found.inflation[0] < 10.0:
-                sizes.append(f"inertia about {found.values[0]:.2g} {'kg m²' if turning else 'kg'}")
+            rigid_fit = record.statistics.dynamics
+            if (
+                rigid_fit is not None
+                and 0.0 < 4.0 * rigid_fit.errors[0] < rigid_fit.values[0]
+                and rigid_fit.inflation[0] < 10.0
+            ):
+                sizes.append(f"inertia about {rigid_fit.values[0]:.2g} {'kg m²' if is_rotary else 'kg'}")
         return f"As read: {', '.join(sizes)}. If the machine is another, see the units in [log]."
 
     @property
     def twist(self) -> np.ndarray | None:
         """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""
-        both = self.record.positions
-        if self.gear_ratio is None or len(both) < 2:
+        positions = self.record.positions
+        if self.gear_ratio is None or len(positions) < 2:
             return None
-        twist = both["motor"] - self.gear_ratio * both["load"]
+        twist = positions["motor"] - self.gear_ratio * positions["load"]
         return twist - np.median(twist)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in `inspection.json`."""
-        record, found = self.record, self.record.statistics
-        dynamics = found.dynamics
+        """Return the content of `inspection.json`."""
+        record, statistics = self.record, self.record.statistics
+        dynamics = statistics.dynamics
         return {
             "file": str(record.path.resolve()),
             "samples": len(record.time),
@@ -93,15 +97,16 @@ class Inspection:
             "start": record.start,
             "closed_loop": record.closed_loop,
             "segments": [[float(record.time[s][0]), float(record.time[s][-1])] for s in record.segments],
-            "sampling": asdict(found.sampling),
-            "channels": {name: asdict(channel) for name, channel in found.channels.items()},
+            "sampling": asdict(statistics.sampling),
+            "channels": {name: asdict(channel) for name, channel in statistics.channels.items()},
             "gear_ratio": self.gear_ratio,
-            "gearing": None if found.gearing is None else asdict(found.gearing),
+            "gearing": None if statistics.gearing is None else asdict(statistics.gearing),
             "dynamics": None if dynamics is None else dynamics.to_dict(),
             "reversals": self.reversals,
             "element": None if self.element is None else self.element.to_dict(),
             "identifiable": [
-                {"quantity": item.quantity, "answer": item.answer, "why": item.reason} for item in self.identifiability
+                {"quantity": judgement.quantity, "answer": judgement.answer, "why": judgement.reason}
+                for judgement in self.identifiability
             ],
             "warnings": list(record.warnings),
             "notes": list(record.notes),
@@ -133,65 +138,74 @@ def inspect(
     rigid = _judge_rigid_drive(record, speed, reversals)
     if gearing is not None and gearing.is_loose:
         rigid = [_weaken_for_loose_load(judgement) for judgement in rigid]
-    found = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
-    return Inspection(record, table, ratio, reversals, tuple(found))
+    judgements = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
+    return Inspection(record, table, ratio, reversals, tuple(judgements))
 
 
 def element_displacement(record: Record, gear_ratio: float | None) -> np.ndarray:
-    """Of an element: of one side, against `gear_ratio` times the other's if it was recorded; rad (m), shape (samples,)."""
+    """Return the displacement of an element, rad (m), shape (samples,).
+
+    It is the position of one side, less `gear_ratio` times that of the other side if it was recorded.
+    """
     motor, load = record.positions["motor"], record.positions.get("load")
     return motor if load is None else motor - (gear_ratio or 1.0) * load
 
 
 def fit_record_element(record: Record, gear_ratio: float | None) -> Element | None:
-    """What a log says of a transmission on a test rig; None where it shows nothing."""
+    """Fit a transmission on a test rig to its log; None if the log does not show one."""
     assert record.torque is not None
     channel = record.statistics.channels["theta_e"]
-    moved, noise = element_displacement(record, gear_ratio), element_noise(record, gear_ratio)
-    return fit_element(moved, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m")
+    displacement, noise = element_displacement(record, gear_ratio), element_noise(record, gear_ratio)
+    return fit_element(
+        displacement, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m"
+    )
 
 
 def element_noise(record: Record, gear_ratio: float | None) -> float:
-    """Of an element's displacement, with that of the resolution, rad (m) rms."""
-    found = record.statistics.channels
+    """Return the rms noise of an element's displacement with that of its resolution, rad (m)."""
+    statistics = record.statistics.channels
     ratio = {"theta_e": 1.0, "theta_s": gear_ratio or 1.0}
-    parts = [(ratio[n] * found[n].noise, ratio[n] * found[n].resolution / 12.0**0.5) for n in ratio if n in found]
-    return float(np.hypot.reduce([one for part in parts for one in part]))
+    noise = [
+        (factor * statistics[name].noise, factor * statistics[name].resolution / 12.0**0.5)
+        for name, factor in ratio.items()
+        if name in statistics
+    ]
+    return float(np.hypot.reduce(np.ravel(noise)))
 
 
 _ELEMENT_NUMBERS = {
     "stiffness": "stiffness", "gap": "half_gap", "damping": "damping", "dry friction": "dry_friction",
     "hysteresis": "hysteresis", "friction under load": "friction_coefficient",
 }  # fmt: skip
-"""Quantity of an element -> its number."""
+"""Quantity of an element -> name of its number."""
 
 
-def _judge_element(found: Element | None) -> tuple[Identifiability, ...]:
-    if found is None:
-        why = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
-        return tuple(Identifiability(quantity, "no", why) for quantity in _ELEMENT_NUMBERS)
+def _judge_element(element: Element | None) -> tuple[Identifiability, ...]:
+    if element is None:
+        reason = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
+        return tuple(Identifiability(quantity, "no", reason) for quantity in _ELEMENT_NUMBERS)
     judgements = []
     for quantity, key in _ELEMENT_NUMBERS.items():
-        number = found.numbers.get(key)
+        number = element.numbers.get(key)
         if number is None:
             judgements.append(
-                Identifiability(quantity, "no", "does not make the torque any better on parts of the log left out")
+                Identifiability(quantity, "no", "does not predict the torque better on parts of the log that are left out")
             )
             continue
         low, high = number.interval
         unit = f" {number.unit}" if number.unit else ""
         text = f"{key} = {number.value:.4g} ± {number.error:.2g}{unit}, 95 %: {low:.4g} to {high:.4g}"
-        judgements.append(Identifiability(quantity, "weak" if key in found.open else "yes", text))
+        judgements.append(Identifiability(quantity, "weak" if key in element.open else "yes", text))
     return tuple(judgements)
 
 
 def main_side(record: Record) -> str:
-    """The side whose encoder shows the motion: motor, or load where the motor has none."""
+    """Return the side whose encoder shows the motion: motor, or load if the motor has none."""
     return "motor" if "motor" in record.positions else "load"
 
 
 def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
-    """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,); by default of the main side."""
+    """Differentiate the low-passed position of a side, by default the main one; rad/s (m/s), shape (samples,)."""
     side = side or main_side(record)
     width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
@@ -203,7 +217,7 @@ def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
 
 
 def _is_moving(speed: np.ndarray) -> np.ndarray:
-    return np.abs(speed) > 0.1 * np.sqrt(np.mean(speed**2))
+    return np.abs(speed) > 0.1 * rms(speed)
 
 
 def _count_reversals(record: Record, speed: np.ndarray) -> int:
@@ -211,61 +225,65 @@ def _count_reversals(record: Record, speed: np.ndarray) -> int:
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
 
-def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Identifiability]:
-    return [Identifiability(quantity, answer, why) for quantity in quantities]
+def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], reason: str) -> list[Identifiability]:
+    return [Identifiability(quantity, answer, reason) for quantity in quantities]
 
 
 def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> list[Identifiability]:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
-    torque, found = record.torque, record.statistics.dynamics
+    torque, rigid_fit = record.torque, record.statistics.dynamics
     if torque is None:
         return _judge_alike(names, "no", "no torque was recorded: the log shows kinematics only")
     if np.ptp(torque) == 0.0:
-        why = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
-        return _judge_alike(names, "weak", why)
-    if found is None:
+        reason = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
+        return _judge_alike(names, "weak", reason)
+    if rigid_fit is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
     moving = np.abs(speed[_is_moving(speed)])
     slow, fast = np.quantile(moving, [0.05, 0.95])
-    both = min((speed[_is_moving(speed)] > 0).mean(), (speed[_is_moving(speed)] < 0).mean())
+    minor_share = min((speed[_is_moving(speed)] > 0).mean(), (speed[_is_moving(speed)] < 0).mean())
     width = record.statistics.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
-    percent = [f"{100 * share:.0f} % of the torque" for share in found.shares]
-    spread = [abs(error / value) if value else math.inf for value, error in zip(found.values, found.errors, strict=True)]
+    percent = [f"{100 * share:.0f} % of the torque" for share in rigid_fit.shares]
+    relative_errors = [
+        abs(error / value) if value else math.inf for value, error in zip(rigid_fit.values, rigid_fit.errors, strict=True)
+    ]
 
-    def judge(name: str, i: int, yes: str, similar: str) -> Identifiability:
-        if found.inflation[i] > 10.0:
+    def judge(name: str, i: int, evidence: str, similar_term: str) -> Identifiability:
+        if rigid_fit.inflation[i] > 10.0:
             return Identifiability(
-                name, "weak", f"hard to separate from {similar} here (variance × {found.inflation[i]:.0f})"
+                name, "weak", f"hard to separate from {similar_term} here (variance × {rigid_fit.inflation[i]:.0f})"
             )
-        if found.values[i] < 2.0 * found.errors[i]:
+        if rigid_fit.values[i] < 2.0 * rigid_fit.errors[i]:
             return Identifiability(
                 name, "weak", f"a rough fit finds no positive value ({percent[i]}): other effects hide it"
             )
-        if found.shares[i] < 0.05:
+        if rigid_fit.shares[i] < 0.05:
             return Identifiability(name, "weak", f"it makes only {percent[i]}")
-        if spread[i] > 0.2:
-            return Identifiability(name, "weak", f"a rough fit finds it only to ± {100 * spread[i]:.0f} % ({percent[i]})")
-        return Identifiability(name, "yes", f"{yes}: {percent[i]}")
+        if relative_errors[i] > 0.2:
+            return Identifiability(
+                name, "weak", f"a rough fit finds it only to ± {100 * relative_errors[i]:.0f} % ({percent[i]})"
+            )
+        return Identifiability(name, "yes", f"{evidence}: {percent[i]}")
 
-    result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
-    alone = "motion in one direction only: hard to separate from"
+    judgements = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
+    one_way_text = "motion in one direction only: hard to separate from"
     if fast < 1.5 * slow:
-        why = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
-        result += _judge_alike(names[1:3], "weak", why)
+        reason = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
+        judgements += _judge_alike(names[1:3], "weak", reason)
     else:
-        result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
-        if both < 0.05:
-            result += _judge_alike(["Coulomb friction"], "weak", f"{alone} a constant torque")
+        judgements.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
+        if minor_share < 0.05:
+            judgements += _judge_alike(["Coulomb friction"], "weak", f"{one_way_text} a constant torque")
         else:
-            result.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
-    if both < 0.05:
-        return [*result, Identifiability("constant torque", "weak", f"{alone} Coulomb friction")]
-    why = f"motion in both directions ({100 * both:.0f} % in the less frequent one)"
-    return [*result, Identifiability("constant torque", "yes", why)]
+            judgements.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
+    if minor_share < 0.05:
+        return [*judgements, Identifiability("constant torque", "weak", f"{one_way_text} Coulomb friction")]
+    reason = f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
+    return [*judgements, Identifiability("constant torque", "yes", reason)]
 
 
 def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:
-    """A fit of one rigid body says little of a motor whose load follows only loosely."""
+    """Weaken a judgement by a fit of a rigid body, which says little of a motor whose load follows only loosely."""
     if judgement.answer == "no" or judgement.quantity == "constant torque":
         return judgement
     reason = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
@@ -276,25 +294,22 @@ def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio
     names = ("gear ratio", "lost motion", "stiffness")
     gearing, channels = record.statistics.gearing, record.statistics.channels
     if len(record.positions) < 2:
-        missing = "load" if "motor" in record.positions else "motor"
-        why = f"there is no {missing} encoder: the transmission in between is not observed"
-        if missing == "load" and record.torque is not None and reversals >= 2:
-            tried = "from the motor's encoder alone: jaxbl identify with a model of two inertias tries"
-            return [
-                Identifiability(names[0], "no", why),
-                *_judge_alike(names[1:], "weak", f"{tried}, and says if it cannot"),
-            ]
-        return _judge_alike(names, "no", why)
+        missing_side = "load" if "motor" in record.positions else "motor"
+        reason = f"there is no {missing_side} encoder: the transmission in between is not observed"
+        if missing_side == "load" and record.torque is not None and reversals >= 2:
+            advice = "jaxbl identify with a model of two inertias tries to find it from the motor's encoder alone"
+            return [Identifiability(names[0], "no", reason), *_judge_alike(names[1:], "weak", advice)]
+        return _judge_alike(names, "no", reason)
     if gearing is None or ratio is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
-    left = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
+    remark = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
     if gearing.is_loose:
-        left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
+        remark = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])
     answer = "yes" if gearing.residual < 0.05 and not gearing.is_loose else "weak"
     return [
-        Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}"),
+        Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {remark}"),
         _judge_lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
         _judge_stiffness(record, speed, ratio, noise),
     ]
@@ -302,20 +317,20 @@ def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio
 
 def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Identifiability:
     size = gearing.describe_lost_motion(unit)
-    answer, why = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
+    answer, reason = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
-        answer, why = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
+        answer, reason = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
     elif reversals < 2:
-        answer, why = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
+        answer, reason = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
     elif gearing.is_loose:
-        why = f"shift of {size} includes the wind-up, which this motion does not separate"
+        reason = f"shift of {size} includes the wind-up, which this motion does not separate"
     elif gearing.exceeds_noise(noise):
-        answer, why = "yes", f"theta_e shifts by {size} from flank to flank"
-    return Identifiability("lost motion", answer, why)
+        answer, reason = "yes", f"theta_e shifts by {size} from flank to flank"
+    return Identifiability("lost motion", answer, reason)
 
 
 def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Identifiability:
-    """From twist over torque within one direction of motion; `noise` is the twist's, rms."""
+    """Judge the stiffness by twist over torque within one direction of motion; `noise` is that of the twist, rms."""
     torque = record.transmitted
     if torque is None:
         if record.torque is None or np.ptp(record.torque) == 0.0:
@@ -331,15 +346,15 @@ def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: flo
         smooth = low_pass(signals, 4.0 * width, record.sample_period)
         targets.append(smooth[:, 0])
         rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
-    found, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
-    if not np.isfinite(found[0]):
+    coefficients, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
+    if not np.isfinite(coefficients[0]):
         return Identifiability("stiffness", "weak", "the log is too short to see how the twist follows the torque")
-    reach = abs(float(found[0])) * float(np.std(torque))
+    windup = abs(float(coefficients[0])) * float(np.std(torque))
     unit = record.statistics.channels["theta_e"].unit
-    if found[0] < 5.0 * errors[0] or reach < noise:
+    if coefficients[0] < 5.0 * errors[0] or windup < noise:
         return Identifiability(
-            "stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)"
+            "stiffness", "weak", f"the twist hardly follows the torque (it winds up {windup:.2g} {unit} rms)"
         )
     return Identifiability(
-        "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {noise:.2g}"
+        "stiffness", "yes", f"the twist follows the torque: {windup:.2g} {unit} rms against a noise of {noise:.2g}"
     )

@@ -3,13 +3,25 @@
 import numpy as np
 
 BLOCKS = 12
-"""Parts of a log that are left out in turn: enough for a standard error within 20 %, and each long against correlations."""
+"""Parts of a log, each left out in turn: enough for a standard error within 20 %, each longer than correlations last."""
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def scale_columns(columns: np.ndarray) -> np.ndarray:
+    """Divide each column by its largest magnitude, so that least squares are well conditioned."""
+    return columns / (np.abs(columns).max(axis=0) + 1e-300)
 
 
 def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of regressors, shape (samples, terms), and their standard errors (delete-a-block jackknife).
+    """Fit coefficients of regressors, shape (samples, terms), by least squares.
 
-    The errors hold for residuals of any correlation in time; both are nan where undetermined.
+    Returns:
+        Coefficients and standard errors (delete-a-block jackknife), shape (terms,); NaN if they are not determined. The
+        errors hold for residuals of any correlation in time.
     """
     scale = np.sqrt(np.mean(regressors**2, axis=0))
     scale[scale == 0.0] = 1.0

@@ -1,4 +1,4 @@
-"""Reading measured logs: from a file to evenly spaced channels in SI units, with figures and remarks on its quality."""
+"""Read measured logs: from a file to evenly spaced channels in SI units, with statistics and remarks on its quality."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -37,13 +37,13 @@ from .time_stamps import Sampling, SegmentedStamps, read_time_stamps, split_at_g
 
 @dataclass(frozen=True)
 class LogStatistics:
-    """What the log says about itself.
+    """Statistics of a log.
 
     Attributes:
-        sampling: of the time stamps.
-        channels: channel -> its figures; channels are u, theta_e, theta_s, transmitted, as far as they were recorded.
-        gearing: motor against load motion; None with one encoder, or too little motion.
-        dynamics: rough rigid-drive regression of the torque; None without torque, or too little motion.
+        sampling: statistics of the time stamps.
+        channels: channel -> its statistics; channels are u, theta_e, theta_s, transmitted, if they were recorded.
+        gearing: relation of motor and load motion; None with a single encoder or too little motion.
+        dynamics: rough rigid-drive regression of the torque; None without torque or with too little motion.
     """
 
     sampling: Sampling
@@ -62,17 +62,17 @@ class Record:
         sample_period: s.
         torque: input at the motor shaft, held from each sample to the next, N m (N on a linear axis), shape (samples,); None
             if it was not recorded.
-        positions: "motor" and "load", as far as they were recorded -> rad (m on a linear axis), shape (samples,).
+        positions: "motor" and "load", if recorded -> rad (m on a linear axis), shape (samples,).
         transmitted: measured transmitted torque, N m (N), shape (samples,), or None.
-        closed_loop: whether a controller chose the input from the positions; None if not known.
+        closed_loop: True if a controller chose the input from the positions; None if not known.
         start: time of the first sample by the stamps of the log, s.
-        segments: contiguous parts; between them the log has gaps.
-        notes: what was done to the log, and what is odd about it, in sentences.
-        warnings: those that are to be said first: clock or zero point of an encoder corrected, units in doubt.
-        corrections: "skew" of theta_s, s, its "drift", s/s, and "offset" of theta_e, rad (m), as far as they were put in.
-        contradiction: why nothing can be fitted to the nominal drive, as units are surely wrong; "" where they are not.
+        segments: samples of each segment; between them the log has gaps.
+        notes: sentences on changes to the log, and on its oddities.
+        warnings: sentences to be said first: corrected clocks or zero points of encoders, doubtful units.
+        corrections: "skew" of theta_s, s, its "drift", s/s, and "offset" of theta_e, rad (m), if they were applied.
+        contradiction: reason for which the nominal drive cannot be fitted, such as a wrong unit; "" if there is none.
         statistics: of its stamps, channels, gearing and torque.
-        intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
+        intervals: between the raw stamps that were used, s, shape (raw samples - 1,).
         logs: file and rows of each log that it was joined from.
     """
 
@@ -94,14 +94,14 @@ class Record:
     logs: tuple[tuple[Path, slice], ...]
 
     def unit_of(self, path: str, unit: str) -> str:
-        """The unit of a number of one side in this log: N and m in place of N m and rad, if the side moves along a line."""
+        """Return the unit of a number of one side in this log: N and m for N m and rad, if the side moves along a line."""
         side = "load" if any(name.startswith("load") for name in path.split(".")) else "motor"
         channel = self.statistics.channels.get(POSITION_CHANNELS[side])
         return on_a_line(unit) if channel is not None and channel.unit == "m" else unit
 
 
 def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> LogTable:
-    """Validate a `[log]` table, None for defaults; `name` is how messages call the file that it is from.
+    """Validate a `[log]` table, None for defaults; messages begin with `name`, the file that it is from.
 
     Raises:
         InputError: unknown key, wrong type or range; one line that names the key.
@@ -130,23 +130,23 @@ def read_record(
 ) -> Record:
     """Read a measured log.
 
-    Columns become SI units as the `[log]` table says; uneven stamps are resampled to their median period, positions by cubic
-    splines, torques so that their integral over time is kept. Gaps part the log into segments.
+    Columns become SI units as the `[log]` table says. Samples at uneven stamps are resampled to their median period:
+    positions by cubic splines, torques so that their integral over time stays the same. Gaps split the log into segments.
 
     Args:
         path: CSV or other text, Parquet, MATLAB (.mat up to 7.3), or JSON file.
-        log: the `[log]` table of a study, or its keys; left out: columns t, u, theta_e, theta_s in s, N m, rad, rad.
-        gear_ratio: expected ratio of motor over load motion, which the log is checked against.
-        gear_tolerance: relative deviation of the ratio up to which the log is read nevertheless, with a note.
-        nominal: what the log's drive is said to be; with it a skew and an offset between the encoders that nothing else can
-            make are corrected, where the `[log]` table does not give them.
+        log: the `[log]` table of a study, or its keys; if left out, columns t, u, theta_e, theta_s in s, N m, rad, rad.
+        gear_ratio: expected ratio of motor over load motion, which is compared with that of the log.
+        gear_tolerance: relative deviation of the ratio up to which the log is read with a note in place of an error.
+        nominal: nominal drive of the log. It is needed to correct a skew and an offset between the encoders that no
+            friction or gap can cause, if the `[log]` table does not give them.
 
     Raises:
-        InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
+        InputError: the file or a column is missing or unfit, or the log contradicts the `[log]` table or `gear_ratio`.
     """
     table = read_log_table(log)
     file = read_log_file(Path(path), table.list_columns())
-    # from columns to SI channels at the time stamps of the log
+    # columns become SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
     check_channels_differ(file, channels)
@@ -161,34 +161,36 @@ def read_record(
         check_position_moves(file, name, channels[name].values)
     if drive and len(encoders) == 2:
         note_standstill(file, segmented, channels)
-    # from there to evenly spaced samples
-    two = drive and len(encoders) == 2
-    shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None
+    # these become evenly spaced samples
+    has_both_encoders = drive and len(encoders) == 2
+    shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
     grid, gearing, regular = _resample_and_align(file, table, segmented, channels, gear_ratio, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
-    # what these say of the drive
-    if two:
+    # the motion is compared with the drive
+    if has_both_encoders:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit)
-    position, driven = grid.values[encoders[0]], drive and "u" in channels
-    dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if driven else None
+    position, is_driven = grid.values[encoders[0]], drive and "u" in channels
+    dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if is_driven else None
     if dynamics is not None:
         check_torque_sign(file, dynamics, grid, position)
         if nominal is not None:
             flag_wrong_units(file, dynamics, encoders[0], nominal)
-    # uneven stamps would pass for noise of what moves between them
-    source = Grid(segmented.times, {n: raw.values for n, raw in channels.items()}, segmented.segments, grid.period)
-    figures = {
+    # values at uneven stamps, read as even ones, would look noisy
+    source = Grid(
+        segmented.times, {channel: raw.values for channel, raw in channels.items()}, segmented.segments, grid.period
+    )
+    statistics = {
         name: _measure_channel(file, name, raw, segmented, source if regular else grid) for name, raw in channels.items()
     }
     if gearing is not None:
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
-        figures["theta_s"] = replace(figures["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
+        statistics["theta_s"] = replace(statistics["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
         note_skew(file, gearing, grid.period)
-        note_lost_motion(file, gearing, figures)
-    # a delay of the torque shows only where it is explained, and mostly by inertia
+        note_lost_motion(file, gearing, statistics)
+    # a delay of the torque shows only if the motion explains the torque, mostly by inertia
     if dynamics is not None and dynamics.residual < 0.1 and dynamics.shares[0] > 0.3:
-        figures["u"] = replace(figures["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
+        statistics["u"] = replace(statistics["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
     return Record(
         path=file.path,
         time=grid.time - grid.time[0],
@@ -200,11 +202,11 @@ def read_record(
         start=stamps.start + float(grid.time[0]),
         segments=tuple(grid.segments),
         notes=tuple(file.notes),
-        # doubts before what was corrected
+        # doubts come before corrections
         warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith("Doubtful"))),
         corrections=file.corrections,
         contradiction=file.contradiction,
-        statistics=LogStatistics(segmented.sampling, figures, gearing, dynamics),
+        statistics=LogStatistics(segmented.sampling, statistics, gearing, dynamics),
         intervals=np.diff(segmented.times),
         logs=((file.path, slice(0, len(grid.time))),),
     )
@@ -218,12 +220,16 @@ def _resample_and_align(
     gear_ratio: float | None,
     shaft: NominalDrive | None,
 ) -> tuple[Grid, Gearing | None, bool]:
-    """The channels at even spacing without skews; relation of both encoders; whether the stamps had that spacing already."""
+    """Resample the channels to even spacing and remove skews.
+
+    Returns:
+        The samples, the relation of both encoders, and True if the stamps had that spacing already.
+    """
     period = table.resample or segmented.period
     regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
     delays = {name: Delay(raw.skew if isinstance(raw.skew, float) else 0.0, raw.drift) for name, raw in channels.items()}
 
-    def attempt() -> tuple[Grid, Gearing | None]:
+    def resample() -> tuple[Grid, Gearing | None]:
         grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
@@ -231,162 +237,160 @@ def _resample_and_align(
         motor, load = grid.values["theta_e"], grid.values["theta_s"]
         return grid, fit_gearing(grid.time, motor, load, grid.segments, period, expected=gear_ratio, turn=turn)
 
-    grid, gearing = attempt()
-    asked = any(raw.skew == "estimate" for raw in channels.values())
-    open_ = shaft is not None and _is_left_out(table, "skew")
-    said = []
-    if gearing is not None and (asked or open_) and _is_left_out(table, "drift"):
-        drift = _find_clock_drift(gearing, grid, shaft if open_ else None)
+    grid, gearing = resample()
+    is_estimated = any(raw.skew == "estimate" for raw in channels.values())
+    may_correct = shaft is not None and _is_left_out(table, "skew")
+    sentences = []
+    if gearing is not None and (is_estimated or may_correct) and _is_left_out(table, "drift"):
+        drift = _find_clock_drift(gearing, grid, shaft if may_correct else None)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
-            grid, gearing = attempt()
-            said.append(
-                f"theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± {1e6 * drift.error:.1g} us each second, "
-                "clocks that run apart: corrected."
+            grid, gearing = resample()
+            sentences.append(
+                f"The clocks drift apart: theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± "
+                f"{1e6 * drift.error:.1g} us each second. This was corrected."
             )
-    first = delays.get("theta_s", Delay())
-    if asked:
-        delays["theta_s"] = Delay(first.skew + _estimate_skew(file, gearing, period), first.drift)
-        grid, gearing = attempt()
-    elif open_ and shaft is not None and gearing is not None:
-        found = judge_clock_skew(gearing, grid, shaft)
-        if found is not None and found.is_sure:
-            delays["theta_s"] = Delay(first.skew + found.value, first.drift)
-            grid, gearing = attempt()
-            said.append(_skew_sentence(found, " in the middle of the log" if said else ""))
-    if said:
-        file.warnings.append(" ".join([*said, _delay_advice(table, delays["theta_s"])]))
-    if open_ and any(delays["theta_s"]):
-        file.corrections |= {key: one for key, one in delays["theta_s"]._asdict().items() if one}
+    initial_delay = delays.get("theta_s", Delay())
+    if is_estimated:
+        delays["theta_s"] = Delay(initial_delay.skew + _estimate_skew(file, gearing, period), initial_delay.drift)
+        grid, gearing = resample()
+    elif may_correct and shaft is not None and gearing is not None:
+        clock_skew = judge_clock_skew(gearing, grid, shaft)
+        if clock_skew is not None and clock_skew.is_sure:
+            delays["theta_s"] = Delay(initial_delay.skew + clock_skew.value, initial_delay.drift)
+            grid, gearing = resample()
+            sentences.append(_describe_skew(clock_skew, " in the middle of the log" if sentences else ""))
+    if sentences:
+        file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, delays["theta_s"])]))
+    if may_correct and any(delays["theta_s"]):
+        file.corrections |= {key: correction for key, correction in delays["theta_s"]._asdict().items() if correction}
     if not regular:
-        why = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
+        purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
-            f"Resampled {why}: every {1e3 * period:.6g} ms, sampled every {1e3 * segmented.period:.6g} ms; positions by "
-            "cubic splines, torques with their integral kept."
+            f"Resampled {purpose}: every {1e3 * period:.6g} ms in place of {1e3 * segmented.period:.6g} ms; positions by "
+            "cubic splines, torques so that their integral stays the same."
         )
     for name, delay in delays.items():
         if any(delay):
-            more = f", growing by {1e6 * delay.drift:.4g} us each second" if delay.drift else ""
-            file.notes.append(f"{name}: moved by its skew of {1e3 * delay.skew:.4g} ms{more}.")
+            growth = f", growing by {1e6 * delay.drift:.4g} us each second" if delay.drift else ""
+            file.notes.append(f"{name}: shifted by its skew of {1e3 * delay.skew:.4g} ms{growth}.")
     return grid, gearing, regular
 
 
 def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
-    """A drift between the clocks of both encoders, as far as friction of the nominal drive, if one is given, is no cause."""
+    """Find a drift between the clocks of both encoders; None if friction of the nominal `shaft` may cause it."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
     if gearing.is_loose:
         return None
-    found = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
-    # friction that changes as the machine warms up changes the wind-up, by less than all of it
-    if found is None or (
+    drift = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
+    # as the machine warms up, friction and wind-up change, at most by the whole wind-up
+    if drift is None or (
         shaft is not None
-        and found.reach < max_windup_delay(grid, shaft) + 6.0 * found.reach * found.error / abs(found.value)
+        and drift.reach < max_windup_delay(grid, shaft) + 6.0 * drift.reach * drift.error / abs(drift.value)
     ):
         return None
-    return found
+    return drift
 
 
 def _estimate_skew(file: LogFile, gearing: Gearing | None, period: float) -> float:
     if gearing is None or gearing.skew is None or gearing.skew_error is None:
         raise file.error("theta_s.skew = 'estimate': this motion does not show a skew; give it in s, or leave it out")
-    found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
+    estimate = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
     if not gearing.skew_error < 0.5 * period:
         raise file.error(
-            f"theta_s.skew = 'estimate': found {found}; its error should be less than half the period of "
+            f"theta_s.skew = 'estimate': the estimate is {estimate}; its error should be less than half the period of "
             f"{1e3 * period:.4g} ms; give the skew in s, or leave it out"
         )
-    file.notes.append(f"The skew of theta_s was estimated against theta_e: {found}.")
+    file.notes.append(f"The skew of theta_s was estimated against theta_e: {estimate}.")
     return gearing.skew
 
 
 def _is_left_out(table: LogTable, key: str) -> bool:
-    """Whether `[log]` leaves a key of theta_e and theta_s out; a speed in place of theta_s may not have it."""
+    """Return True if `[log]` leaves a key of theta_e and theta_s out; False if a speed in place of theta_s lacks the key."""
     motor, load = table.position_source("theta_e")[1], table.position_source("theta_s")[1]
     return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
 
 
-def _skew_sentence(found: Skew, when: str) -> str:
-    how = "later" if found.value > 0.0 else "earlier"
+def _describe_skew(skew: Skew, place: str) -> str:
+    direction = "later" if skew.value > 0.0 else "earlier"
     return (
-        f"theta_s is {1e3 * abs(found.value):.3g} ± {1e3 * found.error:.1g} ms {how} than theta_e{when}, more than friction "
-        f"can make (at most {1e3 * found.max_windup_delay:.2g} ms): corrected."
+        f"theta_s is {1e3 * abs(skew.value):.3g} ± {1e3 * skew.error:.1g} ms {direction} than theta_e{place}. Friction can "
+        f"cause at most {1e3 * skew.max_windup_delay:.2g} ms, so this was corrected."
     )
 
 
-def _delay_advice(table: LogTable, delay: Delay) -> str:
-    """What `[log]` would say of a skew that was corrected."""
+def _describe_delay_keys(table: LogTable, delay: Delay) -> str:
+    """Describe the keys of `[log]` that would correct the same skew."""
     name, _ = table.position_source("theta_s")
-    if not delay.drift:
-        return f"[log] {name}.skew = {delay.skew:.4g} says the same, 0 leaves it as it is."
-    return (
-        f"[log] {name}.skew = {delay.skew:.4g}, that at the first stamp, with {name}.drift = {delay.drift:.4g} says the "
-        "same; 0 for both leaves it as it is."
-    )
+    drift_key = f" (at the first stamp) and {name}.drift = {delay.drift:.4g}" if delay.drift else ""
+    return f"[log] {name}.skew = {delay.skew:.4g}{drift_key} corrects the same; 0 corrects nothing."
 
 
 def _correct_offset(
     file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive
 ) -> None:
-    """Take an offset between the encoders out of theta_e where it is sure, and say so; say that it may be one, if not."""
+    """Subtract a sure offset between the encoders from theta_e; warn of a possible one."""
     integrals = [name for name in POSITION_CHANNELS.values() if table.position_source(name)[0] != name]
     if not integrals and not _is_left_out(table, "offset"):
         return
-    found = find_encoder_offset(grid, nominal)
-    if found is None:
+    offset = find_encoder_offset(grid, nominal)
+    if offset is None:
         return
     if integrals:
-        # an integral counts from any place
+        # an integral may begin at any position
         name = integrals[0]
-        change = -found.value if name == "theta_e" else found.value / nominal.gear_ratio
+        change = -offset.value if name == "theta_e" else offset.value / nominal.gear_ratio
         grid.values[name] = grid.values[name] + change
         channels[name] = channels[name]._replace(values=channels[name].values + change)
-        file.notes.append(f"{name} is an integral: {change:.4g} {channels[name].unit} were added to fit the other encoder.")
+        file.notes.append(
+            f"{name} is an integral: {change:.4g} {channels[name].unit} were added, so that it fits the other encoder."
+        )
         return
-    size = f"{found.value:.4g} ± {found.error:.1g} {channels['theta_e'].unit}"
+    size = f"{offset.value:.4g} ± {offset.error:.1g} {channels['theta_e'].unit}"
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
-    if found.is_sure:
-        grid.values["theta_e"] = grid.values["theta_e"] - found.value
-        file.corrections["offset"] = -found.value
-        channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - found.value)
+    if offset.is_sure:
+        grid.values["theta_e"] = grid.values["theta_e"] - offset.value
+        file.corrections["offset"] = -offset.value
+        channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - offset.value)
         file.warnings.append(
-            f"{twist} is {size} without torque, an offset between the encoders: corrected. [log] theta_e.offset = "
-            f"{-found.value:.4g} says the same, 0 leaves it as it is."
+            f"{twist} is {size} without torque. This offset between the encoders was corrected. [log] theta_e.offset = "
+            f"{-offset.value:.4g} corrects the same; 0 corrects nothing."
         )
         return
     cause = (
         "a constant torque in the shaft"
-        if found.both_flanks
+        if offset.both_flanks
         else "a constant torque that holds the load on one flank of a gap"
     )
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
-        f"[log] theta_e.offset = {-found.value:.4g} takes it for an offset, 0 for none."
+        f"[log] theta_e.offset = {-offset.value:.4g} corrects it as an offset; 0 corrects nothing."
     )
 
 
 def _measure_channel(
     file: LogFile, name: str, raw: RawChannel, segmented: SegmentedStamps, source: Grid
 ) -> ChannelStatistics:
-    """Figures on a channel, with remarks; noise and bandwidth are taken from the longest part of `source`."""
-    part = longest_segment(source.segments)
-    values, times = source.values[name][part], source.time[part]
+    """Measure a channel, with remarks; noise and bandwidth are those of the longest segment of `source`."""
+    segment = longest_segment(source.segments)
+    values, times = source.values[name][segment], source.time[segment]
     period = float(times[-1] - times[0]) / (len(values) - 1)
-    figures = measure_channel(
+    statistics = measure_channel(
         values,
         period,
-        [raw.values[p] for p in segmented.segments],
-        None if segmented.sampling.even else [segmented.times[p] for p in segmented.segments],
+        [raw.values[rows] for rows in segmented.segments],
+        None if segmented.sampling.even else [segmented.times[rows] for rows in segmented.segments],
         unit=raw.unit,
         is_position=name.startswith("theta"),
         saturated=raw.saturated,
     )
-    note_channel_faults(file, name, figures, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
-    return figures
+    note_channel_faults(file, name, statistics, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
+    return statistics
 
 
 def check_positions(log: Record, other: Record) -> None:
-    """Refuse another log of a machine without a position that the first one has."""
+    """Refuse another log of the same machine that lacks a position of the first one."""
     for side in log.positions:
         if side not in other.positions:
             raise InputError(
@@ -394,12 +398,12 @@ def check_positions(log: Record, other: Record) -> None:
             )
 
 
-_PAUSE = 10
+_PAUSE_PERIODS = 10
 """Periods between logs that are joined."""
 
 
 def join_records(records: Sequence[Record]) -> Record:
-    """Several logs of one machine as one record: one after the other, with figures and units of the first.
+    """Join several logs of one machine to a record, one after the other, with statistics and units of the first.
 
     Raises:
         InputError: other channels or another sampling period than the first one's.
@@ -412,16 +416,18 @@ def join_records(records: Sequence[Record]) -> Record:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
                 f"{record.path}: is sampled every {record.sample_period:.6g} s, {first.path} every {period:.6g} s; "
-                f"[log] resample = {period:.6g} reads both alike"
+                f"set [log] resample = {period:.6g} to read both at the same period"
             )
-        for one, other in ((record, first), (first, record)):
-            if missing := _channel_names(other) - _channel_names(one):
+        for incomplete, other in ((record, first), (first, record)):
+            if missing := _channel_names(other) - _channel_names(incomplete):
                 name = min(missing)
-                raise InputError(f"{one.path}: has no {name}, which {other.path} has; logs of one machine should be alike")
+                raise InputError(
+                    f"{incomplete.path}: has no {name}, which {other.path} has; logs of one machine should be alike"
+                )
         times.append(record.time - record.time[0] + end)
-        end = float(times[-1][-1]) + _PAUSE * period
-        segments += [slice(part.start + rows, part.stop + rows) for part in record.segments]
-        logs += [(path, slice(part.start + rows, part.stop + rows)) for path, part in record.logs]
+        end = float(times[-1][-1]) + _PAUSE_PERIODS * period
+        segments += [slice(rows_of_log.start + rows, rows_of_log.stop + rows) for rows_of_log in record.segments]
+        logs += [(path, slice(rows_of_log.start + rows, rows_of_log.stop + rows)) for path, rows_of_log in record.logs]
         rows += len(record.time)
         notes += [f"{record.path.name}: {note}" for note in record.notes]
         warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
@@ -442,7 +448,9 @@ def join_records(records: Sequence[Record]) -> Record:
 
 def _channel_names(record: Record) -> set[str]:
     torques = {"torque": record.torque, "transmitted torque": record.transmitted}
-    return {f"{side} position" for side in record.positions} | {name for name, one in torques.items() if one is not None}
+    return {f"{side} position" for side in record.positions} | {
+        name for name, values in torques.items() if values is not None
+    }
 
 
 def _concatenate(parts):

@@ -1,4 +1,4 @@
-"""A rough fit of a rigid drive to a log: torque against acceleration, velocity, its sign, position and a constant."""
+"""Rough fit of a rigid drive to a log: torque against acceleration, velocity, its sign, position and a constant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from .least_squares import fit_with_jackknife
-from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass, trim_filter_ends
+from .least_squares import fit_with_jackknife, rms
+from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, trim_filter_ends
 
 
 @dataclass(frozen=True)
 class RigidFit:
-    """A rough regression of the torque on the motion of a rigid drive, to judge a log by; no identification.
+    """Rough regression of the torque on the motion of a rigid drive. It serves to judge a log, not to identify a drive.
 
     The terms are acceleration, velocity, its sign, position and a constant.
 
@@ -20,16 +20,16 @@ class RigidFit:
         names: of the terms.
         values: coefficients, SI units, shape (terms,).
         errors: their standard errors, shape (terms,).
-        inflation: variance inflation factor of each: 1 if its term is uncorrelated with all others, shape (terms,).
+        inflation: variance inflation factors: 1 if a term is uncorrelated with all others, shape (terms,).
         shares: rms of each term over that of the torque, shape (terms,).
-        skew: by how much the stamps of u are later than the torque, s.
+        skew: delay of the stamps of u against the torque, s.
         skew_error: standard error.
         residual: rms of the residual over the rms of the torque about its mean.
         torque: rms, N m (N).
         acceleration: rms of the low-passed motion, rad/s² (m/s²).
-        power: mean that the torque puts in, W.
+        power: mean power of the torque, W.
         square: mean of the squared low-passed speed, rad²/s² (m²/s²).
-        slowing: by how much the squared speed falls from begin to end of the segments, over their length, rad²/s³ (m²/s³).
+        slowing: fall of the squared speed from begin to end of the segments, over their duration, rad²/s³ (m²/s³).
     """
 
     names: tuple[str, ...]
@@ -47,7 +47,7 @@ class RigidFit:
     slowing: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As in `inspection.json`; an inflation without limit is null."""
+        """Return the entry of `inspection.json`; an infinite inflation is null."""
         columns = (x.tolist() for x in (self.values, self.errors, self.inflation, self.shares))
         terms = {
             name: {
@@ -62,60 +62,58 @@ class RigidFit:
 
 
 def smooth_sign(velocity: np.ndarray) -> np.ndarray:
-    """+1 or -1 by the sign of a velocity, smooth through zero, shape (samples,)."""
+    """Return the sign of a velocity, +1 or -1, smooth through zero; shape (samples,)."""
     # 2 % of the rms velocity: standstill then counts as neither direction
-    return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
+    return velocity / np.hypot(velocity, 0.02 * rms(velocity) + 1e-300)
 
 
 def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
-    """Regress a torque, held from each stamp to the next, on the motion of one encoder; None where that is too small."""
-    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
-    if width == 0.0 or np.ptp(torque) == 0.0:
+    """Regress a torque, held from each stamp to the next, on the motion of an encoder; None if that is too small."""
+    bandwidth = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
+    if bandwidth == 0.0 or np.ptp(torque) == 0.0:
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes
-    cutoff = 3.0 * width
+    cutoff = 3.0 * bandwidth
     targets, all_rows, slowing = [], [], 0.0
-    for s in segments:
-        if s.stop - s.start < MIN_SAMPLES:
-            continue
-        smooth = low_pass(position[s], cutoff, period)
+    for segment in long_segments(segments):
+        smooth = low_pass(position[segment], cutoff, period)
         velocity = np.gradient(smooth, period)
         acceleration = np.gradient(velocity, period)
         direction = low_pass(smooth_sign(velocity), cutoff, period)
-        held = low_pass(torque[s], cutoff, period)
-        cut = trim_filter_ends(len(smooth), cutoff, period)
-        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(held, period)]
-        all_rows.append(np.stack(columns, axis=1)[cut])
-        slowing += float(velocity[cut][0] ** 2 - velocity[cut][-1] ** 2)
-        targets.append(held[cut])
+        smooth_torque = low_pass(torque[segment], cutoff, period)
+        inner = trim_filter_ends(len(smooth), cutoff, period)
+        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(smooth_torque, period)]
+        all_rows.append(np.stack(columns, axis=1)[inner])
+        slowing += float(velocity[inner][0] ** 2 - velocity[inner][-1] ** 2)
+        targets.append(smooth_torque[inner])
     if not targets:
         return None
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
     if np.ptp(target) == 0.0:
         return None
-    found, errors = fit_with_jackknife(target, rows)
-    if not np.isfinite(found).all():
+    coefficients, errors = fit_with_jackknife(target, rows)
+    if not np.isfinite(coefficients).all():
         # two terms are proportional to each other
-        found, errors = np.zeros(6), np.full(6, np.inf)
+        coefficients, errors = np.zeros(6), np.full(6, np.inf)
     terms = rows[:, :5]
     centred = terms[:, :4] - terms[:, :4].mean(axis=0)
-    spread = np.sqrt(np.mean(centred**2, axis=0))
+    term_rms = np.sqrt(np.mean(centred**2, axis=0))
     inflation = np.full(5, np.inf)
-    if np.isfinite(errors).all() and (spread > 0.0).all():
+    if np.isfinite(errors).all() and (term_rms > 0.0).all():
         inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
-    left = target - rows @ found
+    residuals = target - rows @ coefficients
     return RigidFit(
         names=("inertia", "viscous", "coulomb", "spring", "constant"),
-        values=found[:5],
+        values=coefficients[:5],
         errors=errors[:5],
         inflation=inflation,
-        shares=np.abs(found[:5]) * np.sqrt(np.mean(terms**2, axis=0)) / np.sqrt(np.mean(target**2)),
+        shares=np.abs(coefficients[:5]) * np.sqrt(np.mean(terms**2, axis=0)) / rms(target),
         # a torque that is held for a period acts half a period after its stamp
-        skew=float(found[5]) + 0.5 * period,
+        skew=float(coefficients[5]) + 0.5 * period,
         skew_error=float(errors[5]),
-        residual=float(np.std(left) / np.std(target)),
-        torque=float(np.sqrt(np.mean(target**2))),
-        acceleration=float(np.sqrt(np.mean(rows[:, 0] ** 2))),
+        residual=float(np.std(residuals) / np.std(target)),
+        torque=rms(target),
+        acceleration=rms(rows[:, 0]),
         power=float(np.mean(target * rows[:, 1])),
         square=float(np.mean(rows[:, 1] ** 2)),
         slowing=slowing / (len(rows) * period),

@@ -219,3 +219,8 @@ def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndar
 def longest_segment(segments: Sequence[slice]) -> slice:
     """Return the longest segment."""
     return max(segments, key=lambda segment: segment.stop - segment.start)
+
+
+def long_segments(segments: Sequence[slice]) -> list[slice]:
+    """Return the segments that are long enough to be filtered and regressed."""
+    return [segment for segment in segments if segment.stop - segment.start >= MIN_SAMPLES]

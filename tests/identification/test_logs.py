@@ -94,7 +94,7 @@ def test_a_clock_that_one_log_is_sure_of_holds_for_all_and_for_the_held_out_log(
     assert [list(one.corrections) for one in alone] == [["skew"], [], ["skew"]]
     record, held = read_with_holdout(config, [tmp_path / f"{i}.parquet" for i in order], tmp_path / "2.parquet")
     assert held is not None
-    moved = f"theta_s: moved by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
+    moved = f"theta_s: shifted by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
     assert sum(moved in note for note in record.notes) == 2 and moved in held.notes
     assert record.corrections == held.corrections == alone[0].corrections
 

@@ -86,9 +86,9 @@ def test_clocks_that_run_apart_are_found_to_a_tenth_of_a_sample(read, skew, drif
     late = found["skew"] + found["drift"] * ends - skew - drift * ends
     assert np.abs(late).max() < 0.1e-3
     (warning,) = record.warnings
-    assert "clocks that run apart: corrected" in warning
+    assert "The clocks drift apart" in warning
     said = (
-        f"[log] theta_s.skew = {found['skew']:.4g}, that at the first stamp, with theta_s.drift = {found['drift']:.4g} says"
+        f"[log] theta_s.skew = {found['skew']:.4g} (at the first stamp) and theta_s.drift = {found['drift']:.4g} corrects"
     )
     assert said in warning and warning.count("[log]") == 1
     given = read(frame, {"theta_s": {"skew": found["skew"], "drift": found["drift"]}})
@@ -108,7 +108,7 @@ def test_the_zero_of_an_integral_is_none_and_its_clock_is_its_own(read):
     for record, name in ((motor, "theta_s"), (load, "omega_s")):
         assert set(record.corrections) == {"skew"}
         (warning,) = (one for one in record.warnings if "corrected" in one)
-        assert f"[log] {name}.skew = {record.corrections['skew']:.4g} says the same" in warning
+        assert f"[log] {name}.skew = {record.corrections['skew']:.4g} corrects the same" in warning
         assert not any(".offset" in one for one in record.warnings)
         twist = record.positions["motor"] - 20.0 * record.positions["load"]
         assert abs(np.mean(twist)) < 0.05

@@ -55,7 +55,7 @@ def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
 
 def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
     """Of a long log means are fitted: of a short part behind a gap one or none is left."""
-    monkeypatch.setattr(element, "_MOST", 500)
+    monkeypatch.setattr(element, "_MAX_SAMPLES", 500)
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(4003))
     u = 3.0e4 * x + np.random.default_rng(2).standard_normal(4003)
     for parts in ([slice(0, 4000), slice(4000, 4003)], [slice(0, 3), slice(3, 4003)]):

@@ -22,7 +22,7 @@ def test_names_and_units_of_columns_are_understood(tmp_path):
         "u": {"column": "Motor current [mA]", "unit": "A", "factor": 1e-3},
         "theta_e": {"column": "position_deg", "unit": "deg"},
     }
-    assert guesses == ["u.factor: put in the torque of one mA; 1 is a placeholder for each A or V, and for 100 %."]
+    assert guesses == ["u.factor: put in the torque of one mA; 1 N m for each A or V, or for 100 %, is a placeholder."]
 
 
 COLUMNS = {
@@ -51,7 +51,7 @@ def test_each_quantity_finds_its_column(names, tmp_path):
     table, guesses = guess_log_table(tmp_path / "log.csv")
     read_log_table(table)
     assert {name: one["column"] for name, one in table.items()} == {"t": "t"} | COLUMNS[names]
-    assert (table["u"]["column"] == "torque_cmd") == any("the torque asked for" in guess for guess in guesses)
+    assert (table["u"]["column"] == "torque_cmd") == any("the commanded torque" in guess for guess in guesses)
     assert ("[counts]" in names) == any("put in factor" in guess for guess in guesses)
 
 

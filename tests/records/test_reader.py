@@ -255,7 +255,7 @@ def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew,
     assert any("lags theta_e" in n or "leads theta_e" in n for n in record.notes) == bool(skew)
     # undone on request
     undone = read_record(path, {"theta_s": {"skew": "estimate"}})
-    assert any(note.startswith("theta_s: moved by its skew") for note in undone.notes)
+    assert any(note.startswith("theta_s: shifted by its skew") for note in undone.notes)
     assert abs(undone.statistics.gearing.skew) < 4.0 * found.skew_error
 
 
