@@ -87,9 +87,7 @@ def test_clocks_that_run_apart_are_found_to_a_tenth_of_a_sample(read, skew, drif
     assert np.abs(late).max() < 0.1e-3
     (warning,) = record.warnings
     assert "The clocks drift apart" in warning
-    said = (
-        f"[log] theta_s.skew = {found['skew']:.4g} (at the first stamp) and theta_s.drift = {found['drift']:.4g} corrects"
-    )
+    said = f"[log] theta_s.skew = {found['skew']:.4g} (at the first stamp) and theta_s.drift = {found['drift']:.4g} corrects"
     assert said in warning and warning.count("[log]") == 1
     given = read(frame, {"theta_s": {"skew": found["skew"], "drift": found["drift"]}})
     np.testing.assert_allclose(given.positions["load"], record.positions["load"], atol=1e-12)
