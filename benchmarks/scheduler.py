@@ -155,7 +155,7 @@ class Pass:
 
     def by_client(self, client: Client, marks: list[int], seconds: float) -> None:
         count = 0
-        for count, _ in enumerate(Cluster(client, local=False).done(done, jobs(max(marks), seconds)), 1):
+        for count, _ in enumerate(Cluster(client, local=False).run_jobs(done, jobs(max(marks), seconds)), 1):
             self.first = self.first or time.perf_counter() - self.start
             if count in marks:
                 self.row(count)

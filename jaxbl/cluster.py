@@ -25,15 +25,15 @@ Result = TypeVar("Result")
 Scheduler = Union[str, "Client", "Cluster", None]
 """How a cluster is given (:func:`connect`)."""
 
-_ANSWER = 15.0
-"""Seconds in which a scheduler has to answer."""
-_LOOK = 0.05
-"""Seconds between two looks at what is done."""
+_ANSWER_SECONDS = 15.0
+"""Longest time in which a scheduler has to answer."""
+_POLL_SECONDS = 0.05
+"""Time between two looks at which jobs have ended."""
 _AHEAD, _FEWEST_AHEAD = 4, 16
 """Jobs a worker, and in all at least, that the scheduler knows at once: workers never wait for the next one, and neither
 scheduler nor client grows with the number of jobs (docs/scale.md)."""
-_COUNT = 2.0
-"""Seconds between two looks at how many workers there are."""
+_COUNT_SECONDS = 2.0
+"""Time between two counts of the workers."""
 _ONE_AT_A_TIME = Lock()
 """A job uses all cores of its worker, whatever number of threads takes jobs there."""
 
@@ -42,7 +42,7 @@ class Cluster:
     """A connection to a Dask scheduler.
 
     Attributes:
-        local: whether its workers end with this process.
+        local: True if its workers end with this process.
     """
 
     def __init__(self, client: "Client", *, local: bool):
@@ -51,7 +51,7 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """How many there are now, at least one: a cluster may start them as they are needed."""
+        """Number of workers, at least one: a cluster may start them as they are needed."""
         try:
             workers: Any = self._client.nthreads()
         except OSError:
@@ -60,19 +60,21 @@ class Cluster:
 
     def map_jobs(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results of a function (importable by name), in the order of its arguments."""
-        found: dict[int, Result] = {}
+        results: dict[int, Result] = {}
         following = 0
-        for index, result in self.done(function, enumerate(jobs)):
-            found[index] = result
-            while following in found:
-                yield found.pop(following)
+        for index, result in self.run_jobs(function, enumerate(jobs)):
+            results[index] = result
+            while following in results:
+                yield results.pop(following)
                 following += 1
 
-    def done(
-        self, function: Callable[[Job], Result], jobs: Iterable[tuple[Any, Job]], look: Callable[[], object] = lambda: None
+    def run_jobs(
+        self, function: Callable[[Job], Result], jobs: Iterable[tuple[Any, Job]], poll: Callable[[], object] = lambda: None
     ) -> Iterator[tuple[Any, Result]]:
-        """Names and results of named jobs as they are done, the first ones begun first; a job whose worker is lost is done
-        anew by another. `jobs` are taken from as they are needed, and `look` is called every so often meanwhile.
+        """Run named jobs on the workers, and yield the name and result of each job that has ended.
+
+        Jobs begin in their order; if a worker is lost, another one runs its job again. `jobs` is read as workers become
+        free, and `poll` is called from time to time meanwhile.
 
         Raises:
             InputError, NoResult: of a job, of workers that cannot run one, or where the scheduler is lost.
@@ -81,12 +83,12 @@ class Cluster:
 
         waiting, begun = iter(jobs), {}
         finished = as_completed(loop=self._client.loop)
-        most, counted = 0, -_COUNT
+        most, counted = 0, -_COUNT_SECONDS
         try:
             while True:
                 if self._client.status != "running":
                     raise NoResult(_LOST)
-                if time.monotonic() - counted > _COUNT:
+                if time.monotonic() - counted > _COUNT_SECONDS:
                     most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
@@ -100,9 +102,9 @@ class Cluster:
                 for future in batch:
                     name, _ = begun.pop(future.key)
                     yield name, self._result(future)
-                look()
+                poll()
                 if not batch:
-                    time.sleep(_LOOK)
+                    time.sleep(_POLL_SECONDS)
         finally:
             if begun and self._client.status == "running":
                 self._client.cancel([future for _, future in begun.values()], force=True)
@@ -189,7 +191,7 @@ def connect(scheduler: Scheduler) -> Iterator[Cluster | None]:
         return
     file, address = (scheduler, None) if scheduler.endswith(".json") else (None, scheduler)
     try:
-        client = Client(address, scheduler_file=file, timeout=_ANSWER, set_as_default=False)
+        client = Client(address, scheduler_file=file, timeout=_ANSWER_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"--scheduler {scheduler}: no Dask scheduler answers there ({str(error).partition(chr(10))[0][:120]}); "

@@ -163,12 +163,14 @@ def _describe_study(study: "Status") -> list[str]:
         lines.append(f"  {study.damaged} damaged files are kept in {study.folder / 'damaged'}")
     if study.finished and study.complete:
         return [*lines, "  finished"]
-    rate, left = study.parts_per_second, study.remaining
+    rate, remaining = study.parts_per_second, study.remaining_seconds
     speed = f", {60.0 * rate:.3g} parts a minute" if rate else ""
     if study.complete:
         lines.append("  all parts are there; 'jaxbl sweep' on it reads them and writes the report")
     elif study.held_by:
-        lines.append(f"  {study.held_by} is at work{speed}{'' if left is None else f', {format_duration(left)} left'}")
+        lines.append(
+            f"  {study.held_by} is at work{speed}{'' if remaining is None else f', {format_duration(remaining)} left'}"
+        )
     else:
         lines.append(f"  no process is at work in it{speed and f' (it went at{speed[1:]})'}; 'jaxbl sweep' goes on")
     return lines

@@ -1,6 +1,6 @@
-"""Chunks of a study on a cluster: bundles that take a worker long enough, so that a large study is thousands of jobs.
+"""Computes the chunks of a study on a cluster, in bundles, so that the largest study is some thousands of jobs.
 
-Workers write parts into the study's folder themselves, and leave out what is there: a bundle may be done twice.
+Workers write parts into the study's folder, and leave out the chunks that are stored: a bundle may be computed twice.
 """
 
 import functools
@@ -18,23 +18,31 @@ from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .programs import Backend, Layout
-from .run import Run, RunTotals
+from .run import RunTotals, StudyRun
 from .store import Store, load_config
 
-_SECONDS = 20.0
-"""Of a bundle: a scheduler spends some 1 ms on one, and what a lost worker has begun is lost."""
-_MOST = 50_000
-"""Bundles of a study: a scheduler keeps some 6 kB of each, and is slow above 100 000 (Dask's distributed#3691, #3898)."""
-_TURNS = 4
-"""Bundles that each worker gets at least: they end together then."""
-_LOOK = 2.0
-"""Seconds between two looks at the parts that exist."""
-_SEEN = 30.0
-"""Seconds until a part that a worker has written is seen here: network file systems remember what was not there."""
+_BUNDLE_SECONDS = 20.0
+"""Time of a bundle: a scheduler spends some 1 ms on one, and the bundle that a lost worker has begun is lost."""
+_MAX_BUNDLES = 50_000
+"""Bundles of a study: a scheduler holds some 6 kB of each, and is slow above 100 000 (Dask's distributed#3691, #3898)."""
+_BUNDLES_PER_WORKER = 4
+"""Least number of bundles for each worker, so that the workers end together."""
+_POLL_SECONDS = 2.0
+"""Time between two counts of the stored parts."""
+_DELAY_SECONDS = 30.0
+"""Time until a file that another machine has written is seen: a network file system remembers that it was not there."""
 
 
 class Bundle(NamedTuple):
-    """Chunks for a worker, by their indices, or themselves where they are of a refined study."""
+    """Chunks that a worker computes.
+
+    Attributes:
+        folder: folder of the study.
+        identity: identity of the study in its manifest.
+        layout, backend: layout and backend of the store.
+        require_backend: refuse a study that the fused loop cannot run.
+        chunks: indices of the chunks; of a refined study, the chunks themselves.
+    """
 
     folder: str
     identity: str
@@ -45,17 +53,17 @@ class Bundle(NamedTuple):
 
 
 class _BundleResult(NamedTuple):
-    """What a worker has done of a bundle: checksums of its parts by index."""
+    """Checksums of the parts of a bundle by index, totals of its run, and the worker's host."""
 
     checksums: dict[int, str]
-    work: RunTotals
+    totals: RunTotals
     host: str
 
 
-class ClusterRun(Run):
+class ClusterRun(StudyRun):
     """A run whose chunks are computed by a cluster's workers.
 
-    Raises, where a :class:`Run` does not:
+    Raises, where a :class:`StudyRun` does not:
         InputError: workers do not see the store's folder, or cannot run the study.
         NoResult: the cluster is lost.
     """
@@ -63,73 +71,80 @@ class ClusterRun(Run):
     def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None):
         super().__init__(engine, store, progress)
         self._cluster = cluster
-        self._next_look = time.monotonic() + _LOOK
+        self._next_poll = time.monotonic() + _POLL_SECONDS
 
-    def ensure(self, chunks: Iterable[Chunk]) -> None:
+    def compute_missing(self, chunks: Iterable[Chunk]) -> None:
         missing: list[int | Chunk] = []
         for chunk in chunks:
-            if self.is_there(chunk):
-                self.count(chunk)
+            if self.has_chunk(chunk):
+                self.count_chunk(chunk)
             else:
                 # the points of all chunks would be 8 GB in a study of 10^9
                 missing.append(chunk.index if self.engine.points.refinement is None else chunk)
-        # one chunk a worker says how long one takes
-        first, before = self._cluster.workers, self.work.run_seconds
-        self._wave(missing[:first], 1)
-        rest = missing[first:]
-        self._wave(rest, _bundle_size((self.work.run_seconds - before) / first, len(rest), self._cluster.workers))
+        # the first chunks, one for each worker, show how long a chunk takes
+        first, before = self._cluster.workers, self.totals.run_seconds
+        self._compute_bundles(missing[:first], 1)
+        size = _bundle_size((self.totals.run_seconds - before) / first, len(missing[first:]), self._cluster.workers)
+        self._compute_bundles(missing[first:], size)
 
-    def _wave(self, chunks: Sequence[int | Chunk], size: int) -> None:
-        for part, done in self._cluster.done(compute_bundle, _bundles(self.engine, self.kept, chunks, size), self._look):
-            for one in part:
-                chunk = self.engine.chunk(one) if isinstance(one, int) else one
-                _wait_for(self.kept.part_path(chunk.index), done.host)
-                self.count(chunk)
-            self.kept.add_checksums(done.checksums)
-            self.elsewhere += done.work
+    def _compute_bundles(self, chunks: Sequence[int | Chunk], size: int) -> None:
+        """Have workers compute chunks, in bundles of a size."""
+        bundles = _make_bundles(self.engine, self.store, chunks, size)
+        named_jobs = ((bundle, bundle) for bundle in bundles)
+        for bundle, result in self._cluster.run_jobs(compute_bundle, named_jobs, self._poll_parts):
+            for chunk in _chunks_of(self.engine, bundle):
+                _wait_for_part(self.store.part_path(chunk.index), result.host)
+                self.count_chunk(chunk)
+            self.store.add_checksums(result.checksums)
+            self.worker_totals += result.totals
 
-    def _look(self) -> None:
-        """Tell progress by the parts that exist: bundles take long."""
-        if time.monotonic() > self._next_look:
+    def _poll_parts(self) -> None:
+        """Report progress by the number of stored parts, since a bundle takes long."""
+        if time.monotonic() > self._next_poll:
             start = time.monotonic()
-            self.tell(len(self.kept.list_part_files()))
+            self.report_progress(len(self.store.list_part_files()))
             # a list of 300 000 files takes seconds
-            self._next_look = time.monotonic() + max(_LOOK, 10.0 * (time.monotonic() - start))
+            self._next_poll = time.monotonic() + max(_POLL_SECONDS, 10.0 * (time.monotonic() - start))
 
 
 def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
-    """Have all chunks of a study computed that are missing, without waiting for more than the first. Raises as
-    :class:`ClusterRun`."""
+    """Have a cluster compute all missing chunks of a study, and wait for the first one only.
+
+    Raises as :class:`ClusterRun`.
+    """
     missing = [index for index in engine.chunk_order() if not store.has_part(index)]
     seconds = 0.0
-    for _, done in cluster.done(compute_bundle, _bundles(engine, store, missing[:1], 1)):
-        seconds = done.work.run_seconds
-    rest = missing[1:]
-    size = _bundle_size(seconds, len(rest), cluster.workers)
-    cluster.submit_jobs(compute_bundle, [bundle for _, bundle in _bundles(engine, store, rest, size)])
+    for result in cluster.map_jobs(compute_bundle, _make_bundles(engine, store, missing[:1], 1)):
+        seconds = result.totals.run_seconds
+    size = _bundle_size(seconds, len(missing[1:]), cluster.workers)
+    cluster.submit_jobs(compute_bundle, list(_make_bundles(engine, store, missing[1:], size)))
 
 
 def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
-    """Chunks of a bundle, where one takes so long and so many are left."""
-    by_time = int(_SECONDS / max(seconds, 1e-3))
-    return max(min(by_time, math.ceil(chunks / (workers * _TURNS))), math.ceil(chunks / _MOST), 1)
+    """Number of chunks of a bundle, if a chunk takes so many seconds and so many chunks are missing."""
+    by_time = int(_BUNDLE_SECONDS / max(seconds, 1e-3))
+    by_worker = math.ceil(chunks / (workers * _BUNDLES_PER_WORKER))
+    return max(min(by_time, by_worker), math.ceil(chunks / _MAX_BUNDLES), 1)
 
 
-def _bundles(
-    engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int
-) -> Iterator[tuple[Sequence[int | Chunk], Bundle]]:
-    """Chunks, `size` of them at once, with what a worker needs to know."""
+def _make_bundles(engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
+    """Make bundles of `size` chunks each."""
     folder = store.folder if is_remote(store.folder) else store.folder.absolute()
-    about = str(folder), store.manifest["identity"], store.layout, store.backend, engine.require_backend
+    empty = Bundle(str(folder), store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
     for first in range(0, len(chunks), size):
-        part = chunks[first : first + size]
-        yield part, Bundle(*about, tuple(part))
+        yield empty._replace(chunks=tuple(chunks[first : first + size]))
 
 
-def _wait_for(part: Path, host: str) -> None:
-    latest = time.monotonic() + _SEEN
+def _chunks_of(engine: Engine, bundle: Bundle) -> list[Chunk]:
+    """The chunks of a bundle."""
+    return [engine.chunk(chunk) if isinstance(chunk, int) else chunk for chunk in bundle.chunks]
+
+
+def _wait_for_part(part: Path, host: str) -> None:
+    """Wait until a part that a worker has written is seen here. Raises `InputError` if it is not."""
+    deadline = time.monotonic() + _DELAY_SECONDS
     while not part.exists():
-        if time.monotonic() > latest:
+        if time.monotonic() > deadline:
             raise InputError(
                 f"{part}: was written by worker {host}, and is not seen here; --out should name a folder that all machines "
                 "share"
@@ -138,23 +153,24 @@ def _wait_for(part: Path, host: str) -> None:
 
 
 def compute_bundle(bundle: Bundle) -> _BundleResult:
-    """Compute the chunks of a bundle that are not there, on a worker."""
+    """Compute the chunks of a bundle that are not stored; called on a worker."""
     folder, host = to_path(bundle.folder), socket.gethostname()
     if not (folder / "manifest.json").exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
-    with lock_folder(folder, shared=True, wait=_SEEN):
+    with lock_folder(folder, shared=True, wait=_DELAY_SECONDS):
         store = Store.open(folder, keeps_manifest=False)
         if store.manifest["identity"] != bundle.identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
-        engine = _engine(*bundle[:-1])
+        engine = _cached_engine(*bundle[:-1])
         engine.compile_seconds = engine.run_seconds = 0.0
-        run = Run(engine, store)
-        run.ensure(engine.chunk(one) if isinstance(one, int) else one for one in bundle.chunks)
-    indices = [one if isinstance(one, int) else one.index for one in bundle.chunks]
-    return _BundleResult({index: store.manifest["checksums"][str(index)] for index in indices}, run.work, host)
+        run = StudyRun(engine, store)
+        chunks = _chunks_of(engine, bundle)
+        run.compute_missing(chunks)
+    checksums = {chunk.index: store.manifest["checksums"][str(chunk.index)] for chunk in chunks}
+    return _BundleResult(checksums, run.totals, host)
 
 
 @functools.lru_cache(maxsize=2)
-def _engine(folder: str, identity: str, layout: Layout, backend: Backend, require_backend: bool) -> Engine:
-    """The engine of a study, with its compiled programs, from one bundle to the next."""
+def _cached_engine(folder: str, identity: str, layout: Layout, backend: Backend, require_backend: bool) -> Engine:
+    """The engine of a study; the next bundle of the study gets the same one, with its compiled programs."""
     return Engine(load_config(to_path(folder)), layout, backend=backend, require_backend=require_backend)

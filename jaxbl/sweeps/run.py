@@ -1,4 +1,4 @@
-"""A study's chunks, one after the other or on a cluster, those that are stored already left out."""
+"""Computes the chunks of a study that are not stored yet."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,8 +18,8 @@ from .engine import Chunk, Engine
 from .refine import refine_boundary
 from .store import Store, claim_folder
 
-_PREPARED = 60.0
-"""Seconds to wait for another process that prepares the folder."""
+_PREPARATION_SECONDS = 60.0
+"""Longest wait for another process that prepares the folder."""
 
 
 def open_or_create_store(
@@ -42,16 +42,17 @@ def open_or_create_store(
     config = engine.config
     claim_folder(folder, config, overwrite=overwrite)
     store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-    engine = _engine_for(store, engine, require_backend)
+    engine = _match_engine(store, engine, require_backend)
     if engine.points.refinement is not None:
         store.count_parts()
     elif store.manifest["parts"] != len(engine):
-        # the manifest was lost, and begun anew for other chunks
+        # the manifest was lost, and written anew for chunks of another shape
         store.update_manifest(parts=len(engine))
     return engine, store
 
 
-def _engine_for(store: Store, engine: Engine, require_backend: bool) -> Engine:
+def _match_engine(store: Store, engine: Engine, require_backend: bool) -> Engine:
+    """Return an engine with a store's layout and backend."""
     if require_backend and store.backend != engine.backend and not store.manifest["finished"]:
         raise InputError(
             f"{store.folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
@@ -63,29 +64,40 @@ def _engine_for(store: Store, engine: Engine, require_backend: bool) -> Engine:
 
 @contextmanager
 def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterator[tuple[Engine, Store]]:
-    """A folder into which other processes may write parts of the same study, begun by whichever is first: the engine for it,
-    and its store, which leaves the manifest alone. Raises as :func:`open_or_create_store`."""
-    latest = time.monotonic() + _PREPARED
+    """Open the store of a study whose parts several processes write; the first of them creates it.
+
+    Yields an engine with the store's layout and backend, and the store, which does not write the manifest. Raises as
+    :func:`open_or_create_store`.
+    """
+    deadline = time.monotonic() + _PREPARATION_SECONDS
     while True:
         with suppress(FolderInUse), lock_folder(folder):
             open_or_create_store(folder, engine, require_backend=require_backend)
-        with ExitStack() as held:
+        with ExitStack() as lock:
             try:
-                held.enter_context(lock_folder(folder, shared=True))
+                lock.enter_context(lock_folder(folder, shared=True))
             except FolderInUse:
-                # another one prepares it, or has it for itself
-                if time.monotonic() > latest:
+                # another process prepares the folder, or has it for itself
+                if time.monotonic() > deadline:
                     raise
             else:
                 claim_folder(folder, engine.config, alone=False)
                 store = Store.open(folder, keeps_manifest=False)
-                yield _engine_for(store, engine, require_backend), store
+                yield _match_engine(store, engine, require_backend), store
                 return
         time.sleep(0.1)
 
 
 class RunTotals(NamedTuple):
-    """What was computed: lanes, seconds of compilation and of computing, what the fused loop did not know, damaged parts."""
+    """Totals of a run.
+
+    Attributes:
+        lanes: number of lanes that were computed.
+        compile_seconds: time of compilations, s.
+        run_seconds: time of computing, s.
+        fallback_reasons: what the fused loop does not support, of groups that the scan computed in its place.
+        damaged: a sentence for each damaged part.
+    """
 
     lanes: int = 0
     compile_seconds: float = 0.0
@@ -94,30 +106,29 @@ class RunTotals(NamedTuple):
     damaged: tuple[str, ...] = ()
 
     def __add__(self, other: Any) -> "RunTotals":
-        sums = (self.lanes + other.lanes, self.compile_seconds + other.compile_seconds, self.run_seconds + other.run_seconds)
-        return RunTotals(
-            *sums, tuple(dict.fromkeys(self.fallback_reasons + other.fallback_reasons)), self.damaged + other.damaged
-        )
+        sums = [a + b for a, b in zip(self, other, strict=True)]
+        totals = RunTotals(*sums)
+        return totals._replace(fallback_reasons=tuple(dict.fromkeys(totals.fallback_reasons)))
 
 
-class Run:
-    """Chunk after chunk of a study.
+class StudyRun:
+    """Computes the chunks of a study that are not stored, one after the other.
 
     Args:
-        engine: computes them.
-        store: keeps them; left out, memory.
-        progress: hears finished and total lanes.
-        indices: of the chunks to be computed, in their order; left out, all.
+        engine: computes a chunk.
+        store: stores the chunks; left out, they stay in memory.
+        progress: called with finished and total lanes.
+        indices: indices of the chunks to compute, in their order; left out, all chunks of the study.
 
     Attributes:
-        elsewhere: what workers have computed.
+        worker_totals: totals of the workers of a cluster.
     """
 
     def __init__(
         self, engine: Engine, store: Store | None, progress: Progress | None = None, indices: Sequence[int] | None = None
     ):
         self.engine, self.progress = engine, progress
-        self.elsewhere = RunTotals()
+        self.worker_totals = RunTotals()
         self._lanes = 0
         self._store, self._indices = store, indices
         self._frames: dict[int, pd.DataFrame] = {}
@@ -125,15 +136,15 @@ class Run:
         self._chunks, self._total = len(engine), engine.rows
 
     @property
-    def work(self) -> RunTotals:
-        """What was computed, here and by workers."""
+    def totals(self) -> RunTotals:
+        """Totals of this process and of the workers."""
         engine, damaged = self.engine, () if self._store is None else tuple(self._store.damaged)
-        own = RunTotals(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.fallback_reasons), damaged)
-        return own + self.elsewhere
+        totals = RunTotals(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.fallback_reasons), damaged)
+        return totals + self.worker_totals
 
     @property
-    def kept(self) -> Store:
-        """The store."""
+    def store(self) -> Store:
+        """The store of a run that has one."""
         assert self._store is not None
         return self._store
 
@@ -141,48 +152,50 @@ class Run:
         """All rows of a run without a store."""
         return pd.concat([self._frames[index] for index in sorted(self._frames)], ignore_index=True)
 
-    def all(self) -> None:
-        """Run the whole study, or the chunks that were asked for."""
+    def compute_all(self) -> None:
+        """Compute the whole study, or the chunks that were asked for."""
         if self.engine.points.refinement is None:
             if self._indices is not None:
                 self._chunks, self._total = len(self._indices), sum(map(self.engine.count_lanes, self._indices))
-            self.ensure(map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices))
+            self.compute_missing(
+                map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices)
+            )
             return
         for group in range(len(self.engine.points.groups)):
             self._refine(group)
         if self._store is not None:
             self._store.set_final_totals(self._chunks, self._total)
 
-    def finish(self) -> None:
-        """Say in the manifest that all is there."""
-        work = self.work
-        if work.lanes or not self.kept.manifest["finished"]:
-            self.kept.update_manifest(finished=True, seconds={"compile": work.compile_seconds, "run": work.run_seconds})
+    def mark_finished(self) -> None:
+        """Write into the manifest that all parts are stored."""
+        totals = self.totals
+        if totals.lanes or not self.store.manifest["finished"]:
+            self.store.update_manifest(finished=True, seconds={"compile": totals.compile_seconds, "run": totals.run_seconds})
 
     def _refine(self, group: int) -> None:
-        """The coarse grid of a group, and what its boundaries need."""
+        """Compute the coarse grid of a group, and the points that refine its boundaries."""
         assert self.engine.points.refinement is not None
         _, grid, criterion = self.engine.points.refinement
         columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
-        expected = self.engine.points.coarse_size
+        counted = self.engine.points.coarse_size
 
         def evaluate(points: np.ndarray) -> np.ndarray:
-            nonlocal expected
-            # the coarse grid is counted from the start
-            self._total += (len(points) - expected) * seeds
-            self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(expected)
-            expected = 0
+            nonlocal counted
+            # the totals count the coarse grid from the start
+            self._total += (len(points) - counted) * seeds
+            self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(counted)
+            counted = 0
             if self._store is not None:
                 self._store.raise_totals(self._chunks, self._total)
             chunks = self.engine.split_points(group, points, self._next)
             self._next += len(chunks)
-            self.ensure(chunks)
+            self.compute_missing(chunks)
             values = np.empty((seeds, len(points), len(columns)))
             row = column = 0
             for chunk in chunks:
                 shape = (len(chunk.seeds), len(chunk.points), len(columns))
-                found = self._read(chunk, columns)[columns].to_numpy(float).reshape(shape)
-                values[row : row + shape[0], column : column + shape[1]] = found
+                metrics = self._read_columns(chunk, columns)[columns].to_numpy(float).reshape(shape)
+                values[row : row + shape[0], column : column + shape[1]] = metrics
                 column += shape[1]
                 if column == len(points):
                     row, column = row + shape[0], 0
@@ -190,60 +203,62 @@ class Run:
 
         refine_boundary(grid, evaluate, criterion.disagree)
 
-    def ensure(self, chunks: Iterable[Chunk]) -> None:
-        """Have chunks computed that are not there; one is written while the next one is computed. What was computed is
-        written also where an interrupt ends this."""
+    def compute_missing(self, chunks: Iterable[Chunk]) -> None:
+        """Compute the chunks that are not stored; each is written while the next one is computed.
+
+        If an interrupt ends this, the chunks that were computed are written first.
+        """
         written: tuple[Chunk, Future[str]] | None = None
         with ThreadPoolExecutor(1) as writer:
             for chunk in chunks:
-                if self.is_there(chunk):
-                    self.count(chunk)
+                if self.has_chunk(chunk):
+                    self.count_chunk(chunk)
                     continue
                 frame = self.engine.run(chunk)
                 self._lanes += len(frame)
                 if self._store is None:
                     self._frames[chunk.index] = frame
-                    self.count(chunk)
+                    self.count_chunk(chunk)
                     continue
                 before, written = written, (chunk, writer.submit(self._store.write_part, chunk.index, frame))
-                # frames are large: one waits at most
-                self._keep(before)
-            self._keep(written)
+                # frames are large: at most one waits to be written
+                self._await_part(before)
+            self._await_part(written)
 
-    def _keep(self, written: tuple[Chunk, Future[str]] | None) -> None:
-        """Count a part that is being written, once it is."""
+    def _await_part(self, written: tuple[Chunk, Future[str]] | None) -> None:
+        """Wait until the part of a chunk is written, and count the chunk."""
         if written is not None:
             chunk, checksum = written
-            self.kept.add_checksums({chunk.index: checksum.result()})
-            self.count(chunk)
+            self.store.add_checksums({chunk.index: checksum.result()})
+            self.count_chunk(chunk)
 
-    def is_there(self, chunk: Chunk) -> bool:
-        """Whether a chunk is stored whole; of a refined study, also whether it has the points that are due."""
+    def has_chunk(self, chunk: Chunk) -> bool:
+        """True if the part of a chunk is stored and whole; in a refined study also only if it has the chunk's points."""
         if self._store is None or not self._store.has_part(chunk.index):
             return False
-        return self.engine.points.refinement is None or self._stored(chunk, []) is not None
+        return self.engine.points.refinement is None or self._read_part(chunk, []) is not None
 
-    def _stored(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame | None:
-        return self.kept.read_part(chunk.index, self.engine.row_labels(chunk), columns)
+    def _read_part(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame | None:
+        return self.store.read_part(chunk.index, self.engine.row_labels(chunk), columns)
 
-    def _read(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame:
-        """Some columns of a chunk that is there."""
+    def _read_columns(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame:
+        """Read columns of a chunk that is computed."""
         if self._store is None:
             return self._frames[chunk.index]
-        frame = self._stored(chunk, columns)
+        frame = self._read_part(chunk, columns)
         if frame is None:
             raise InputError(
                 f"{self._store.part_path(chunk.index)}: was changed by another process; run the same command again"
             )
         return frame
 
-    def count(self, chunk: Chunk) -> None:
-        """Say that a chunk is there."""
+    def count_chunk(self, chunk: Chunk) -> None:
+        """Count the lanes of a chunk as done, and report progress."""
         self._done += len(chunk.seeds) * len(chunk.points)
-        self.tell()
+        self.report_progress()
 
-    def tell(self, parts: int = 0) -> None:
-        """Tell progress what is done, also by the number of parts that exist."""
+    def report_progress(self, parts: int = 0) -> None:
+        """Report the lanes that are done: those that were counted, or more if so many parts are stored."""
         if self.progress:
-            there = parts * self._total // max(self._chunks, 1)
-            self.progress(min(max(self._done, there), self._total), self._total)
+            stored = parts * self._total // max(self._chunks, 1)
+            self.progress(min(max(self._done, stored), self._total), self._total)

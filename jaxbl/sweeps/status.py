@@ -1,4 +1,4 @@
-"""How far a study is, by the parts that exist."""
+"""Progress of a study, by the parts that are stored."""
 
 import dataclasses
 from pathlib import Path
@@ -9,22 +9,24 @@ from jaxbl.files import list_paths, lock_holder, to_path
 
 from .store import Store
 
-_RECENT = 600.0
-"""Seconds before the last part whose parts say how fast it goes."""
+_RATE_SECONDS = 600.0
+"""Time before the last part over which the rate is measured."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """How far a study is.
+    """Progress of a study.
 
     Attributes:
-        folder: of the study; its `title`.
-        parts: that exist, of `parts_in_all`, of which a refined study knows its last only at the end.
-        runs: in all of them.
-        finished: whether a command has seen that all are there.
-        damaged: files that were kept aside.
-        held_by: process that writes into the folder, its host and since when; one of them where several do.
-        parts_per_second: rate of the last ten minutes that had parts; 0 where fewer than two say.
+        folder: folder of the study.
+        title: title of the study.
+        parts: number of stored parts.
+        parts_in_all: number of parts that the study will have; it grows while a refined study runs.
+        runs: number of runs of all these parts.
+        finished: True if a command has checked that all parts are stored.
+        damaged: number of damaged files in `damaged/`.
+        held_by: a process that writes into the folder, with its host and start; empty if there is none.
+        parts_per_second: rate over ten minutes before the last part; 0 with fewer than two parts.
     """
 
     folder: Path
@@ -39,23 +41,23 @@ class Status:
 
     @property
     def complete(self) -> bool:
-        """Whether all parts exist."""
+        """True if all parts are stored."""
         return self.parts >= self.parts_in_all
 
     @property
-    def remaining(self) -> float | None:
-        """Seconds that the missing parts take at this rate, if they are computed now; None where that is not known."""
+    def remaining_seconds(self) -> float | None:
+        """Seconds that the missing parts take at this rate; None if the rate is not known."""
         if self.complete:
             return 0.0
         return (self.parts_in_all - self.parts) / self.parts_per_second if self.parts_per_second else None
 
 
 def status(folder: str | Path) -> Status:
-    """How far the study in a folder is. Raises `InputError` where there is none."""
+    """Return the progress of the study in a folder. Raises `InputError` if there is none."""
     folder = to_path(folder)
     store = Store.open(folder)
     times = np.sort([path.stat().st_mtime for path in store.list_part_files()])
-    recent = times[times > times[-1] - _RECENT] if len(times) else times
+    recent = times[times > times[-1] - _RATE_SECONDS] if len(times) else times
     span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
     return Status(
         folder=folder,
@@ -71,10 +73,13 @@ def status(folder: str | Path) -> Status:
 
 
 def list_statuses(folder: str | Path) -> list[Status]:
-    """How far the study in a folder is, and those that `verify` and `tune` run for it. Raises `InputError` where there is
-    none."""
+    """Return the progress of the study in a folder, and of the stages that `verify` and `tune` run for it.
+
+    Raises:
+        InputError: the folder holds no study.
+    """
     folder = to_path(folder)
-    found = (list_paths(folder, f"{command}/*/manifest.json") for command in ("verify", "tune"))
-    stages = [path.parent for paths in found for path in paths]
-    own = [folder] if (folder / "manifest.json").exists() or not stages else []
-    return [status(one) for one in [*own, *stages]]
+    studies = [path.parent for command in ("verify", "tune") for path in list_paths(folder, f"{command}/*/manifest.json")]
+    if (folder / "manifest.json").exists() or not studies:
+        studies.insert(0, folder)
+    return [status(study) for study in studies]

@@ -21,7 +21,7 @@ from .bundles import ClusterRun, submit_chunks
 from .engine import Engine, SweepEstimate
 from .metrics import find_metric
 from .programs import Backend
-from .run import Run, join_store, open_or_create_store
+from .run import StudyRun, join_store, open_or_create_store
 from .status import Status, status
 from .store import Store, load_config
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 
-_LET_GO = 60.0
-"""Seconds in which workers end what they have begun, and let go of the folder: also those of a client that was lost."""
-_MOST_NUMBERS = 2e8
-"""Of a dataset that is mostly empty: 1.6 GB."""
+_RELEASE_SECONDS = 60.0
+"""Longest time until workers, also those of a client that was lost, have ended their jobs and released the folder."""
+_MAX_GRID_NUMBERS = 2e8
+"""Largest number of values of a dataset that is mostly empty: 1.6 GB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,10 +42,10 @@ class StudyResult:
 
     Attributes:
         config: the study.
-        cost: seconds of compilation and of computing, and lanes computed in this call.
-        source: where the rows are: a folder, or memory.
-        scanned: what the fused loop did not know of groups that this call scanned in its place.
-        damaged: parts that this call found damaged, kept aside and computed anew.
+        source: the rows: the store of a folder, or a frame in memory.
+        cost: seconds of compilation and of computing, and number of lanes, that this call took.
+        fallback_reasons: what the fused loop does not support, of groups that the scan computed in its place.
+        damaged: a sentence for each damaged part that this call moved to `damaged/` and computed anew.
     """
 
     config: Config
@@ -56,7 +56,7 @@ class StudyResult:
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:
-        """One row a point and seed: axis paths, `seed`, metrics (columns and units: docs/reference.md)."""
+        """A row for each point and seed: axis paths, `seed`, metrics (columns and units: docs/reference.md)."""
         return self.read()
 
     @property
@@ -65,55 +65,56 @@ class StudyResult:
         return self.source.columns() if isinstance(self.source, Store) else list(self.source.columns)
 
     def is_finished(self, rows: int) -> bool:
-        """Whether so many rows are all that the study has."""
+        """True if a number of rows is all that the study has."""
         if not isinstance(self.source, Store):
             return True
         manifest = self.source.manifest
-        # a refined study knows at the end how many it has
+        # a refined study has its number of rows only at the end
         return rows >= manifest["rows"] and (manifest["finished"] or self.config.sweep.refine is None)
 
     @property
     def runs(self) -> int:
-        """Number of rows that the study has; of an unfinished one, that it will have."""
+        """Number of rows of the finished study."""
         return self.source.manifest["rows"] if isinstance(self.source, Store) else len(self.source)
 
     def batches(self, columns: Iterable[str] | None = None, filters: Sequence[Any] | None = None) -> Iterator[pd.DataFrame]:
-        """Rows part by part, in the memory of one part; all columns, or some.
+        """Yield the rows part by part: only one part is in memory at a time.
 
         Args:
-            columns: names; left out, all.
-            filters: which rows, as of `pandas.read_parquet`: tuples such as `("encoders.noise", "<", 1e-3)` that all
-                have to hold, or lists of such, of which one has to.
+            columns: names of columns; left out, all.
+            filters: conditions on the rows, as for `pandas.read_parquet`: tuples such as `("encoders.noise", "<", 1e-3)`
+                that must all hold, or lists of such tuples, of which one must hold.
 
         Raises:
             InputError: a part is damaged, or not of this study.
         """
         names = self.columns if columns is None else list(dict.fromkeys(columns))
-        given: Any = filters or []
-        conditions = [one for group in given for one in (group if isinstance(group, list) else [group])]
-        needed = list(dict.fromkeys([*names, *(condition[0] for condition in conditions)]))
-        source = self.source.batches(needed) if isinstance(self.source, Store) else [self.source]
-        for frame in source:
+        groups: Any = filters or []
+        conditions = [condition for group in groups for condition in (group if isinstance(group, list) else [group])]
+        needed = list(dict.fromkeys([*names, *(path for path, *_ in conditions)]))
+        for frame in self.source.batches(needed) if isinstance(self.source, Store) else [self.source]:
             if filters:
-                found = pa.Table.from_pandas(frame.loc[:, needed], preserve_index=False)
-                frame = found.filter(filters_to_expression(given)).to_pandas()
+                table = pa.Table.from_pandas(frame.loc[:, needed], preserve_index=False)
+                frame = table.filter(filters_to_expression(groups)).to_pandas()
             yield frame.loc[:, names]
 
     def read(self, columns: Iterable[str] | None = None, filters: Sequence[Any] | None = None) -> pd.DataFrame:
-        """Some columns or rows of the frame, read for this call: a large study need not fit into memory whole. Arguments and
-        errors are those of :meth:`batches`."""
+        """Read some columns or rows of the frame; the other ones are not held in memory.
+
+        Arguments and errors are those of :meth:`batches`.
+        """
         if columns is None and filters is None and not isinstance(self.source, Store):
             return self.source
         return pd.concat(self.batches(columns, filters), ignore_index=True)
 
     def dataset(self, *, check: bool = True) -> "Dataset":
-        """The rows as a dataset of pyarrow, which reads what is asked of it: columns, rows by predicates, batches.
+        """The rows as a dataset of pyarrow, which reads columns, rows by predicates, or batches on request.
 
         pyarrow compares each page that it reads with its checksum.
 
         Args:
-            check: compare each file with its checksum in the manifest first (about a second a GB); otherwise only what each
-                part says of itself is looked at, and damage to a file's index of its rows may pass.
+            check: compare each file with its checksum in the manifest first (about a second a GB); otherwise only the header
+                of each part is checked, and damage to a file's index of its rows may pass.
 
         Raises:
             InputError: a part is damaged, or not of this study.
@@ -127,35 +128,35 @@ class StudyResult:
     def to_xarray(self) -> "xarray.Dataset":
         """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
 
-        Of a refined study it has every value of an axis that occurs, and NaN where no point was simulated (`converged` and
+        For a refined study it has all axis values that occur, and NaN at points that were not simulated (`converged` and
         `finite` are then 1, 0 or NaN).
 
         Raises:
-            ValueError: a quasi-random design, which has no grid; a refined study with too large a one.
+            ValueError: the study has no grid, as its design is quasi-random, or it is refined and its grid is too large.
         """
         import xarray
 
         if self.config.sweep.design != "grid":
             raise ValueError(f"a {self.config.sweep.design} design has no grid; use the frame")
-        along: dict[str, list[str]] = {}
+        dims: dict[str, list[str]] = {}
         for axis in self.config.axes:
-            along.setdefault(axis.zip or axis.path, []).append(axis.path)
-        zipped = {dim: paths for dim, paths in along.items() if paths != [dim]}
+            dims.setdefault(axis.zip or axis.path, []).append(axis.path)
+        zipped = {dim: paths for dim, paths in dims.items() if paths != [dim]}
         frame = self.frame.copy(deep=False)
         for dim, paths in zipped.items():
             frame[dim] = frame.groupby(paths, sort=False).ngroup()
         if self.config.sweep.refine is not None:
-            size = math.prod(len(frame[dim].unique()) for dim in [*along, "seed"]) * len(frame.columns)
-            if size > _MOST_NUMBERS:
+            size = math.prod(len(frame[dim].unique()) for dim in [*dims, "seed"]) * len(frame.columns)
+            if size > _MAX_GRID_NUMBERS:
                 raise ValueError(f"the whole grid would have {size:.2g} numbers, most of them NaN; use the frame")
             frame = frame.astype(dict.fromkeys(frame.select_dtypes(bool).columns, float))
-        dataset = frame.set_index([*along, "seed"]).to_xarray()
+        dataset = frame.set_index([*dims, "seed"]).to_xarray()
         for dim, paths in zipped.items():
             first = {other: 0 for other in dataset.dims if other != dim}
             dataset = dataset.assign_coords({path: dataset[path].isel(first, drop=True) for path in paths}).drop_vars(dim)
         for name in dataset.data_vars:
-            about = find_metric(str(name))
-            dataset[name].attrs = {"units": about.unit, "long_name": about.doc}
+            metric = find_metric(str(name))
+            dataset[name].attrs = {"units": metric.unit, "long_name": metric.doc}
         assert isinstance(dataset, xarray.Dataset)
         return dataset
 
@@ -175,61 +176,68 @@ def sweep(
 
     Args:
         study: TOML file, mapping or config.
-        out: folder to keep the results in, chunk by chunk; a study that was interrupted there goes on where it stopped,
-            one that is finished is only read. Without it nothing is written.
+        out: folder for the results; a study that was interrupted there is continued, and one that is finished is only
+            read. Without a folder nothing is written.
         progress: called with finished and total lanes after each chunk; the total of a refined study grows.
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
-        backend: `fused` or `scan`; left out, the faster one here. A study that goes on keeps to that of its first chunks.
-        verify_store: read each part that is there first, column by column; otherwise only files are compared with their
+        backend: `fused` or `scan`; left out, the faster one here. A study that is continued keeps its backend.
+        verify_store: first read each stored part, column by column; otherwise only files are compared with their
             checksums.
-        scheduler: Dask cluster whose workers compute, and write into `out`, which they have to see: an address,
-            a scheduler's file, `local:N` for N processes of this machine, or a `distributed.Client`; left out, this process.
+        scheduler: Dask cluster whose workers compute and write into `out`, which they must see: an address, a scheduler's
+            file, `local:N` for N processes of this machine, or a `distributed.Client`; left out, this process computes.
 
     Raises:
-        InputError: wrong config, a folder that holds something else or that another process writes into, a part of another
-            study, a backend that cannot run the study, or no such cluster.
-        NoResult: nothing can be written any more, as the disk is full, or the cluster is lost; what was written is whole.
+        InputError: the config is wrong, the folder holds something else or another process writes into it, a part is of
+            another study, the backend cannot run the study, or no cluster answers.
+        NoResult: the disk is full, or the cluster is lost; parts that were written are whole.
     """
-    config = read_config(study)
-    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
+    engine = _make_engine(study, backend, devices)
     if out is None:
         if scheduler is not None:
             raise InputError("--scheduler: its workers write into a folder; name it with --out")
         if backend == "fused":
             engine.compile_all()
-        run = Run(engine, None, progress)
-        run.all()
-        return _result(run, run.frame())
+        run = StudyRun(engine, None, progress)
+        run.compute_all()
+        return _make_result(run, run.frame())
     folder = to_path(out)
     if backend == "fused" and not (folder / "manifest.json").exists():
-        # refused, if it is, before anything is written
+        # a backend that cannot run the study is refused before anything is written
         engine.compile_all()
     with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
-        with lock_folder(folder, wait=0.0 if cluster is None else _LET_GO):
+        with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
             engine, store = open_or_create_store(folder, engine, require_backend=backend is not None, overwrite=overwrite)
             store.refuse_foreign_files()
             if verify_store:
                 store.verify()
-            run = Run(engine, store, progress) if cluster is None else ClusterRun(cluster, engine, store, progress)
             if cluster is None:
-                run.all()
-                run.finish()
+                run = StudyRun(engine, store, progress)
+                run.compute_all()
+                run.mark_finished()
+            else:
+                run = ClusterRun(cluster, engine, store, progress)
         if cluster is not None:
             with lock_folder(folder, shared=True):
-                run.all()
-            with lock_folder(folder, wait=_LET_GO):
-                # of workers that were lost
+                run.compute_all()
+            with lock_folder(folder, wait=_RELEASE_SECONDS):
+                # drafts of workers that were lost
                 remove_drafts(folder)
-                run.finish()
-    return _result(run, store)
+                run.mark_finished()
+    return _make_result(run, store)
 
 
-def _result(run: Run, source: Store | pd.DataFrame) -> StudyResult:
-    """What a run leaves."""
-    work = run.work
-    cost = {"compile_seconds": work.compile_seconds, "run_seconds": work.run_seconds, "lanes": work.lanes}
-    return StudyResult(run.engine.config, source, cost, work.fallback_reasons, work.damaged)
+def _make_engine(
+    study: str | Path | Mapping[str, Any] | Config, backend: Backend | None, devices: list[Any] | None = None
+) -> Engine:
+    """Make the engine of a study; it requires the backend if one is chosen."""
+    return Engine(read_config(study), devices=devices, backend=backend, require_backend=backend is not None)
+
+
+def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
+    totals = run.totals
+    cost = {"compile_seconds": totals.compile_seconds, "run_seconds": totals.run_seconds, "lanes": totals.lanes}
+    return StudyResult(run.engine.config, source, cost, totals.fallback_reasons, totals.damaged)
 
 
 def share(
@@ -241,7 +249,7 @@ def share(
     devices: list[Any] | None = None,
     backend: Backend | None = None,
 ) -> Status:
-    """Compute one of several shares of a study's chunks, apart from chunks that are stored already.
+    """Compute one of several shares of a study's chunks, except chunks that are stored.
 
     Other processes may compute other shares into the same folder at the same time. Once all chunks are stored,
     :func:`sweep` only reads them.
@@ -255,19 +263,15 @@ def share(
         backend: as for :func:`sweep`.
 
     Raises:
-        InputError: as for :func:`sweep`; or a refined study, whose points depend on one another.
-        NoResult: nothing can be written any more.
+        InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another.
+        NoResult: the disk is full.
     """
-    config, folder = read_config(study), to_path(out)
-    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
+    folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--share")
     number, count = portion
-    with (
-        remove_if_empty_on_error(folder),
-        join_store(folder, engine, require_backend=backend is not None) as (engine, store),
-    ):
-        run = Run(engine, store, progress, engine.chunk_order()[number - 1 :: count])
-        run.all()
+    with remove_if_empty_on_error(folder), join_store(folder, engine, require_backend=engine.require_backend) as joined:
+        engine, store = joined
+        StudyRun(engine, store, progress, engine.chunk_order()[number - 1 :: count]).compute_all()
     return status(folder)
 
 
@@ -279,20 +283,20 @@ def submit(
     devices: list[Any] | None = None,
     backend: Backend | None = None,
 ) -> Status:
-    """Hand a study's chunks to a cluster, and do not wait for them: :func:`status` says how far it is, and :func:`sweep`
-    reads what is there and computes what is missing. Arguments are as of :func:`sweep`.
+    """Hand a study's chunks to a cluster without waiting for them. Arguments are as for :func:`sweep`.
+
+    :func:`status` returns the progress; a later :func:`sweep` reads stored chunks and computes missing ones.
 
     Raises:
-        InputError: as of :func:`sweep`; a refined study, whose points depend on one another, or a cluster that would end
-            with this process.
+        InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another, or the cluster
+            would end with this process.
     """
-    config, folder = read_config(study), to_path(out)
-    engine = Engine(config, devices=devices, backend=backend, require_backend=backend is not None)
+    folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--detach")
     with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-        with join_store(folder, engine, require_backend=backend is not None) as (engine, store):
+        with join_store(folder, engine, require_backend=engine.require_backend) as (engine, store):
             submit_chunks(cluster, engine, store)
     return status(folder)
 
@@ -303,19 +307,25 @@ def _check_independent(engine: Engine, option: str) -> None:
 
 
 def open_study(folder: str | Path) -> StudyResult:
-    """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read
-    on first use. Raises `InputError` where there is none."""
+    """Open a study's folder, finished or not; its rows are read on first use.
+
+    Raises:
+        InputError: the folder holds no study.
+    """
     store = Store.open(to_path(folder))
     return StudyResult(load_config(store.folder), store)
 
 
 def repair(folder: str | Path) -> tuple[int, Store]:
-    """Check a study's folder: damaged parts are kept aside, and a manifest that is lost or damaged is written anew.
+    """Check a study's folder: damaged parts are moved to `damaged/`, and a lost or damaged manifest is written anew.
 
-    Returns how many parts are whole, and the store. What is missing then, :func:`sweep` computes.
+    A later :func:`sweep` computes the missing parts.
+
+    Returns:
+        The number of whole parts, and the store.
 
     Raises:
-        InputError: no study is there, its `study.toml` is damaged, or a part is of another one.
+        InputError: the folder holds no study, its `study.toml` is damaged, or a part is of another study.
     """
     folder = to_path(folder)
     if not (folder / "study.toml").exists():
@@ -327,5 +337,5 @@ def repair(folder: str | Path) -> tuple[int, Store]:
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:
-    """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
-    return Engine(read_config(study), backend=backend, require_backend=backend is not None).estimate()
+    """Estimate time and memory of a study by a compilation and short runs; for a refined study, of its coarse grid."""
+    return _make_engine(study, backend).estimate()

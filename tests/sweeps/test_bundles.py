@@ -122,7 +122,7 @@ def test_bundles_take_workers_long_enough_and_are_not_too_many():
 def test_bad_input(tmp_path, client, monkeypatch):
     with pytest.raises(InputError, match="--scheduler local:none: local:N needs the number of processes"):
         sweep(thirty(), tmp_path / "a", scheduler="local:none")
-    monkeypatch.setattr(cluster, "_ANSWER", 0.3)
+    monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
     with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:1: no Dask scheduler answers there"):
         sweep(thirty(), tmp_path / "a", scheduler="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="its workers write into a folder; name it with --out"):

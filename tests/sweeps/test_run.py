@@ -30,7 +30,7 @@ def test_shares_are_the_whole_study(tmp_path, computed):
         assert status(folder).held_by.startswith("process")
     done = share(thirty(), folder, (2, 3))
     assert sorted(computed) == list(range(8))
-    assert done.complete and done.remaining == 0.0 and not done.finished
+    assert done.complete and done.remaining_seconds == 0.0 and not done.finished
     # a share that is there, and who collects them, compute nothing
     share(thirty(), folder, (2, 3))
     result = sweep(thirty(), folder)
@@ -48,7 +48,7 @@ def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypat
     before = parts(tmp_path / "study")
     with pytest.raises(InputError, match="holds another study"):
         share(thirty(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
-    monkeypatch.setattr(run, "_PREPARED", 0.2)
+    monkeypatch.setattr(run, "_PREPARATION_SECONDS", 0.2)
     with (
         lock_folder(tmp_path / "study"),
         pytest.raises(InputError, match="is writing into it; wait until it has ended"),
