@@ -54,7 +54,7 @@ finally:
 def make(folder: Path, rows: int) -> int:
     """Write a study of so many rows, to the next whole seed. Returns its rows."""
     config = read_config(_STUDY | {"sweep": {"seeds": -(-rows // SIDE**2), "chunk": 32768}})
-    engine, store = open_or_create_store(folder, Engine(config, backend="fused"), require_backend=False)
+    engine, store = open_or_create_store(folder, Engine(config, backend="fused"))
     rng = np.random.default_rng(0)
     for index in range(len(engine)):
         labels = engine.row_labels(engine.chunk(index))

@@ -3,6 +3,7 @@
 from .gains import TUNE_NAMES as TUNE_NAMES
 from .gains import SideCertificateTable as SideCertificateTable
 from .gains import TuneTable as TuneTable
+from .reading import ConfigSource as ConfigSource
 from .reading import read_config as read_config
 from .reading import read_log_config as read_log_config
 from .reading import read_model as read_model

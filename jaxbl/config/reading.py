@@ -17,6 +17,9 @@ from jaxbl.validation import Key, abbreviate, check_file, check_sizes, explain_f
 
 from .study import Config, numeric_paths, suggest_path
 
+ConfigSource = str | Path | Mapping[str, Any] | Config
+"""A study: a TOML file, a mapping, or a config."""
+
 _MOST_BYTES = 8_000_000
 """Of a TOML file: 300 000 numbers of full length, some seconds of reading."""
 _MOST_FILES = 100
@@ -35,7 +38,7 @@ class Origin(NamedTuple):
 Origins = dict[str, Origin]
 
 
-def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
+def read_config(source: ConfigSource) -> Config:
     """Read and validate a study from a TOML file, a mapping, or a config.
 
     Raises:
@@ -47,7 +50,7 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
 _MISSING_GAINS = {"lambda": 1.0, "alpha": 1.0}
 
 
-def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+def read_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     """Read a study that is to be held against a log: `[excitation]` and the observers' gains may be missing.
 
     Returns:
@@ -69,7 +72,7 @@ _ELEMENT = (
 )
 
 
-def _read_model_of_any_log(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     """Read a model as :func:`read_model` does, for any kind of log."""
     if isinstance(source, Config):
         return source, frozenset()

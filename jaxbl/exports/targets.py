@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import is_empty, json_with_checksum, make_folder, read_json, remove_if_empty_on_error, write_atomic
 from jaxbl.fused import Unsupported
@@ -166,7 +166,7 @@ TARGETS: dict[str, Target] = {
 
 
 def export(
-    config: str | Path | Mapping[str, Any] | Config,
+    config: ConfigSource,
     folder: str | Path,
     target: str = "c",
     *,

@@ -29,25 +29,25 @@ from .noise import host_device
 from .shared_part import SharedPart, compile_shared_part
 
 _CACHE_BYTES = 2**24
-"""Bytes of shared inputs, of some seeds, that a simulator keeps for the next lanes."""
+"""Largest size of the shared inputs, of several seeds, that a simulator keeps for the next lanes."""
 _COMPACTION_SHARE = 0.875
-"""Lanes that are done are removed when at most this share of the lanes is left: to move the others costs as much as some
+"""Lanes that are done are removed once at most this share of the lanes runs: moving the others costs as much as several
 samples."""
 _THREAD_WORK = 2**18
-"""Samples of lanes times their bytes, some 0.1 ms, that are worth a thread."""
+"""Least work for a thread, some 0.1 ms: lanes times samples times bytes of a number."""
 _CALL_WORK = 2**20
-"""Samples of lanes that one call of the loop takes, some 1 ms; after the call, lanes that are done may leave."""
+"""Work of one call of the loop, some 1 ms: lanes times samples. Lanes that are done are removed after a call."""
 
 
 class SharedInputs(NamedTuple):
-    """What all lanes read in a span: some whole blocks of samples.
+    """Inputs that all lanes share in a span. A span is a number of whole blocks of samples.
 
     Attributes:
-        length: samples of the span.
-        sample_inputs: inputs of each sample, `(samples,)` each.
-        block_inputs: inputs of what follows each block, `(blocks,)` each.
-        final_inputs: inputs of a lane's metrics, `()` each; None before the last span.
-        shared_metrics: metrics that are the same for all lanes, `()` each; none before the last span.
+        length: number of samples of the span.
+        sample_inputs: arrays `(samples,)` that each sample reads.
+        block_inputs: arrays `(blocks,)` that the end of each block reads.
+        final_inputs: numbers `()` that the metrics of a lane need; None before the last span.
+        shared_metrics: metrics `()` that are the same for all lanes; empty before the last span.
     """
 
     length: int
@@ -67,12 +67,12 @@ class LaneSimulator(abc.ABC):
 
     Args:
         experiment, reducers: as for :func:`jaxbl.simulate.scan`.
-        paths: of the leaves that differ from lane to lane.
+        paths: paths of the leaves that differ from lane to lane.
         lanes: number of lanes that the code is compiled for.
         multiple: the lanes are padded to a multiple of this number.
 
     Attributes:
-        carry_count: how many numbers each lane carries from sample to sample, beside those that all lanes share.
+        carry_count: number of values that each lane carries from sample to sample, without those that all lanes share.
 
     Raises:
         Unsupported: a step does something that a compiled loop cannot do.
@@ -113,7 +113,7 @@ class LaneSimulator(abc.ABC):
         self.carry_count = len(dependences) - len(shared_state)
         start_split = split_by_lane(start, values, (), (), [], dependences)
         step_split = split_by_lane(step, values, carry, sample_inputs, dependences, dependences)
-        # after a block it is known whether a lane is done, if the reducers can tell
+        # the end of a block also returns whether a lane is done, if the reducers can tell
         flag_count = len(jax.tree.leaves(jax.eval_shape(finish_block, values, carry, ()))) - len(dependences)
         result_dependences = [*dependences, *[Dependence.LANE] * flag_count]
         block_split = split_by_lane(finish_block, values, carry, (), dependences, result_dependences)
@@ -134,8 +134,8 @@ class LaneSimulator(abc.ABC):
         """Simulate the lanes with one seed.
 
         Args:
-            values: of the lanes, `(lanes,)` by path, in SI units.
-            seed: of the encoders' noise.
+            values: values of the lanes, `(lanes,)` by path, in SI units.
+            seed: seed of the encoders' noise.
 
         Returns:
             Metrics of the lanes, `(lanes,)` by name.
@@ -148,11 +148,11 @@ class LaneSimulator(abc.ABC):
         }
 
     def keep_seeds(self, seeds: Collection[int]) -> None:
-        """Keep the shared inputs of these seeds for the next lanes, as far as there is room, and drop all others."""
+        """Keep the cached inputs of these seeds for the next lanes, and drop those of all other seeds."""
         self._cached_inputs = {seed: inputs for seed, inputs in self._cached_inputs.items() if seed in seeds}
 
     def _iterate_inputs(self, seed: int) -> Iterator[SharedInputs]:
-        """Shared inputs of a run, span after span: from the cache, or computed and then cached if there is room."""
+        """Yield the shared inputs of a run, span after span, from the cache; or compute them, and cache them if they fit."""
         if seed in self._cached_inputs:
             yield from self._cached_inputs[seed]
             return
@@ -166,7 +166,7 @@ class LaneSimulator(abc.ABC):
             self._cached_inputs[seed] = computed
 
     def pad_lanes(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """Values of the lanes in the order of the paths, the last lane repeated: `(padded lanes,)` each."""
+        """Return the values of the lanes, `(padded lanes,)` for each path in order, padded by repeating the last lane."""
         columns = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
         for path, column in zip(self._paths, columns, strict=True):
             if column.shape != (self._lanes,):
@@ -175,7 +175,7 @@ class LaneSimulator(abc.ABC):
         return [np.pad(column, padding, "edge") for column in columns] if any(padding) else columns
 
     def compute_inputs(self, seed: int) -> Iterator[SharedInputs]:
-        """Compute the shared inputs of a run, span after span."""
+        """Compute and yield the shared inputs of a run, span after span."""
         state = self._initial_state
         for first in range(0, self._steps, self._span_length):
             length = min(self._span_length, self._steps - first)
@@ -192,7 +192,7 @@ class LaneSimulator(abc.ABC):
     def _simulate(
         self, values: list[np.ndarray], spans: Iterator[SharedInputs]
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Take the lanes through all spans; returns metrics of lanes `(padded lanes,)`, and metrics that they share `()`."""
+        """Simulate the lanes over all spans; return metrics of lanes `(padded lanes,)` and metrics that they share `()`."""
 
 
 class HostSimulator(LaneSimulator):
@@ -205,7 +205,7 @@ class HostSimulator(LaneSimulator):
         self._vector_lanes = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._vector_lanes)
         if any(eqn.primitive.name == "scan" for eqn in self._step.jaxpr.eqns):
-            # plant steps of a sample: few numbers, each of which waits for the one before
+            # plant steps within a sample: each number waits for the one before, so that wider vectors keep the core busy
             self._vector_lanes *= 2
             self._padded_lanes = -(-lanes // self._vector_lanes) * self._vector_lanes
         self._loop = Loop(
@@ -234,13 +234,13 @@ class HostSimulator(LaneSimulator):
         running: deque[list[Future[None]]] = deque()
         inputs = None
         for inputs in spans:
-            # what lanes share is computed meanwhile, a span or two ahead of them
+            # this thread computes the shared inputs, a span or two ahead of the lanes
             is_last = inputs.final_inputs is not None
             if not running:
-                # threads do nothing then but compute: they would wait for the interpreter
+                # prepared here, since threads would wait for the interpreter
                 for thread in threads:
                     thread.prepare_arrays(inputs)
-            # nothing is left to do here during the last span, so that this thread takes the first lanes itself
+            # in the last span this thread has nothing to compute ahead, and simulates the first lanes itself
             submitted = zip(self._pools[int(is_last) :], threads[int(is_last) :], strict=True)
             running.append([pool.submit(thread.simulate_span, inputs) for pool, thread in submitted])
             while len(running) > 2:
@@ -265,21 +265,21 @@ def _wait_for(futures: Iterable[Future[None]]) -> None:
 
 
 class _ThreadLanes:
-    """The lanes of one thread. Lanes that are done leave with what they then carry, and the others move together.
+    """The lanes of one thread. Lanes that are done are removed with their carry, and the others move together.
 
     Args:
         loop: the compiled loop.
-        dtypes: of the loop's arrays, by the name of their group.
-        values: `(paths, lanes)`.
-        carry_count: how many numbers a lane carries.
-        block_length: samples of a block.
+        dtypes: types of the loop's arrays, by the name of their group.
+        values: values of the lanes, `(paths, lanes)`.
+        carry_count: number of values that a lane carries.
+        block_length: number of samples of a block.
     """
 
     def __init__(
         self, loop: Loop, dtypes: dict[str, list[np.dtype]], values: np.ndarray, carry_count: int, block_length: int
     ):
         self._loop, self._dtypes, self._block_length, self._has_begun = loop, dtypes, block_length, False
-        # places of the lanes that are computed, and their values and carry; further columns are padding
+        # places of the running lanes, and their values and carry; further columns are padding
         self._lanes = np.arange(values.shape[1])
         self._values_and_carry = np.empty((len(values) + carry_count, values.shape[1]), values.dtype)
         self._values_and_carry[: len(values)] = values
@@ -288,7 +288,7 @@ class _ThreadLanes:
         self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def simulate_span(self, inputs: SharedInputs) -> None:
-        """Take the lanes through a span, in calls of as many blocks as are worth one."""
+        """Simulate the lanes over a span; a call of the loop takes several blocks if the lanes are few."""
         start = 0
         while start < inputs.length and len(self._lanes):
             flags, results, arrays = self._prepared or self.prepare_arrays(inputs)
@@ -306,7 +306,7 @@ class _ThreadLanes:
                 self._remove_done_lanes(flags[0][(end - 1) // self._block_length])
         self._prepared = None
         if inputs.final_inputs is not None and self._done:
-            # metrics of the lanes that have left
+            # metrics of the lanes that were removed
             self._lanes, self._values_and_carry = (np.concatenate(parts, axis=-1) for parts in zip(*self._done, strict=True))
             self._select_lanes(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare_arrays(inputs)
@@ -314,10 +314,11 @@ class _ThreadLanes:
             self._results.append((self._lanes, results))
 
     def prepare_arrays(self, inputs: SharedInputs) -> tuple[list[np.ndarray], list[np.ndarray], LoopArrays]:
-        """Make the loop's arrays for a span.
+        """Make the arrays of the loop for a span.
 
         Returns:
-            Flags of lanes that are done `(blocks, lanes)`, results `(metrics of one type, lanes)`, and all arrays together.
+            Flags that are true for lanes that are done, `(blocks, lanes)`; results `(metrics, lanes)` for each type of
+            number; and all arrays of the loop.
         """
         width = self._values_and_carry.shape[1]
         blocks = -(-inputs.length // self._block_length)
@@ -333,7 +334,7 @@ class _ThreadLanes:
 
     @property
     def results(self) -> list[np.ndarray]:
-        """Results of all lanes, an array `(metrics of one type, lanes)` for each type."""
+        """Results of all lanes, an array `(metrics, lanes)` for each type of number."""
         if not self._done:
             return self._results[0][1]
         count = sum(len(lanes) for lanes, _ in self._results)
@@ -344,7 +345,7 @@ class _ThreadLanes:
         return merged
 
     def _remove_done_lanes(self, flags: np.ndarray) -> None:
-        """Remove the lanes that are done, if they are enough to be worth the move."""
+        """Remove the lanes that are done, if there are enough of them to pay for moving the others."""
         is_done = flags[: len(self._lanes)]
         remaining = np.flatnonzero(~is_done)
         padded = -(-len(remaining) // self._loop.lanes) * self._loop.lanes
@@ -362,15 +363,15 @@ class _ThreadLanes:
 
 
 class DeviceSimulator(LaneSimulator):
-    """Simulates lanes by one kernel of an accelerator, which takes them through the whole run.
+    """Simulates lanes by one kernel of an accelerator, which computes the whole run.
 
     Args:
         experiment, reducers, paths, lanes: as for :class:`LaneSimulator`.
         interpret: run the kernel anywhere, slowly.
 
     Attributes:
-        kernel: the compiled code; it takes the padded values of the lanes and :meth:`join_spans`, and returns the lanes'
-            metrics.
+        kernel: the compiled kernel; it maps the padded values of the lanes and the joined inputs (:meth:`join_spans`) to
+            the metrics of the lanes.
     """
 
     def __init__(
@@ -400,7 +401,7 @@ class DeviceSimulator(LaneSimulator):
 
     @staticmethod
     def join_spans(spans: Iterable[SharedInputs]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-        """Shared inputs of a whole run: of its samples, of its blocks, and of the metrics at the end."""
+        """Join the shared inputs of all spans: arrays for samples and for blocks, and the inputs of the metrics."""
         all_spans = list(spans)
         samples = zip(*(inputs.sample_inputs.arrays for inputs in all_spans), strict=True)
         blocks = zip(*(inputs.block_inputs.arrays for inputs in all_spans), strict=True)

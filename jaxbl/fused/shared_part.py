@@ -23,7 +23,7 @@ SharedPartRunner = Callable[[list[Any], int, int, int], SharedValues]
 
 
 class SharedPart(NamedTuple):
-    """What all lanes share, as functions of its state.
+    """The computation that all lanes share, as functions of its state.
 
     Attributes:
         step: state, index and noise of a sample -> state, outputs that lanes read at the sample.

@@ -262,7 +262,7 @@ def _derivatives_by_xla(
 
 
 class _PlantStructure(NamedTuple):
-    """What loops are compiled for.
+    """Structure of the arguments that loops are compiled for.
 
     Attributes:
         experiment_tree: structure of the experiments.

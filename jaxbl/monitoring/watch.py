@@ -14,7 +14,7 @@ import jax
 import pandas as pd
 from scipy.special import stdtrit
 
-from jaxbl.config import Config, prepare, read_model
+from jaxbl.config import Config, ConfigSource, prepare, read_model
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import on_record, read_logs
@@ -97,7 +97,7 @@ class Watch:
 
 def watch(
     source: str | Path,
-    model: str | Path | Mapping[str, Any] | Config,
+    model: ConfigSource,
     *,
     alarm_gap: float | None = None,
     window: float = 10.0,
@@ -128,7 +128,7 @@ def watch(
 
 def read_watch_task(
     source: str | Path,
-    model: str | Path | Mapping[str, Any] | Config,
+    model: ConfigSource,
     *,
     alarm_gap: float | None = None,
     window: float = 10.0,

@@ -158,7 +158,7 @@ def compute_bundle(bundle: Bundle) -> _BundleResult:
     if not (folder / "manifest.json").exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
     with lock_folder(folder, shared=True, wait=_DELAY_SECONDS):
-        store = Store.open(folder, keeps_manifest=False)
+        store = Store.open(folder, writes_manifest=False)
         if store.manifest["identity"] != bundle.identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
         engine = _cached_engine(*bundle[:-1])

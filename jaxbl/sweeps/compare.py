@@ -14,6 +14,7 @@ with its own spread alone.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -36,6 +37,8 @@ _CONFIDENCE = 0.99
 """Confidence of the intervals over all points: some forty metrics have one."""
 _AXIS_TOLERANCE = 1e-9
 """Relative difference up to which two values of an axis are the same."""
+_ignore_undefined = functools.partial(np.errstate, divide="ignore", invalid="ignore")
+"""Context in which numbers that are not defined become NaN or infinite without a warning."""
 _IGNORED_KEYS = "title", "notes", "figures"
 """Keys on which no number depends."""
 
@@ -279,9 +282,10 @@ def _match_points(
         True if runs are compared seed by seed.
     """
     frames = [_read_keys(study, paths) for study in studies]
-    codes = [np.zeros(len(frame), np.int64) for frame in frames]
-    for path in paths:
-        codes = _number_pairs(codes, _number_values(*(frame[path] for frame in frames)))
+    joint = pd.concat(frames, ignore_index=True)
+    # without axes all rows are of one point
+    groups = joint[paths].apply(_number_values).groupby(paths).ngroup() if paths else np.zeros(len(joint), int)
+    codes = np.split(np.asarray(groups), [len(frames[0])])
     points = [np.unique(code) for code in codes]
     common_points = np.intersect1d(*points, assume_unique=True)
     seeds = [np.unique(frame["seed"]) for frame in frames]
@@ -310,24 +314,13 @@ def _read_keys(study: StudyResult, paths: list[str]) -> pd.DataFrame:
     return study.read([*axis_paths, "seed"]).assign(**constants).reset_index(drop=True)
 
 
-def _number_values(first: pd.Series, second: pd.Series) -> list[np.ndarray]:
-    """Number the values of two columns so that equal values, within a tolerance, have equal numbers; NaN has its own."""
-    joint = pd.concat([first, second], ignore_index=True)
-    if joint.dtype == object or not pd.api.types.is_numeric_dtype(joint):
-        numbers = pd.factorize(joint)[0]
-    else:
-        values, index = np.unique(joint.to_numpy(float), return_inverse=True)
-        steps = np.diff(values) > _AXIS_TOLERANCE * np.maximum(np.abs(values[1:]), np.abs(values[:-1]))
-        numbers = np.concatenate([[0], np.cumsum(steps | np.isnan(values[1:]))])[index]
-    return [numbers[: len(first)], numbers[len(first) :]]
-
-
-def _number_pairs(first: list[np.ndarray], second: list[np.ndarray]) -> list[np.ndarray]:
-    """Number the pairs of two columns of numbers, which both studies have, so that equal pairs have equal numbers."""
-    base = max(int(column.max(initial=0)) for column in second) + 1
-    pairs = np.concatenate([a * base + b for a, b in zip(first, second, strict=True)])
-    numbers = np.unique(pairs, return_inverse=True)[1]
-    return [numbers[: len(first[0])], numbers[len(first[0]) :]]
+def _number_values(column: pd.Series) -> np.ndarray:
+    """Number the values of a column so that equal values, within a tolerance, have equal numbers; NaN has its own."""
+    if column.dtype == object or not pd.api.types.is_numeric_dtype(column):
+        return pd.factorize(column)[0]
+    values, index = np.unique(column.to_numpy(float), return_inverse=True)
+    steps = np.diff(values) > _AXIS_TOLERANCE * np.maximum(np.abs(values[1:]), np.abs(values[:-1]))
+    return np.concatenate([[0], np.cumsum(steps | np.isnan(values[1:]))])[index]
 
 
 class _MatchedMetric:
@@ -375,7 +368,7 @@ class _MatchedMetric:
 def _row_means(values: np.ndarray) -> np.ndarray:
     """Mean of the finite numbers of each row; NaN if there are none."""
     finite = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
+    with _ignore_undefined():
         return np.where(finite, values, 0.0).sum(axis=1) / finite.sum(axis=1)
 
 
@@ -384,7 +377,7 @@ def _row_statistics(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     finite = np.isfinite(values)
     count, mean = finite.sum(axis=1), _row_means(values)
     squares = (np.where(finite, values - mean[:, None], 0.0) ** 2).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with _ignore_undefined():
         return count, mean, np.where(count > 1, squares / (count - 1) / count, np.nan)
 
 
@@ -394,7 +387,7 @@ def _mean_differences(first: np.ndarray, second: np.ndarray, paired: bool) -> tu
         count, mean, variance = _row_statistics(second - first)
         return mean, variance, count - 1.0
     (m, a, u), (n, b, v) = _row_statistics(first), _row_statistics(second)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with _ignore_undefined():
         freedom = (u + v) ** 2 / (u**2 / (m - 1.0) + v**2 / (n - 1.0))
     # without any spread the formula is 0 / 0
     return b - a, u + v, np.where(u + v == 0.0, 1.0, freedom)
@@ -402,7 +395,7 @@ def _mean_differences(first: np.ndarray, second: np.ndarray, paired: bool) -> tu
 
 def _t_test(mean: np.ndarray, variance: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Two-sided p-values of means; NaN if the variance is not known."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with _ignore_undefined():
         t = np.abs(mean) / np.sqrt(variance)
     p = 2.0 * stats.t.sf(t, np.maximum(freedom, 1.0))
     return np.where(np.isfinite(variance), np.where(mean == 0.0, 1.0, p), np.nan)
@@ -418,7 +411,7 @@ def _select_significant(p: np.ndarray) -> np.ndarray:
 def _compare_metric(metric: str, first: _MatchedStudy, second: _MatchedStudy, paired: bool) -> MetricChange:
     matched, boolean = _MatchedMetric(metric, first, second, paired), is_boolean(metric)
     a, b = matched.means
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with _ignore_undefined():
         change = b - a if boolean else np.log(b / a)
     size = np.abs(np.where(np.isfinite(change), change, 0.0))
     differs = matched.differs
@@ -460,7 +453,7 @@ def _value_range(column: pd.Series) -> list[Any]:
 
 def _mean_change(matched: _MatchedMetric, boolean: bool, paired: bool) -> MeanChange:
     """Mean change over the points at which all seeds have a number; its interval by the spread over seeds."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with _ignore_undefined():
         a, b = (values if boolean else np.log(values) for values in (matched.first, matched.second))
     complete = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if not complete.any():

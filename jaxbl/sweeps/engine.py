@@ -50,6 +50,16 @@ class Chunk(NamedTuple):
     seeds: np.ndarray
     points: np.ndarray
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of seeds and of points."""
+        return len(self.seeds), len(self.points)
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes."""
+        return math.prod(self.shape)
+
 
 _REFINED_LANES_PER_DEVICE = 1024
 """Lanes that a device computes at once in a refined study: its batches are small, and would leave larger chunks mostly
@@ -106,6 +116,11 @@ def _rank_coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
     return rank, np.frexp(rank)[1]
 
 
+def _slice_evenly(indices: np.ndarray, length: int) -> list[np.ndarray]:
+    """Cut indices into slices of a length; the last one may be shorter."""
+    return [indices[first : first + length] for first in range(0, len(indices), length)]
+
+
 class Engine:
     """Compiles and runs the chunks of a study.
 
@@ -146,7 +161,7 @@ class Engine:
         layouts: dict[Backend, Layout] = {backend: self._choose_layout(backend, None) for backend in BACKENDS}
         steps = sum(group.config.run.steps for group in self.points.groups)
         samples: dict[Backend, int] = {
-            backend: steps * self._count_chunks(layout, self.points.coarse_size) for backend, layout in layouts.items()
+            backend: steps * self.count_chunks(self.points.coarse_size, layout) for backend, layout in layouts.items()
         }
         return choose_backend(self.devices, self._operations, layouts, samples, len(self.points.groups))
 
@@ -175,11 +190,9 @@ class Engine:
         """Number of chunks; of a refined study, those of its coarse grid."""
         return len(self.points.groups) * self.count_chunks(self.points.coarse_size)
 
-    def count_chunks(self, points: int) -> int:
-        """Number of chunks for a number of points of a group, with all seeds."""
-        return self._count_chunks(self.layout, points)
-
-    def _count_chunks(self, layout: Layout, points: int) -> int:
+    def count_chunks(self, points: int, layout: Layout | None = None) -> int:
+        """Number of chunks for a number of points of a group, with all seeds; `layout` is the engine's if left out."""
+        layout = layout or self.layout
         return math.ceil(self.config.sweep.seeds / layout.seeds) * math.ceil(points / layout.points)
 
     def chunk(self, index: int) -> Chunk:
@@ -190,11 +203,6 @@ class Engine:
         first = point_slice * self.layout.points
         last = min(first + self.layout.points, self.points.coarse_size)
         return Chunk(index, group, self._seed_slices[seed_slice], self.points.coarse_points(np.arange(first, last)))
-
-    def count_lanes(self, index: int) -> int:
-        """Number of lanes of a chunk."""
-        chunk = self.chunk(index)
-        return len(chunk.seeds) * len(chunk.points)
 
     def chunk_order(self) -> list[int]:
         """Indices of all chunks in the order in which they are computed, so that the grid is covered coarsely first.
@@ -223,18 +231,13 @@ class Engine:
             points: indices of the points, `(points,)`.
             first_index: index of the first chunk; the others count up from it.
         """
-        slices = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
-        pairs = itertools.product(self._seed_slices, slices)
+        pairs = itertools.product(self._seed_slices, _slice_evenly(points, self.layout.points))
         return [Chunk(index, group, seeds, point_slice) for index, (seeds, point_slice) in enumerate(pairs, first_index)]
 
     @functools.cached_property
     def _seed_slices(self) -> list[np.ndarray]:
         """All seeds, divided into those of one chunk each."""
-        end = self.config.sweep.first_seed + self.config.sweep.seeds
-        return [
-            np.arange(first, min(first + self.layout.seeds, end))
-            for first in range(self.config.sweep.first_seed, end, self.layout.seeds)
-        ]
+        return _slice_evenly(self.config.sweep.first_seed + np.arange(self.config.sweep.seeds), self.layout.seeds)
 
     @property
     def rows(self) -> int:
@@ -257,7 +260,7 @@ class Engine:
             self.run_seconds += time.perf_counter() - start
         columns = self.row_labels(chunk)
         for name in self.points.metrics:
-            padded = np.asarray(metrics.get(name, np.full((len(chunk.seeds), len(chunk.points)), np.nan)))
+            padded = np.asarray(metrics.get(name, np.full(chunk.shape, np.nan)))
             columns[name] = padded[: len(chunk.seeds), : len(chunk.points)].ravel()
         return pd.DataFrame(columns)
 
@@ -265,9 +268,8 @@ class Engine:
         """Axis values by path, and seeds, of the rows of a chunk."""
         group = self.points.groups[chunk.group]
         values = group.structural | self.points.columns(chunk.points)
-        shape = (len(chunk.seeds), len(chunk.points))
-        columns = {path: np.broadcast_to(values[path], shape).ravel() for path in self.points.paths}
-        columns["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
+        columns = {path: np.broadcast_to(values[path], chunk.shape).ravel() for path in self.points.paths}
+        columns["seed"] = np.broadcast_to(chunk.seeds[:, None], chunk.shape).ravel()
         return columns
 
     def _pad_arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:

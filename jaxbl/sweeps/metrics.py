@@ -114,10 +114,10 @@ class RunMetric(Metric):
         """The state after a sample."""
         return carry
 
-    def known(self, carry: Any, experiment: Experiment, start: Number) -> Array | None:
-        """True if no further sample can change the result, by the state so far; None if that is never known.
+    def is_final(self, carry: Any, experiment: Experiment, start: Number) -> Array | None:
+        """True if no further sample can change the result, by the state so far; None if this cannot be told.
 
-        `start` is the time of the first sample of the last quarter, s. A lane may stop once all its metrics are known.
+        `start` is the time of the first sample of the last quarter, s. A lane may stop once all its metrics are final.
         """
         return None
 
@@ -211,7 +211,7 @@ class Converged(RunMetric):
     def update(self, carry, sample):
         return jnp.where(sample.within, carry, sample.time)
 
-    def known(self, carry, experiment, start):
+    def is_final(self, carry, experiment, start):
         return carry >= start - 0.5 * experiment.run.sample_period
 
     def result(self, carry, end):
@@ -383,16 +383,15 @@ def _init_carries(names: MetricNames, experiment: Experiment) -> dict[str, tuple
     return {side: tuple(metric.init(zero) for metric in metrics) for side in experiment.sides}
 
 
-def _all_known(names: MetricNames, experiment: Experiment, carry: tuple) -> Array | None:
-    """True if no further sample can change any requested metric of a side; None if that is never known."""
+def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: tuple) -> Array | None:
+    """True if no further sample can change any requested metric of a side; None if this cannot be told."""
     if names is None or needs_gain_metrics(names):
         return None
     states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     start = _window_start_time(experiment)
     metrics = _loop_metrics(experiment, names)
-    maybe_known = [metric.known(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
-    is_known = [known for known in maybe_known if known is not None]
-    return functools.reduce(jnp.logical_and, is_known) if is_known and len(is_known) == len(maybe_known) else None
+    flags = [metric.is_final(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    return None if not flags or any(flag is None for flag in flags) else functools.reduce(jnp.logical_and, flags)
 
 
 def identified_parameters(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
@@ -424,10 +423,10 @@ def _update_carries(
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
         metrics = _carried_metrics(experiment, names).values()
         new_carry = tuple(metric.update(state, sample) for metric, state in zip(metrics, carry, strict=True))
-        known = _all_known(names, experiment, carry)
-        if known is not None:
+        is_final = _are_metrics_final(names, experiment, carry)
+        if is_final is not None:
             # the result must not depend on whether the lane stops here: a later overflow does not count
-            new_carry = jax.tree.map(functools.partial(jnp.where, known), carry, new_carry)
+            new_carry = jax.tree.map(functools.partial(jnp.where, is_final), carry, new_carry)
         new_carries[side] = new_carry
     return new_carries
 
@@ -449,15 +448,15 @@ def _is_finite(results: dict[str, Any]) -> Array:
 
 
 def _is_done(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> Array:
-    """True if the requested metrics of each side are known, or the side has overflowed.
+    """True if the requested metrics of each side are final, or the side has overflowed.
 
     A metric that has overflowed does not become finite again, and all metrics of its side are then NaN.
     """
     undecided = []
     for side, carry in carries.items():
         finite = _is_finite(_compute_results(names, experiment, carry, state, side, _OVERFLOW_METRICS))
-        known = _all_known(names, experiment, carry)
-        undecided.append(finite if known is None else finite & ~known)
+        is_final = _are_metrics_final(names, experiment, carry)
+        undecided.append(finite if is_final is None else finite & ~is_final)
     return ~functools.reduce(jnp.logical_or, undecided)
 
 

@@ -63,18 +63,18 @@ class CellGrid:
         self.depth = depth
         self.coarse_sizes = tuple(sizes)
         self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
-        steps = np.cumprod([1, *self.sizes[:0:-1]], dtype=np.int64)[::-1] if sizes else np.array([], np.int64)
-        self._is_refined = list(is_refined)
-        # flat distance of neighbours on the coarse grid, along each axis
-        self._strides = [int(step) << depth if halved else int(step) for step, halved in zip(steps, is_refined, strict=True)]
+        refined, fine_sizes = np.array(is_refined, bool), np.array(self.sizes, np.int64)
+        steps = np.cumprod([1, *fine_sizes[:0:-1]], dtype=np.int64)[::-1][: len(sizes)]
+        # flat distance of neighbours on the coarse grid, and number of cells on it, along each axis
+        self._strides = np.where(refined, steps << depth, steps)
+        self._coarse_cell_counts = (np.array(sizes, np.int64) - refined).tolist()
         # of the refined axes alone: flat distance of neighbours on the fine grid, and number of vertices
-        self._steps = [int(step) for step, halved in zip(steps, is_refined, strict=True) if halved]
-        self._sizes = [size for size, halved in zip(self.sizes, is_refined, strict=True) if halved]
+        self._steps, self._sizes = steps[refined].tolist(), fine_sizes[refined].tolist()
 
     def coarse_indices(self, positions: np.ndarray) -> Indices:
         """Flat indices of vertices of the coarse grid by their positions in it."""
         coordinates = np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes)
-        return np.stack(coordinates, axis=-1) @ np.array(self._strides, np.int64)
+        return np.stack(coordinates, axis=-1) @ self._strides
 
     def coarse_vertices(self) -> Indices:
         """All vertices of the coarse grid."""
@@ -82,7 +82,7 @@ class CellGrid:
 
     def coarse_cells(self) -> Indices:
         """All cells of level 0."""
-        return self._lattice([n - 1 if halved else n for n, halved in zip(self.coarse_sizes, self._is_refined, strict=True)])
+        return self._lattice(self._coarse_cell_counts)
 
     def _lattice(self, counts: Sequence[int]) -> Indices:
         """The first vertices of the coarse grid along each axis, so many as `counts` says."""

@@ -22,9 +22,7 @@ _PREPARATION_SECONDS = 60.0
 """Longest wait for another process that prepares the folder."""
 
 
-def open_or_create_store(
-    folder: Path, engine: Engine, *, require_backend: bool, overwrite: bool = False
-) -> tuple[Engine, Store]:
+def open_or_create_store(folder: Path, engine: Engine, *, overwrite: bool = False) -> tuple[Engine, Store]:
     """Open the store of an engine's study in a locked folder (:func:`jaxbl.files.lock_folder`), or create it.
 
     Returns an engine with the store's layout and backend as well: chunks keep the shape that they had when the store was
@@ -32,8 +30,7 @@ def open_or_create_store(
 
     Args:
         folder: study's folder, locked by this process.
-        engine: engine that this machine would use.
-        require_backend: refuse a store of another backend than the engine's.
+        engine: engine that this machine would use; if it requires its backend, a store of another one is refused.
         overwrite: remove the results of other studies from the folder.
 
     Raises:
@@ -42,28 +39,28 @@ def open_or_create_store(
     config = engine.config
     claim_folder(folder, config, overwrite=overwrite)
     store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-    engine = _match_engine(store, engine, require_backend)
+    engine = _match_engine(store, engine)
     if engine.points.refinement is not None:
-        store.count_parts()
+        store.restore_part_count()
     elif store.manifest["parts"] != len(engine):
         # the manifest was lost, and written anew for chunks of another shape
         store.update_manifest(parts=len(engine))
     return engine, store
 
 
-def _match_engine(store: Store, engine: Engine, require_backend: bool) -> Engine:
+def _match_engine(store: Store, engine: Engine) -> Engine:
     """Return an engine with a store's layout and backend."""
-    if require_backend and store.backend != engine.backend and not store.manifest["finished"]:
+    if engine.require_backend and store.backend != engine.backend and not store.manifest["finished"]:
         raise InputError(
             f"{store.folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
         )
     if (store.layout, store.backend) == (engine.layout, engine.backend):
         return engine
-    return Engine(engine.config, store.layout, engine.devices, store.backend, require_backend)
+    return Engine(engine.config, store.layout, engine.devices, store.backend, engine.require_backend)
 
 
 @contextmanager
-def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterator[tuple[Engine, Store]]:
+def join_store(folder: Path, engine: Engine) -> Iterator[tuple[Engine, Store]]:
     """Open the store of a study whose parts several processes write; the first of them creates it.
 
     Yields an engine with the store's layout and backend, and the store, which does not write the manifest. Raises as
@@ -72,7 +69,7 @@ def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterat
     deadline = time.monotonic() + _PREPARATION_SECONDS
     while True:
         with suppress(FolderInUse), lock_folder(folder):
-            open_or_create_store(folder, engine, require_backend=require_backend)
+            open_or_create_store(folder, engine)
         with ExitStack() as lock:
             try:
                 lock.enter_context(lock_folder(folder, shared=True))
@@ -81,9 +78,9 @@ def join_store(folder: Path, engine: Engine, *, require_backend: bool) -> Iterat
                 if time.monotonic() > deadline:
                     raise
             else:
-                claim_folder(folder, engine.config, alone=False)
-                store = Store.open(folder, keeps_manifest=False)
-                yield _match_engine(store, engine, require_backend), store
+                claim_folder(folder, engine.config, exclusive=False)
+                store = Store.open(folder, writes_manifest=False)
+                yield _match_engine(store, engine), store
                 return
         time.sleep(0.1)
 
@@ -156,7 +153,8 @@ class StudyRun:
         """Compute the whole study, or the chunks that were asked for."""
         if self.engine.points.refinement is None:
             if self._indices is not None:
-                self._chunks, self._total = len(self._indices), sum(map(self.engine.count_lanes, self._indices))
+                self._chunks = len(self._indices)
+                self._total = sum(self.engine.chunk(index).lanes for index in self._indices)
             self.compute_missing(
                 map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices)
             )
@@ -193,7 +191,7 @@ class StudyRun:
             values = np.empty((seeds, len(points), len(columns)))
             row = column = 0
             for chunk in chunks:
-                shape = (len(chunk.seeds), len(chunk.points), len(columns))
+                shape = (*chunk.shape, len(columns))
                 metrics = self._read_columns(chunk, columns)[columns].to_numpy(float).reshape(shape)
                 values[row : row + shape[0], column : column + shape[1]] = metrics
                 column += shape[1]
@@ -254,7 +252,7 @@ class StudyRun:
 
     def count_chunk(self, chunk: Chunk) -> None:
         """Count the lanes of a chunk as done, and report progress."""
-        self._done += len(chunk.seeds) * len(chunk.points)
+        self._done += chunk.lanes
         self.report_progress()
 
     def report_progress(self, parts: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""A study's folder: resolved config, manifest, one Parquet file per chunk; restart, and no overwriting of other studies."""
+"""A study's folder: resolved config, manifest, and one Parquet file for each chunk. Other studies are never overwritten."""
 
 import hashlib
 import json
@@ -56,9 +56,9 @@ _COMMANDS = {
     "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
-_COMMON = "figures", "report.html"
+_COMMON_RESULTS = "figures", "report.html"
 _SAVE_INTERVAL = 10.0
-"""Least seconds between two writes of the manifest while chunks are computed; parts have headers, so that none is lost."""
+"""Least time between two writes of the manifest while chunks are computed, s; parts have headers, so that none is lost."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -82,7 +82,7 @@ def identity(config: Config, command: str = "sweep") -> str:
 
 
 def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
-    """Put a hash of a recorded input in place of its file name: the path of the file decides no number."""
+    """Replace the file name of a recorded input by a hash of its samples, since the file's path decides no number."""
     if excitation.kind == "recorded":
         record = excitation.build()
         data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
@@ -94,7 +94,7 @@ def manifest_head(config: Config, command: str) -> dict[str, Any]:
 
 
 def claim_folder(
-    folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, alone: bool = True
+    folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, exclusive: bool = True
 ) -> None:
     """Check that a command may write its results for a study into a folder, and make the folder.
 
@@ -105,7 +105,7 @@ def claim_folder(
         config: the study.
         command: command that writes.
         overwrite: remove the results of other studies from the folder.
-        alone: no other process writes there, so that drafts of killed processes are removed.
+        exclusive: no other process writes there, so that drafts of killed processes are removed.
 
     Raises:
         InputError: the folder holds another study or other files, or cannot be written to.
@@ -130,11 +130,11 @@ def claim_folder(
     # an empty head is that of a damaged marker, which belongs to a study
     if any(head and "single_run" not in head for head in heads.values()):
         raise InputError(f"{folder}: holds files that are not of a study; choose another folder with --out")
-    same = [head.get("single_run") == identity(config, "simulate") for head in heads.values()]
+    matches = [head.get("single_run") == identity(config, "simulate") for head in heads.values()]
     if command != "simulate" and command in heads:
-        same.append(heads[command].get("identity") == identity(config, command))
-    if all(same) and (heads or own_is_damaged or is_empty(folder)):
-        if alone:
+        matches.append(heads[command].get("identity") == identity(config, command))
+    if all(matches) and (heads or own_is_damaged or is_empty(folder)):
+        if exclusive:
             remove_drafts(folder)
         return
     if not heads:
@@ -149,7 +149,7 @@ def claim_folder(
             f"{folder}: holds another study ('{title}', other numbers); choose another folder with --out, or --overwrite"
         )
     results = [name for marker, outputs, _ in _COMMANDS.values() for name in (marker, *outputs)]
-    for name in (*results, *_COMMON):
+    for name in (*results, *_COMMON_RESULTS):
         remove(folder / name)
 
 
@@ -188,16 +188,16 @@ class Store:
         folder: path of the folder.
         manifest: entries of `manifest.json`; `checksums` has those of whole parts, by index.
         damaged: a sentence for each damaged part that was moved to `damaged/`.
-        keeps_manifest: True if this process writes the manifest while parts are added; only one does.
+        writes_manifest: True if this process writes the manifest while parts are added; only one does.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any], *, keeps_manifest: bool = True):
+    def __init__(self, folder: Path, manifest: dict[str, Any], *, writes_manifest: bool = True):
         self.folder = folder
-        self.keeps_manifest = keeps_manifest
+        self.writes_manifest = writes_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
-        self._copies: Path | None = None
-        self._saved, self._pause = 0.0, _SAVE_INTERVAL
+        self._copy_folder: Path | None = None
+        self._saved, self._save_interval = 0.0, _SAVE_INTERVAL
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
@@ -246,7 +246,7 @@ class Store:
         return store
 
     @classmethod
-    def open(cls, folder: Path, *, keeps_manifest: bool = True) -> "Store":
+    def open(cls, folder: Path, *, writes_manifest: bool = True) -> "Store":
         """Open the store in a folder. Raises `InputError` if there is none."""
         path = folder / "manifest.json"
         if not has_file(folder, path.name):
@@ -264,7 +264,7 @@ class Store:
                 f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
                 "that wrote it, or sweep anew into another folder"
             )
-        return cls(folder, manifest, keeps_manifest=keeps_manifest)
+        return cls(folder, manifest, writes_manifest=writes_manifest)
 
     @property
     def layout(self) -> Layout:
@@ -285,8 +285,8 @@ class Store:
         start = time.monotonic()
         write_atomic(self.folder / "manifest.json", json_with_checksum(self.manifest))
         self._saved = time.monotonic()
-        # with very many parts it is long: spend at most 1 % of the time on it
-        self._pause = max(_SAVE_INTERVAL, 100.0 * (self._saved - start))
+        # with very many parts the manifest is long: writing it should take at most 1 % of the time
+        self._save_interval = max(_SAVE_INTERVAL, 100.0 * (self._saved - start))
 
     def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
@@ -355,11 +355,11 @@ class Store:
     def add_checksums(self, checksums: dict[int, str]) -> None:
         """Add checksums of written parts, by index, to the manifest; write it from time to time."""
         self.manifest["checksums"] |= {str(index): checksum for index, checksum in checksums.items()}
-        if self.keeps_manifest and time.monotonic() - self._saved > self._pause:
+        if self.writes_manifest and time.monotonic() - self._saved > self._save_interval:
             self.update_manifest()
 
     def list_part_files(self) -> list[Path]:
-        """All files of parts, whole or damaged, in the order of their indices."""
+        """All files among the parts, whole or damaged, in the order of their indices."""
         # names with six digits come after those with five
         return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
@@ -377,9 +377,9 @@ class Store:
         if rows > self.manifest["rows"]:
             self.update_manifest(parts=parts, rows=rows)
 
-    def count_parts(self) -> None:
-        """Raise the number of parts to that of the files: if a refined study lost its manifest, only these tell it."""
-        part_count = max((index + 1 for index, _ in self._numbered_files() if index is not None), default=0)
+    def restore_part_count(self) -> None:
+        """Raise the manifest's number of parts to that of the files, its only record if a refined study lost its manifest."""
+        part_count = max(self._split_files()[0], default=-1) + 1
         if part_count > self.manifest["parts"]:
             self.update_manifest(parts=part_count)
 
@@ -387,30 +387,36 @@ class Store:
         """Set the numbers of parts and rows of a refined study that is computed, and remove parts beyond them."""
         if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
             self.update_manifest(parts=parts, rows=rows)
-        for index, path in self._numbered_files():
-            if index is not None and index >= parts:
+        for index, path in self._split_files()[0].items():
+            if index >= parts:
                 path.unlink()
                 self.manifest["checksums"].pop(str(index), None)
 
-    def _numbered_files(self) -> Iterator[tuple[int | None, Path]]:
-        """Yield all files of parts with their indices; None for a file with another name."""
+    def _split_files(self) -> tuple[dict[int, Path], list[Path]]:
+        """The files among the parts: those named as parts, by index, and all others."""
+        indexed: dict[int, Path] = {}
+        others = []
         for path in self.list_part_files():
             number = path.stem.removeprefix("part-")
-            yield (int(number) if number.isdecimal() and path == self.part_path(int(number)) else None), path
+            if number.isdecimal() and path == self.part_path(int(number)):
+                indexed[int(number)] = path
+            else:
+                others.append(path)
+        return indexed, others
 
-    def refuse_foreign_files(self) -> None:
-        """Raise `InputError` if a file among the parts is not a part of this study."""
-        for index, path in self._numbered_files():
-            if index is None or index >= self.manifest["parts"]:
-                raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
+    def checked_parts(self) -> dict[int, Path]:
+        """Files of the stored parts by index. Raises `InputError` if a file among them is not a part of this study."""
+        indexed, others = self._split_files()
+        for path in [*others, *(path for index, path in indexed.items() if index >= self.manifest["parts"])]:
+            raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
+        return indexed
 
-    def stored_parts(self) -> list[Path]:
-        """Files of the stored parts. Raises `InputError` if there is none, or one that the study does not have."""
-        self.refuse_foreign_files()
-        paths = self.list_part_files()
-        if not paths:
+    def _parts_to_read(self) -> dict[int, Path]:
+        """The :meth:`checked_parts`. Raises `InputError` if no part is stored."""
+        indexed = self.checked_parts()
+        if not indexed:
             raise InputError(f"{self.folder}: holds no points yet; wait for the sweep that runs in it, or run 'jaxbl sweep'")
-        return paths
+        return indexed
 
     def columns(self) -> list[str]:
         """Names of the columns."""
@@ -423,10 +429,10 @@ class Store:
         Raises:
             InputError: a part is damaged, or not of this study.
         """
-        for part in self.stored_parts():
+        for index, part in self._parts_to_read().items():
             with _report_damage(part):
                 header, frame = parts.read_part(self._local_copy(part), columns)
-                self._check_header(part, header, int(part.stem.removeprefix("part-")))
+                self._check_header(part, header, index)
             yield frame
 
     def dataset(self, check: bool) -> "Dataset":
@@ -440,9 +446,8 @@ class Store:
         """
         from pyarrow import dataset
 
-        paths = self.stored_parts()
-        for part in paths:
-            index = int(part.stem.removeprefix("part-"))
+        indexed = self._parts_to_read()
+        for index, part in indexed.items():
             with _report_damage(part):
                 if check:
                     self._check_file(part, index)
@@ -451,19 +456,19 @@ class Store:
         file_format = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )
-        first: Any = paths[0]
-        file_system = first.fs if is_remote(first) else None
-        names = [str(part.path if file_system else part) for part in cast(Any, paths)]
+        paths: Any = [*indexed.values()]
+        file_system = paths[0].fs if is_remote(paths[0]) else None
+        names = [str(path.path if file_system else path) for path in paths]
         return cast("Dataset", dataset.dataset(names, format=file_format, filesystem=file_system))
 
     def _local_copy(self, part: Path) -> Path:
-        """A part on this machine: one in an object store is copied once, since a report reads it often."""
+        """Path of a part on this machine; a part in an object store is copied here once, since a report reads it often."""
         if not is_remote(part):
             return part
-        if self._copies is None:
-            self._copies = Path(tempfile.mkdtemp())
-            weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
-        copy = self._copies / part.name
+        if self._copy_folder is None:
+            self._copy_folder = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, self._copy_folder, ignore_errors=True)
+        copy = self._copy_folder / part.name
         if not copy.exists():
             copy.write_bytes(part.read_bytes())
         return copy
@@ -475,7 +480,7 @@ class Store:
             InputError: a part is of another study, or has an index that this study does not have.
         """
         self.manifest["checksums"] = {}
-        whole_parts = sum(self.has_part(int(path.stem.removeprefix("part-"))) for path in self.stored_parts())
+        whole_parts = sum(map(self.has_part, self._parts_to_read()))
         if self.damaged:
             self.manifest["finished"] = False
         self.update_manifest()

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,7 +12,7 @@ import pyarrow as pa
 from pyarrow.parquet import filters_to_expression
 
 from jaxbl.cluster import Scheduler, connect
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import lock_folder, remove_drafts, remove_if_empty_on_error, to_path
 from jaxbl.workers import Progress
@@ -162,7 +162,7 @@ class StudyResult:
 
 
 def sweep(
-    study: str | Path | Mapping[str, Any] | Config,
+    study: ConfigSource,
     out: str | Path | None = None,
     *,
     progress: Progress | None = None,
@@ -207,8 +207,8 @@ def sweep(
         engine.compile_all()
     with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
-            engine, store = open_or_create_store(folder, engine, require_backend=backend is not None, overwrite=overwrite)
-            store.refuse_foreign_files()
+            engine, store = open_or_create_store(folder, engine, overwrite=overwrite)
+            store.checked_parts()
             if verify_store:
                 store.verify()
             if cluster is None:
@@ -227,9 +227,7 @@ def sweep(
     return _make_result(run, store)
 
 
-def _make_engine(
-    study: str | Path | Mapping[str, Any] | Config, backend: Backend | None, devices: list[Any] | None = None
-) -> Engine:
+def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any] | None = None) -> Engine:
     """Make the engine of a study; it requires the backend if one is chosen."""
     return Engine(read_config(study), devices=devices, backend=backend, require_backend=backend is not None)
 
@@ -241,7 +239,7 @@ def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
 
 
 def share(
-    study: str | Path | Mapping[str, Any] | Config,
+    study: ConfigSource,
     out: str | Path,
     portion: tuple[int, int],
     *,
@@ -269,14 +267,13 @@ def share(
     folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--share")
     number, count = portion
-    with remove_if_empty_on_error(folder), join_store(folder, engine, require_backend=engine.require_backend) as joined:
-        engine, store = joined
+    with remove_if_empty_on_error(folder), join_store(folder, engine) as (engine, store):
         StudyRun(engine, store, progress, engine.chunk_order()[number - 1 :: count]).compute_all()
     return status(folder)
 
 
 def submit(
-    study: str | Path | Mapping[str, Any] | Config,
+    study: ConfigSource,
     out: str | Path,
     scheduler: Scheduler,
     *,
@@ -296,7 +293,7 @@ def submit(
     with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-        with join_store(folder, engine, require_backend=engine.require_backend) as (engine, store):
+        with join_store(folder, engine) as (engine, store):
             submit_chunks(cluster, engine, store)
     return status(folder)
 
@@ -332,10 +329,10 @@ def repair(folder: str | Path) -> tuple[int, Store]:
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
     config = load_config(folder)
     with lock_folder(folder):
-        _, store = open_or_create_store(folder, Engine(config), require_backend=False)
+        _, store = open_or_create_store(folder, Engine(config))
         return store.verify(), store
 
 
-def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:
+def dry_run(study: ConfigSource, *, backend: Backend | None = None) -> SweepEstimate:
     """Estimate time and memory of a study by a compilation and short runs; for a refined study, of its coarse grid."""
     return _make_engine(study, backend).estimate()

@@ -1,9 +1,7 @@
 """One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, precision, prepare, read_config, with_values
+from jaxbl.config import Config, ConfigSource, precision, prepare, read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
@@ -39,9 +37,7 @@ class Trial(NamedTuple):
     summary: dict[str, Any]
 
 
-def run(
-    study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1, backend: Backend | None = None
-) -> Trial:
+def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend | None = None) -> Trial:
     """Run the experiment of a study once, without its axes.
 
     Args:

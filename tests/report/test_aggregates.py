@@ -65,7 +65,7 @@ def test_groups_are_those_of_pandas():
 def stored(folder, data, **columns):
     """A made-up study in parts."""
     result = made(data, **columns)
-    engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"), require_backend=False)
+    engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"))
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):
         labels = pd.DataFrame(engine.row_labels(engine.chunk(index)))
