@@ -378,7 +378,7 @@ class Store:
             self.update_manifest(parts=parts, rows=rows)
 
     def restore_part_count(self) -> None:
-        """Raise the manifest's number of parts to that of the files, its only record if a refined study lost its manifest."""
+        """Raise the number of parts in the manifest to that of the files, its only record if the manifest was lost."""
         part_count = max(self._split_files()[0], default=-1) + 1
         if part_count > self.manifest["parts"]:
             self.update_manifest(parts=part_count)
