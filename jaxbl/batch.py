@@ -1,14 +1,14 @@
 """Diagnosis of all logs of a folder: `jaxbl diagnose --batch`."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 
 from .cluster import Scheduler, connect
 from .errors import InputError
 from .files import make_folder, run_or_read
+from .json_types import JsonObject
 from .lines import format_descriptions
 from .records.files import is_log, log_suffixes
 from .report.diagnose import probability, rms_text
@@ -62,7 +62,7 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
 
 def run_batch(
     jobs: list[LogJob], out: Path, processes: int | None, progress: Progress, scheduler: Scheduler = None
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Diagnose logs that are not diagnosed yet, in processes here or by a cluster's workers, and write `batch.csv`.
 
     Returns its rows.
@@ -83,7 +83,7 @@ def run_batch(
     return rows
 
 
-def _diagnose_log(job: LogJob) -> dict[str, Any]:
+def _diagnose_log(job: LogJob) -> JsonObject:
     """Diagnose a log and return its row of a batch."""
     from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
     from .report.diagnose import write_diagnosis_report
@@ -99,9 +99,9 @@ def _diagnose_log(job: LogJob) -> dict[str, Any]:
         return make_batch_row(job.log, None, str(error))
 
 
-def make_batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
+def make_batch_row(log: Path, summary: JsonObject | None, refused: str = "") -> JsonObject:
     """Make a row of `batch.csv` from a log's diagnosis, or from the reason why it was refused."""
-    row: dict[str, Any] = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
+    row: JsonObject = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
     if summary is None:
         return row
     row["verdict"] = summary["verdict"]
@@ -116,7 +116,7 @@ def make_batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = 
 _LONGEST_VERDICT = len("no discrepancy")
 
 
-def format_batch(rows: list[dict[str, Any]]) -> list[str]:
+def format_batch(rows: list[JsonObject]) -> list[str]:
     """Write the rows of a batch as a table for the terminal."""
     cells = []
     for row in rows:

@@ -7,9 +7,10 @@ Numbers are read in the units of data sheets and written in SI, each beside what
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .errors import InputError
+from .json_types import JsonObject
 from .units import on_a_line
 
 Unit = float | Callable[[float], float]
@@ -265,7 +266,7 @@ _ERROR_SHARE = 0.05
 """Of the largest speed: the velocity error that an observer may have."""
 
 
-def write_first_study(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> tuple[str, dict[str, Any]]:
+def write_first_study(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> tuple[str, JsonObject]:
     """Write a study with comments that `simulate`, `sweep` and `tune` can run.
 
     Args:
@@ -300,7 +301,7 @@ def write_first_study(kind: DriveKind, answers: Mapping[str, Answer], title: str
     return text, pilot_metrics
 
 
-def _check_motion(kind: DriveKind, pilot_metrics: Mapping[str, Any]) -> None:
+def _check_motion(kind: DriveKind, pilot_metrics: JsonObject) -> None:
     """Refuse a drive that its rated torque does not move."""
     options = {item.key or item.name: item.option for item in kind.items}
     if not pilot_metrics["motor"]["largest_velocity"] > 0.0:
@@ -316,7 +317,7 @@ def rename_to_geared(kind: DriveKind, answers: Mapping[str, Answer]) -> dict[str
     return {item.key or item.name: answers[item.name] for item in kind.items}
 
 
-def _parse_toml(text: str) -> dict[str, Any]:
+def _parse_toml(text: str) -> JsonObject:
     import tomllib
 
     return tomllib.loads(text)
@@ -454,7 +455,7 @@ def _choose_amplitude(answers: Mapping[str, Answer], waves: int) -> float:
     return min(value["torque"], lowest * math.sqrt(waves) + value["motor_friction"])
 
 
-def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: Mapping[str, Any]) -> tuple[float, float]:
+def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: JsonObject) -> tuple[float, float]:
     """Choose the velocity and position error (rad/s, rad; m/s, m) that the motor's observer may have.
 
     A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what
@@ -473,7 +474,7 @@ def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: Mapping[str
     return velocity, velocity * period + 4.0 * max(reading_errors)
 
 
-def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metrics: Mapping[str, Any]) -> str:
+def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metrics: JsonObject) -> str:
     """Describe in a sentence why estimates will be poor; "" if they will not."""
     velocity, _ = _choose_tolerances(rename_to_geared(kind, answers), pilot_metrics)
     share = velocity / pilot_metrics["motor"]["largest_velocity"]
@@ -488,7 +489,7 @@ def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metr
 def _write_observers(
     kind: DriveKind,
     answers: Mapping[str, Answer],
-    pilot_metrics: Mapping[str, Any],
+    pilot_metrics: JsonObject,
     gains: Mapping[str, tuple[float, float]],
     usual: tuple[float, float],
 ) -> str:

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from .errors import InputError, NoResult
+from .json_types import JsonObject
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,7 +83,7 @@ def checksum(content: bytes) -> str:
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> JsonObject:
     """Read a JSON object that a command wrote, and check it against its checksum, which is left out.
 
     Raises:
@@ -99,14 +100,14 @@ def read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def json_with_checksum(data: Mapping[str, Any]) -> str:
+def json_with_checksum(data: JsonObject) -> str:
     """Return an object as JSON text, with a checksum of all its other keys."""
     # the checksum is of the keys and numbers as they are read again
-    as_read: dict[str, Any] = json.loads(json.dumps(data))
+    as_read: JsonObject = json.loads(json.dumps(data))
     return json.dumps(as_read | {"checksum": _json_checksum(as_read)}, indent=1, ensure_ascii=False)
 
 
-def _json_checksum(data: Mapping[str, Any]) -> str:
+def _json_checksum(data: JsonObject) -> str:
     return checksum(json.dumps(data, sort_keys=True).encode())
 
 
@@ -387,7 +388,7 @@ def read_log_path(file: Path) -> str | None:
 
 def run_or_read(
     task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, Path], object], *, overwrite: bool
-) -> dict[str, Any]:
+) -> JsonObject:
     """Do a task on a log and write its results, unless an earlier call wrote the results of the same task.
 
     Args:

@@ -1,14 +1,14 @@
 """Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jaxbl import workers
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep
 from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
@@ -131,7 +131,7 @@ def identify(
     folder = folder_of(log[0], out)
     log_call = LogCall(log, model, holdout, next_experiment)
 
-    def steps(summary: Mapping[str, Any]) -> list[NextStep]:
+    def steps(summary: JsonObject) -> list[NextStep]:
         return after_identification(task, summary, repeat_call(context, folder), folder, log_call)
 
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
@@ -213,7 +213,7 @@ def diagnose(
     folder = folder_of(log[0], out)
     log_call = LogCall(log, model, holdout, next_experiment)
 
-    def steps(summary: Mapping[str, Any]) -> list[NextStep]:
+    def steps(summary: JsonObject) -> list[NextStep]:
         return after_diagnosis(task, summary, repeat_call(context, folder), folder, log_call)
 
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
@@ -338,7 +338,7 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
             keep = stack.enter_context(values_file(folder, task))
         ended = None if task.record is not None else stack.enter_context(watch_for_end_request())
 
-        def show(values: dict[str, Any]) -> None:
+        def show(values: JsonObject) -> None:
             if keep is not None:
                 keep(values)
             if as_json:

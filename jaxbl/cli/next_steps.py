@@ -1,10 +1,11 @@
 """Commands to try after a command, for its page and the terminal: only those that its result leaves open."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxbl.files import is_remote
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep, command_line
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def after_proposal(log: Path, model: Path) -> list[NextStep]:
 
 
 def after_identification(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: "LogCall"
+    task: "LogTask", summary: JsonObject, again: Sequence[str], folder: Path, log_call: "LogCall"
 ) -> list[NextStep]:
     """Propose commands after an identification.
 
@@ -96,7 +97,7 @@ def after_identification(
 
 
 def after_diagnosis(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: "LogCall"
+    task: "LogTask", summary: JsonObject, again: Sequence[str], folder: Path, log_call: "LogCall"
 ) -> list[NextStep]:
     """Propose commands after a diagnosis. Arguments as for :func:`after_identification`."""
     from jaxbl.diagnosis.diagnosis_summary import tied
@@ -115,7 +116,7 @@ def after_diagnosis(
     return [*steps, _explore_log(folder)]
 
 
-def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> list[NextStep]:
+def after_watch(task: "WatchTask", summary: JsonObject, model: Path) -> list[NextStep]:
     """Propose commands after a log was watched; a stream cannot be read again."""
     if task.record is None:
         return []
@@ -145,9 +146,7 @@ def _explore_log(folder: Path) -> NextStep:
     return NextStep(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
 
 
-def _propose_gap_experiment(
-    summary: Mapping[str, Any], again: Sequence[str], folder: Path, log_call: LogCall
-) -> list[NextStep]:
+def _propose_gap_experiment(summary: JsonObject, again: Sequence[str], folder: Path, log_call: LogCall) -> list[NextStep]:
     """The move that would show a gap to the motor's encoder alone, where the log does not."""
     backlash = summary.get("backlash")
     if backlash is None or backlash["shown"] or log_call.next_experiment is not None:

@@ -3,7 +3,7 @@
 import functools
 import inspect
 import json as json_format
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -11,6 +11,7 @@ import typer
 
 from jaxbl.errors import InputError, NoResult, escape_unprintable
 from jaxbl.files import list_paths, read_json
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep, format_steps
 from jaxbl.terminal import INTERRUPTED
 
@@ -34,7 +35,7 @@ class Outcome(NamedTuple):
     lines: list[str]
     folder: Path | None = None
     page: str = "report.html"
-    summary: Mapping[str, Any] | str | None = None
+    summary: JsonObject | str | None = None
     code: int = 0
     steps: Sequence[NextStep] = ()
     compact: bool = False
@@ -48,9 +49,9 @@ class Outcome(NamedTuple):
             for part in line.split("\n")
         ]
 
-    def data(self) -> dict[str, Any]:
+    def data(self) -> JsonObject:
         """Return the outcome as plain data, with the files in the folder but for a sweep's parts (there may be millions)."""
-        fields: dict[str, Any] = {"exit": self.code, "found": [line for line in self.lines if line]}
+        fields: JsonObject = {"exit": self.code, "found": [line for line in self.lines if line]}
         if self.folder is not None:
             files = [file for pattern in ("*.*", "figures/*.*") for file in list_paths(self.folder, pattern)]
             fields["folder"] = str(self.folder)
@@ -69,7 +70,7 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*, quiet: bool, json: bool, **arguments: Any) -> None:
-        report: dict[str, Any] = {}
+        report: JsonObject = {}
         indent: int | None = 1
         try:
             outcome = command(**arguments)
@@ -102,7 +103,7 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
 
 
 def with_options(
-    run: Callable[..., Any], command: Callable[..., Any], options: Mapping[str, Any], default: Any
+    run: Callable[..., Any], command: Callable[..., Any], options: JsonObject, default: Any
 ) -> Callable[..., Any]:
     """Give a function the arguments of a command, and further options that have one default."""
     signature = inspect.signature(command)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
@@ -93,7 +94,7 @@ def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]
     return _validate(name, data, origins), frozenset(missing)
 
 
-def _read_with_includes(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], Origins]:
+def _read_with_includes(source: str | Path | Mapping[str, Any]) -> tuple[str, JsonObject, Origins]:
     """Read a study with its included files. Returns its name for messages, the data, and the file of each key."""
     if isinstance(source, Mapping):
         data = dict(source)
@@ -119,7 +120,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     return config.log, ratio, config.nominal_drive()
 
 
-def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[dict[str, Any], Origins]:
+def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[JsonObject, Origins]:
     """A TOML file with what it includes; `chain` are the files that led here, `read` all so far. Files that it names become
     absolute."""
     data = _load(path)
@@ -131,7 +132,7 @@ def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[dict[str, An
     return _merge_includes(data, str(path), path.parent, [*chain, path.resolve()], read)
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> JsonObject:
     """A TOML file as it stands."""
     try:
         check_file(path, _MOST_BYTES)
@@ -161,14 +162,14 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _merge_includes(
-    data: dict[str, Any], name: str, folder: Path, chain: list[Path], read: list[Path]
-) -> tuple[dict[str, Any], Origins]:
+    data: JsonObject, name: str, folder: Path, chain: list[Path], read: list[Path]
+) -> tuple[JsonObject, Origins]:
     """Merge the included files (relative to `folder`) into the data. Returns it, and the file of each key."""
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise InputError(f"{name}: include: should be a file name or an array of them, not {abbreviate(files)}")
-    merged: dict[str, Any] = {}
+    merged: JsonObject = {}
     origins: Origins = {}
     for file in files:
         path = folder / file
@@ -188,7 +189,7 @@ def _merge_includes(
     return merged, origins
 
 
-def _origins_from_file(data: Mapping[str, Any], file: str) -> Origins:
+def _origins_from_file(data: JsonObject, file: str) -> Origins:
     """Return origins of keys that all come from one file."""
     return {
         name: Origin(file, _origins_from_file(element, file) if isinstance(element, Mapping) else {})
@@ -196,7 +197,7 @@ def _origins_from_file(data: Mapping[str, Any], file: str) -> Origins:
     }
 
 
-def _merge(into: dict[str, Any], data: dict[str, Any], new: Origins, origins: Origins) -> None:
+def _merge(into: JsonObject, data: JsonObject, new: Origins, origins: Origins) -> None:
     """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
     for name, value in data.items():
         old = into.get(name)
@@ -212,7 +213,7 @@ def _merge(into: dict[str, Any], data: dict[str, Any], new: Origins, origins: Or
             into[name], origins[name] = value, new[name]
 
 
-def _validate(name: str, data: dict[str, Any], origins: Origins) -> Config:
+def _validate(name: str, data: JsonObject, origins: Origins) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:

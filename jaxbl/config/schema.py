@@ -3,13 +3,15 @@
 from collections.abc import Iterator
 from typing import Any
 
+from jaxbl.json_types import JsonObject
+
 from .study import Config
 
 _LIMITS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
 """What pydantic leaves as it is on keys that may be left out."""
 
 
-def build_schema() -> dict[str, Any]:
+def build_schema() -> JsonObject:
     """The schema of a TOML study (draft 7), with units and meanings of its keys.
 
     A table may get its other keys from a file that the study includes, and commands on logs need less than others, so that
@@ -24,7 +26,7 @@ def build_schema() -> dict[str, Any]:
     return head | schema | {"$defs": definitions}
 
 
-def _find_array_tables(schema: dict[str, Any], tables: dict[str, Any]) -> set[str]:
+def _find_array_tables(schema: JsonObject, tables: JsonObject) -> set[str]:
     """Names of tables that occur in arrays alone."""
     merged: set[str] = set()
     waiting = list(_find_merged_tables(schema))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Path, effect_path, remembers_input
+from jaxbl.identification.regression import Path, Samples, SideSamples, effect_path, remembers_input
 from jaxbl.simulate import Experiment, with_effects
 
 
@@ -42,20 +42,20 @@ class Part(eqx.Module):
         before: input before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
-    time: Float[Array, " samples"]
-    torque: Float[Array, " samples"]
+    time: Samples
+    torque: Samples
     readings: Float[Array, "samples sides"]
-    position: dict[str, Float[Array, " samples"]]
-    velocity: dict[str, Float[Array, " samples"]]
-    acceleration: dict[str, Float[Array, " samples"]]
-    modelled: dict[str, Float[Array, " samples"]]
-    deviation: dict[str, Float[Array, " samples"]]
-    held: dict[str, Float[Array, " samples"]]
+    position: SideSamples
+    velocity: SideSamples
+    acceleration: SideSamples
+    modelled: SideSamples
+    deviation: SideSamples
+    held: SideSamples
     step: Float[Array, "samples states states"]
     force: Float[Array, "samples states inputs"]
     own: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
-    weight: Float[Array, " samples"]
+    weight: Samples
     before: Float[Array, " earlier"] | None = None
 
 

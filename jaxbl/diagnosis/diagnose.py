@@ -6,18 +6,18 @@ the fit has seen.
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config
+from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import Logs, arrays, gains_for
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
@@ -85,7 +85,7 @@ class Diagnosis:
     model: Config
     record: Record
     holdout: Record
-    summary: dict[str, Any]
+    summary: JsonObject
     trace: pd.DataFrame
     residuals: dict[str, list[Residual]]
     observed: dict[str, list[Observed]]
@@ -95,7 +95,7 @@ class Diagnosis:
     replays: bool
 
 
-def diagnose(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None) -> Diagnosis:
+def diagnose(log: Logs, model: ConfigSource, *, holdout: Logs | None = None) -> Diagnosis:
     """Find what a model lacks, add it, and prove on held-out data that the gap shrinks.
 
     Args:

@@ -15,6 +15,7 @@ from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import parameters
 from jaxbl.identification.free_parameters import FreeParameter
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
@@ -32,7 +33,7 @@ from .sentences import sentence_of
 from .setup import Setup
 
 
-def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str, Any]:
+def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObject:
     """The summary but for the proof, and for what the observers say."""
     task, record, located = setup.task, setup.task.record, setup.located
     fitted = accepted.fitted
@@ -95,8 +96,8 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str
 
 
 def _finding(
-    record: Record, one: Finding, values: Mapping[str, float], errors: Mapping[str, float], where: Mapping[str, Any]
-) -> dict[str, Any]:
+    record: Record, one: Finding, values: Mapping[str, float], errors: Mapping[str, float], where: JsonObject
+) -> JsonObject:
     units = {field.name: about.unit for field, about in parameters(EFFECTS[one.effect])}
     numbers = {
         leaf: {
@@ -124,7 +125,7 @@ def tested(
     after: Mapping[str, float],
     expected: Mapping[str, Expected],
     controls: Sequence[Control],
-) -> dict[str, Any]:
+) -> JsonObject:
     """What the held-out errors of a complete model would be, which of them are larger, and the controls; errors `before` and
     `after` with those of slow torques."""
     return {
@@ -150,7 +151,7 @@ def tested(
     }
 
 
-def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contradiction]) -> list[dict[str, Any]]:
+def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contradiction]) -> list[JsonObject]:
     """Numbers that two logs show to be different, in the log's units."""
     units = {one.path: record.unit_of(one.path, one.unit) for one in fitted.free}
     return [
@@ -163,7 +164,7 @@ def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contr
     ]
 
 
-def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
+def where_lacking(record: Record, located: Mapping[str, Localised]) -> JsonObject:
     """Where a model lacks torque, by side, with sentences in the log's units."""
     return {
         name: dataclasses.asdict(one) | {"sentence": sentence_of(one, record.unit_of(f"{name}.torque", "N m"))}
@@ -173,7 +174,7 @@ def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str,
 
 def observers_say(
     nominal: Experiment, observed: Mapping[str, Sequence[Observed]], setup: Setup
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[JsonObject, list[str]]:
     """What the observers of a model with their gains say of the torques that it lacks as given, by side, and notes where
     they say nothing."""
     found, notes = {}, []
@@ -196,7 +197,7 @@ def extended_study(
     config: Config,
     numbers: Mapping[str, Mapping[str, float]],
     values: Mapping[str, float],
-    tables: Sequence[Mapping[str, Any]] = (),
+    tables: Sequence[JsonObject] = (),
 ) -> Config:
     """The study with effects more, some of them tables of torques, and with these numbers."""
     data = config.to_dict()
@@ -205,7 +206,7 @@ def extended_study(
     return with_values(read_config(data), values)
 
 
-def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
+def tied(summary: JsonObject) -> tuple[str, str] | None:
     """The last finding that has an alternative, and that; None where nothing is tied."""
     findings = summary["findings"]
     if not findings or "rival" not in summary or not findings[-1]["alternatives"]:
@@ -213,7 +214,7 @@ def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> dict[str, Any]:
+def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> JsonObject:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.numbers, free_values(own, rival.theta)).to_dict()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
@@ -235,7 +236,7 @@ def trace_of(
     """
     task = setup.task
     whole = task.record if task.separate else task.holdout
-    columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
+    columns: JsonObject = {"t": whole.time, "u": whole.torque}
     columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
     if setup.nominal.transmission is not None:
         columns["twist"] = setup.nominal.plant.twist(whole.positions)

@@ -1,13 +1,10 @@
 """A diagnosis as a task: study, log, and what is held out of it; and which logs are refused."""
 
 import dataclasses
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from jaxbl.config import Config, read_model
+from jaxbl.config import ConfigSource, read_model
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
 from jaxbl.identification.segments import led_in
@@ -36,9 +33,7 @@ class DiagnosisTask(LogTask):
     separate: bool
 
 
-def read_diagnosis_task(
-    log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None
-) -> DiagnosisTask:
+def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None = None) -> DiagnosisTask:
     """Read study and logs; arguments as of :func:`jaxbl.diagnosis.diagnose.diagnose`.
 
     Raises:

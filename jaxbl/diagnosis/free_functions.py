@@ -5,11 +5,11 @@ them is an effect with a name; if one pays after all effects with names have had
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.fused import Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
 from .candidates import Candidate, MotionTorques, Torques
@@ -73,7 +73,7 @@ def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return found
 
 
-def _stopped(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+def _stopped(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of an element: it bends by the way over its length, and slides beyond 1."""
     (length,), (now,), (way,) = values, carry, inputs
     now = jnp.clip(now + way / length, -1.0, 1.0)

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused import Leaves
 from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
@@ -175,7 +176,7 @@ def _grams(part: Part, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarra
     return total
 
 
-def _backwards(_: list[Any], adjoint: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+def _backwards(_: Leaves, adjoint: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of an adjoint recursion: a matrix, row by row, and what is added."""
     count = len(adjoint)
     new = [inputs[count * count + i] for i in range(count)]

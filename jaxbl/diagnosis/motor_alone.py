@@ -7,7 +7,7 @@ Reference: R. Kass, A. Raftery, Bayes factors, J. American Statistical Associati
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,6 +23,7 @@ from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment, with_effects
@@ -47,7 +48,7 @@ class Found(NamedTuple):
     """What a diagnosis consists of: the study with what was missing, `diagnosis.json`, and the trace."""
 
     model: Config
-    summary: dict[str, Any]
+    summary: JsonObject
     trace: pd.DataFrame
 
 
@@ -215,7 +216,7 @@ def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread,
 
 def _summary(
     task: DiagnosisTask, search: _Search, alone: Alone, gains: Mapping[str, float], out: Sequence[str]
-) -> dict[str, Any]:
+) -> JsonObject:
     """As `diagnosis.json`."""
     record, model = task.record, search.model
     noise, unit = reading_noise(model.segments)["motor"], record.statistics.channels[POSITION_CHANNELS["motor"]].unit

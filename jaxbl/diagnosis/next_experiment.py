@@ -5,9 +5,8 @@ References: G. Box, W. Hill, Discrimination among mechanistic models, Technometr
 for discriminating between two rival models, Technometrics 7 (1965).
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.logs import LogTask, default_paths, on_record
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.unseen_load import GAPS
+from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, plant_trajectory
 
@@ -66,7 +66,7 @@ class Input(NamedTuple):
 
 def write_next_experiment(
     folder: Path,
-    summary: Mapping[str, Any],
+    summary: JsonObject,
     record: Record,
     path: Path,
     torque: float | None = None,
@@ -116,7 +116,7 @@ def check_gap_sought(task: LogTask) -> None:
 
 def write_gap_experiment(
     folder: Path,
-    summary: Mapping[str, Any],
+    summary: JsonObject,
     record: Record,
     path: Path,
     torque: float | None = None,
@@ -173,7 +173,7 @@ def _written(found: Input, record: Record, path: Path) -> str:
 
 
 def next_experiment(
-    summary: Mapping[str, Any], model: Config, record: Record, torque: float | None = None, travel: float | None = None
+    summary: JsonObject, model: Config, record: Record, torque: float | None = None, travel: float | None = None
 ) -> Input | None:
     """The input on which the last finding and its best alternative differ most; None where no input stays within limits.
 

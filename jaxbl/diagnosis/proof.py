@@ -1,13 +1,14 @@
 """The proof on what was held out: whether a model with the missing effects predicts it better, beside floor and controls."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters
 from jaxbl.identification.free_parameters import FreeParameter
+from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -259,12 +260,12 @@ class Proof:
             found.append(Control("permuted", shuffled.errors, beaten(self.other, shuffled, after)))
         return found
 
-    def gap(self, fitted: FittedModel, after: Comparison) -> dict[str, Any]:
+    def gap(self, fitted: FittedModel, after: Comparison) -> JsonObject:
         """Errors on held-out data before and after, and the noise."""
         task, other, nominal = self.setup.task, self.other, self.setup.nominal
         record, part = task.holdout, task.holdout.segments
         noise = other.noise_of(after)
-        found: dict[str, Any] = {
+        found: JsonObject = {
             "holdout": {
                 "file": str(record.path.resolve()),
                 "separate": task.separate,

@@ -8,13 +8,13 @@ Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, 
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.segments import Segment
+from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment, with_effects
 
 from .proof import SURE, Proof, beaten
@@ -69,11 +69,11 @@ class Tabulation:
     after: Comparison
     z: float
 
-    def effects(self) -> list[dict[str, Any]]:
+    def effects(self) -> list[JsonObject]:
         """The tables as effects of a study."""
         return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
 
-    def said(self) -> dict[str, Any]:
+    def said(self) -> JsonObject:
         """As JSON."""
         tables = {side: [dataclasses.asdict(one) for one in tables] for side, tables in self.tables.items()}
         return {"tables": tables, "z": self.z, "holdout_rmse": self.after.errors}
@@ -210,9 +210,9 @@ class _Fit:
         return cls(values, np.sqrt(np.diag(covariance)), np.array(squares))
 
 
-def _numbers(tables: Sequence[Table]) -> dict[str, Any]:
+def _numbers(tables: Sequence[Table]) -> JsonObject:
     """Tables as numbers of the effect."""
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for one in tables:
         points, torques = ("speeds", "speed_torques") if one.over == "speed" else ("positions", "position_torques")
         found |= {points: one.points.tolist(), torques: one.torques.tolist()} | (

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxbl.fused import Leaves
 from jaxbl.fused.jaxprs import ClosedJaxpr, trace
 
 from .lowering import (
@@ -65,6 +66,12 @@ class Block(NamedTuple):
     start_gives_outputs: bool = False
 
 
+Values = dict[str, Any]
+"""Traced numbers by their name or config path."""
+Outputs = dict[str, tuple[Any, str, str]]
+"""Value, unit and description of each output, by its name."""
+
+
 class Program(NamedTuple):
     """A block as operations, without states that nothing reads or that never change.
 
@@ -86,9 +93,9 @@ def trace_block(
     study_numbers: Mapping[str, StudyNumber],
     start_inputs: Sequence[Quantity],
     inputs: Sequence[Quantity],
-    start: Callable[[dict[str, Any], dict[str, Any]], Any],
-    step: Callable[[dict[str, Any], Any, dict[str, Any]], tuple[Any, dict[str, tuple[Any, str, str]]]],
-    outputs: Callable[[dict[str, Any], Any, dict[str, Any]], dict[str, Any]] | None = None,
+    start: Callable[[Values, Values], Any],
+    step: Callable[[Values, Any, Values], tuple[Any, Outputs]],
+    outputs: Callable[[Values, Any, Values], Values] | None = None,
 ) -> Block:
     """Trace the functions of a block.
 
@@ -107,12 +114,12 @@ def trace_block(
         state = jax.eval_shape(start, numbers, start_avals)
         output_descriptions: dict[str, tuple[str, str]] = {}
 
-        def flat_start(numbers: list[Any], begin: list[Any]) -> list[Any]:
+        def flat_start(numbers: Leaves, begin: Leaves) -> Leaves:
             study_values, start_values = dict(zip(study_numbers, numbers, strict=True)), _name_values(start_inputs, begin)
             state = start(study_values, start_values)
             return [*jax.tree.leaves(state), *(outputs(study_values, state, start_values).values() if outputs else ())]
 
-        def flat_step(numbers: list[Any], leaves: list[Any], sample: list[Any]) -> list[Any]:
+        def flat_step(numbers: Leaves, leaves: Leaves, sample: Leaves) -> Leaves:
             tree = jax.tree.structure(state).unflatten(leaves)
             new, out = step(dict(zip(study_numbers, numbers, strict=True)), tree, _name_values(inputs, sample))
             output_descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
@@ -144,7 +151,7 @@ def trace_block(
     )
 
 
-def _name_values(quantities: Sequence[Quantity], values: Sequence[Any]) -> dict[str, Any]:
+def _name_values(quantities: Sequence[Quantity], values: Sequence[Any]) -> Values:
     return {quantity.name: value for quantity, value in zip(quantities, values, strict=True)}
 
 

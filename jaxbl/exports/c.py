@@ -228,8 +228,8 @@ class _C(Writer):
         operands, name, real = operation.operands, operation.name, operation.out.dtype.kind == "f"
         texts = [self.text(value) for value in operands]
         logical = operands[0].dtype == bool
-        if name in _INFIX and not (logical and name in ("and", "or", "xor")):
-            return f"{texts[0]} {_INFIX[name]} {texts[1]}"
+        if name in C_INFIX and not (logical and name in ("and", "or", "xor")):
+            return f"{texts[0]} {C_INFIX[name]} {texts[1]}"
         if name in _LOGICAL and logical:
             return f"{texts[0]} {_LOGICAL[name]} {texts[1]}"
         if name == "not":
@@ -301,7 +301,7 @@ def _write_extreme(name: str, operands: Sequence[Value], texts: Sequence[str]) -
     return f"(({x} {'>' if name == 'max' else '<'} {y}) || ({x} != {x})) ? {x} : {y}"
 
 
-_INFIX = {
+C_INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "rem": "%", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==",
     "ne": "!=", "and": "&", "or": "|", "xor": "^",
 }  # fmt: skip

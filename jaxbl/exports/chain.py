@@ -10,7 +10,7 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, initial_state, step
 
-from .block import Block, Quantity, StudyNumber, trace_block
+from .block import Block, Outputs, Quantity, StudyNumber, Values, trace_block
 from .lowering import default_precision
 
 PERIOD = "run.sample_period"
@@ -56,18 +56,18 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
     positions = [Quantity(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
     torque = Quantity("input", "N m", "input torque, held from this sample to the next", dtype)
 
-    def start(numbers: dict[str, Any], inputs: dict[str, Any]) -> _ChainState:
+    def start(numbers: Values, inputs: Values) -> _ChainState:
         measured = {side: inputs[f"{side}_position"] for side in sides}
         zero = jnp.zeros((), jnp.int32)
         return _make_chain_state(initial_state(set_leaves(experiment, numbers), measured), zero, zero)
 
-    def sample(numbers: dict[str, Any], state: _ChainState, inputs: dict[str, Any]) -> tuple[_ChainState, dict[str, Any]]:
+    def sample(numbers: Values, state: _ChainState, inputs: Values) -> tuple[_ChainState, Outputs]:
         lane = set_leaves(experiment, numbers)
         measured = {side: inputs[f"{side}_position"] for side in sides}
         time = state.samples.astype(dtype) * lane.run.sample_period
         before = State(None, state.observer, state.equivalent_control, state.identifier)
         new, signals = step(lane, before, Sample(time, input=inputs["input"], measured=measured))
-        out: dict[str, Any] = {}
+        out: Outputs = {}
         for side in sides:
             estimates = signals.side(side)
             out |= {
@@ -104,13 +104,13 @@ def read_study_numbers(experiment: Experiment) -> dict[str, StudyNumber]:
     }
 
 
-def _identified_outputs(experiment: Experiment, state: State) -> dict[str, tuple[Any, str, str]]:
+def _identified_outputs(experiment: Experiment, state: State) -> Outputs:
     """Return what each side identifies of the law (0 while it is not determined), and whether it is determined."""
     identifier, law = experiment.identifier, experiment.transmission
     if identifier is None or law is None or state.identifier is None:
         return {}
     units = {key.rpartition(".")[2]: parameter.unit for key, parameter in leaf_paths(law).items()} | {"half_gap": "rad"}
-    out: dict[str, tuple[Any, str, str]] = {}
+    out: Outputs = {}
     solutions = identifier.solution(state.identifier)
     for side in experiment.sides:
         determined, theta = solutions[side]

@@ -13,7 +13,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
 from jaxbl.simulate import Experiment, move_plant
 
-from .block import Program, Quantity, lower_block, trace_block
+from .block import Outputs, Program, Quantity, Values, lower_block, trace_block
 from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
 from .lowering import default_precision, find_read_variables
 
@@ -112,22 +112,20 @@ def _lower_plant(
     unit = experiment.plant.input_unit
     torque = Quantity(_INPUT, unit, f"input{' torque' * (unit == 'N m')}, held from this sample to the next", dtype)
 
-    def place_numbers(study_values: dict[str, Any], arguments: dict[str, Any]) -> Experiment:
+    def place_numbers(study_values: Values, arguments: Values) -> Experiment:
         return set_leaves(
             experiment, study_values | {path: arguments[name] for path, name in numbers.items() if name in arguments}
         )
 
-    def start(study_values: dict[str, Any], arguments: dict[str, Any]) -> MovingDrive:
+    def start(study_values: Values, arguments: Values) -> MovingDrive:
         experiment = place_numbers(study_values, arguments)
         return MovingDrive(experiment.plant.init(experiment.initial), jnp.zeros((), jnp.int32))
 
-    def first_outputs(study_values: dict[str, Any], state: MovingDrive, arguments: dict[str, Any]) -> dict[str, Any]:
+    def first_outputs(study_values: Values, state: MovingDrive, arguments: Values) -> Values:
         outputs = _read_outputs(place_numbers(study_values, arguments), None, state.plant, jnp.zeros((), dtype))
         return {key: value for key, (value, _, _) in outputs.items()}
 
-    def step(
-        study_values: dict[str, Any], state: MovingDrive, arguments: dict[str, Any]
-    ) -> tuple[MovingDrive, dict[str, Any]]:
+    def step(study_values: Values, state: MovingDrive, arguments: Values) -> tuple[MovingDrive, Outputs]:
         placed = place_numbers(study_values, arguments)
         time = state.samples.astype(dtype) * placed.run.sample_period
         moved = move_plant(placed.plant, placed.run, state.plant, arguments[_INPUT], time)
@@ -140,13 +138,11 @@ def _lower_plant(
     )
 
 
-def _read_outputs(
-    experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any
-) -> dict[str, tuple[Any, str, str]]:
+def _read_outputs(experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any) -> Outputs:
     """Value, unit and description: those of :func:`jaxbl.simulate.step`, but for means over a sample, which are over the one
     that ends here, and 0 where none has."""
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
-    out: dict[str, tuple[Any, str, str]] = {}
+    out: Outputs = {}
     acceleration = {side: jnp.zeros_like(period) for side in drive.sides}
     if before is not None:
         acceleration = {side: (state.velocity[side] - before.velocity[side]) / period for side in drive.sides}

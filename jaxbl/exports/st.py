@@ -8,7 +8,7 @@ import numpy as np
 from jaxbl.fused import Unsupported
 
 from .block import Program
-from .c import describe_constant
+from .c import C_INFIX, describe_constant
 from .lowering import Constant, Operation, Value, Variable
 from .writer import Writer, to_ascii, write_shortest
 
@@ -119,8 +119,7 @@ class _St(Writer):
         return f"(* {text} *)"
 
     def define(self, out, text):
-        self._temporary.append((self.name(out), out.dtype))
-        self.assign(self.name(out), text)
+        self.declare(out, text)
 
     def declare(self, out, text):
         self._temporary.append((self.name(out), out.dtype))
@@ -155,7 +154,7 @@ class _St(Writer):
         kind, logical = st_type(out.dtype), operands[0].dtype == bool
         if name == "div" and out.dtype.kind == "f" and not isinstance(operands[1], Constant):
             # controllers stop at a division by zero
-            self._temporary.append((self.name(out), out.dtype))
+            self.declare(out, None)
             zero = f"{kind}#0.0"
             self._add_lines(
                 f"IF {texts[1]} <> {zero} THEN",
@@ -196,7 +195,7 @@ class _St(Writer):
     def _write_rounding(self, operation: Operation, x: str) -> None:
         """Write a rounding by a conversion, whichever neighbour it takes. Numbers beyond 2^30 stay as they are."""
         kind, out = st_type(operation.out.dtype), self.name(operation.out)
-        self._temporary.append((out, operation.out.dtype))
+        self.declare(operation.out, None)
         n, remainder = self._add_temporary(np.dtype(np.int32), "near"), self._add_temporary(operation.out.dtype, "rest")
         up, down = f"{out} := {out} + {kind}#1.0;", f"{out} := {out} - {kind}#1.0;"
         odd = f"{n} MOD DINT#2 <> DINT#0"
@@ -224,7 +223,7 @@ class _St(Writer):
     def _write_power_of_two(self, operation: Operation, n: str) -> None:
         """Write a power of two by squares of 2 or 1 / 2, which are exact."""
         kind, out = st_type(operation.out.dtype), self.name(operation.out)
-        self._temporary.append((out, operation.out.dtype))
+        self.declare(operation.out, None)
         left, factor = (
             self._add_temporary(np.dtype(np.int32), "remaining"),
             self._add_temporary(operation.out.dtype, "factor"),
@@ -254,7 +253,4 @@ def _is_integer(operation_by_variable: dict[Variable, Operation], value: Value) 
     )
 
 
-_INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "rem": "MOD", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=",
-    "ne": "<>", "and": "AND", "or": "OR", "xor": "XOR",
-}  # fmt: skip
+_INFIX = C_INFIX | {"rem": "MOD", "eq": "=", "ne": "<>", "and": "AND", "or": "OR", "xor": "XOR"}

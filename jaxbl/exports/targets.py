@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import is_empty, json_with_checksum, make_folder, read_json, remove_if_empty_on_error, write_atomic
 from jaxbl.fused import Unsupported
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.store import identity
 
 from .block import Program, Quantity, lower_block
@@ -55,7 +56,7 @@ class Files(NamedTuple):
     """Contents by file name, entries for `export.json`, and lines for the terminal."""
 
     contents: Mapping[str, str | bytes]
-    summary: Mapping[str, Any]
+    summary: JsonObject
     lines: list[str]
 
 
@@ -87,7 +88,7 @@ class Export(NamedTuple):
 
     folder: Path
     files: tuple[str, ...]
-    summary: Mapping[str, Any]
+    summary: JsonObject
     lines: list[str]
 
 
@@ -326,7 +327,7 @@ def _write_c_call(program: Program) -> list[str]:
     ]
 
 
-def _summarise(program: Program) -> dict[str, Any]:
+def _summarise(program: Program) -> JsonObject:
     block = program.block
     counts = count_operations(program.step)
     return {

@@ -11,11 +11,16 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 import jax
 
 SCAN_MESSAGE = "The fused loop does not support %s; the slower scan is used."
 """Message for the user; takes what is not supported."""
+
+
+Leaves = list[Any]
+"""Leaves of a tree: numbers or arrays, traced or not."""
 
 
 class Unsupported(Exception):

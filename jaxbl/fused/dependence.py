@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import Unsupported
+from . import Leaves, Unsupported
 from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate_equations, jaxpr_as_fun, read_variable, trace_inlined
 
 LANE_DTYPES = ("float32", "float64", "int32", "uint32", "int64", "bool")
@@ -38,7 +38,7 @@ class LaneSplit(NamedTuple):
         is_lane_result: for each result, True if the lanes' part makes it.
     """
 
-    shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
+    shared: Callable[[Sequence[Any], Any], tuple[Leaves, Leaves]]
     lane: ClosedJaxpr
     is_lane_result: list[bool]
 
@@ -132,7 +132,7 @@ def split_by_lane(
     lane_vars = [*jaxpr.invars[:count], *(v for v, is_lane in zip(carry_vars, is_lane_carry, strict=True) if is_lane)]
     shared_vars = [v for v, is_lane in zip(carry_vars, is_lane_carry, strict=True) if not is_lane]
 
-    def compute_shared(state: Sequence[Any], inputs: Any) -> tuple[list[Any], list[Any]]:
+    def compute_shared(state: Sequence[Any], inputs: Any) -> tuple[Leaves, Leaves]:
         env = constants | dict(zip(shared_vars, state, strict=True))
         env |= dict(zip(input_vars, jax.tree.leaves(inputs), strict=True))
         evaluate_equations(shared_equations, env)
@@ -141,7 +141,7 @@ def split_by_lane(
         ]
         return results, [env[v] for v in handed_over]
 
-    def compute_fixed() -> list[Any]:
+    def compute_fixed() -> Leaves:
         env = dict(constants)
         fixed_equations = [
             eqn for eqn in shared_equations if all(dependences[out] == Dependence.FIXED for out in eqn.outvars)
@@ -154,7 +154,7 @@ def split_by_lane(
             raise Unsupported(f"lanes that read {v.aval.dtype}{list(v.aval.shape) or ''}")
     fixed_numbers = [np.asarray(number)[()] for number in (jax.jit(compute_fixed)() if fixed else [])]
 
-    def compute_lane(*arguments: Any) -> list[Any]:
+    def compute_lane(*arguments: Any) -> Leaves:
         env = dict(zip([*fixed, *lane_vars, *handed_over], [*fixed_numbers, *arguments], strict=True))
         evaluate_equations(lane_equations, env)
         return [read_variable(env, out) for out in lane_results]
@@ -173,11 +173,11 @@ class StateSplit(NamedTuple):
     """
 
     is_stateless: list[bool]
-    compute_stateless: Callable[[Any], tuple[list[Any], list[Any]]]
+    compute_stateless: Callable[[Any], tuple[Leaves, Leaves]]
     step: ClosedJaxpr
 
 
-def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], inputs: Any) -> StateSplit:
+def split_by_state(function: Callable[..., tuple[Leaves, Leaves]], state: Sequence[Any], inputs: Any) -> StateSplit:
     """Split `f(state, inputs)` into what needs the state of the sample before, and what all samples can compute at once.
 
     Args:
@@ -195,7 +195,7 @@ def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: 
     output_dependences = [Dependence.SHARED if stateless else Dependence.LANE for stateless in is_stateless]
     carry_dependences = [Dependence.LANE] * count + output_dependences
 
-    def combine(values: Any, carry: list[Any], inputs: Any) -> list[Any]:
+    def combine(values: Any, carry: Leaves, inputs: Any) -> Leaves:
         state, outputs = function(carry[:count], inputs)
         return [*state, *outputs]
 
@@ -206,7 +206,7 @@ def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: 
         jnp.zeros(slot.shape, slot.dtype) for slot, stateless in zip(slots, is_stateless, strict=True) if not stateless
     ]
 
-    def step(state: list[Any], read: list[Any]) -> list[Any]:
+    def step(state: Leaves, read: Leaves) -> Leaves:
         return jaxpr_as_fun(parts.lane)(*state, *unread, *read)
 
     read = parts.lane.jaxpr.invars[count + len(unread) :]

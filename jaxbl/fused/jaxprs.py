@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax.extend.core import JaxprEqn, Literal, Var
 from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
 
+from . import Leaves
+
 ClosedJaxpr = Any
 """What `jax.make_jaxpr` returns: constants and a jaxpr until JAX 0.10, a jaxpr with them inside from 0.11 on."""
 _CALLS = ("jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
@@ -73,7 +75,7 @@ def join_multiply_add(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> 
                 product_of_sum[eqn.outvars[0]] = product
     joined = set(product_of_sum.values())
 
-    def evaluate_joined(*arguments: Any) -> list[Any]:
+    def evaluate_joined(*arguments: Any) -> Leaves:
         env = _bind_arguments(closed, arguments)
         for eqn in jaxpr.eqns:
             out = next(iter(eqn.outvars), None)
@@ -142,7 +144,7 @@ def _path_in_package(file: str) -> str:
     return "/".join(parts[len(parts) - parts[::-1].index("jaxbl") :]) if "jaxbl" in parts else ""
 
 
-def _evaluate_replaced(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *arguments: Any) -> list[Any]:
+def _evaluate_replaced(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *arguments: Any) -> Leaves:
     jaxpr = closed.jaxpr
     env = _bind_arguments(closed, arguments)
     for eqn in jaxpr.eqns:

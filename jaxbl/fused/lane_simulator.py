@@ -23,6 +23,7 @@ from jaxbl.simulate import (
     initial_carry,
 )
 
+from . import Leaves
 from .dependence import Dependence, LoopHooks, find_carry_dependences, split_by_lane
 from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
 from .noise import host_device
@@ -87,20 +88,20 @@ class LaneSimulator(abc.ABC):
         dtype = jnp.result_type(experiment.run.sample_period)
         self._dtype = np.dtype(dtype)
 
-        def place_values(values: list[Any]) -> Experiment:
+        def place_values(values: Leaves) -> Experiment:
             return set_leaves(experiment, dict(zip(paths, values, strict=True)))
 
-        def start(values: list[Any], *_: Any) -> Any:
+        def start(values: Leaves, *_: Any) -> Any:
             return initial_carry(place_values(values), reducers)
 
-        def step(values: list[Any], carry: Any, sample_inputs: Any) -> Any:
+        def step(values: Leaves, carry: Any, sample_inputs: Any) -> Any:
             return advance_sample(place_values(values), reducers, carry, *sample_inputs)[0]
 
-        def finish_block(values: list[Any], carry: Any, _: Any) -> Any:
+        def finish_block(values: Leaves, carry: Any, _: Any) -> Any:
             carry = end_block(place_values(values), carry)
             return carry, all_done(place_values(values), reducers, carry)
 
-        def finish(values: list[Any], carry: Any, _: Any) -> dict[str, Any]:
+        def finish(values: Leaves, carry: Any, _: Any) -> dict[str, Any]:
             return compute_metrics(place_values(values), reducers, carry)
 
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbl.workers import map_in_threads
 
-from . import program_cache
+from . import Leaves, program_cache
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 _NEGLIGIBLE = 1e-60
@@ -86,8 +86,8 @@ def _sample_function(states: int, sides: int) -> Any:
     """One sample of the recursion, as a function of scalars."""
 
     def sample(
-        change: list[Any], gains: list[Any], transition: list[Any], forcing: list[Any], readings: list[Any]
-    ) -> tuple[list[Any], list[Any]]:
+        change: Leaves, gains: Leaves, transition: Leaves, forcing: Leaves, readings: Leaves
+    ) -> tuple[Leaves, Leaves]:
         errors = [readings[i] - change[i] for i in range(sides)]
         corrected = list(change)
         for i in range(2 * sides):

@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import Unsupported
+from . import Leaves, Unsupported
 from .dependence import split_by_state
 from .jaxprs import trace_inlined
 from .llvm import Loop
 from .noise import LONGEST_SPAN, draw_noise
 
-SharedValues = tuple[list[Any], list[Any], list[Any]]
+SharedValues = tuple[Leaves, Leaves, Leaves]
 """State of the shared part after a span, outputs of each block `(blocks,)`, and outputs of each sample `(samples,)`."""
-SharedPartRunner = Callable[[list[Any], int, int, int], SharedValues]
+SharedPartRunner = Callable[[Leaves, int, int, int], SharedValues]
 """Computes a span from the state before it, the seed, its first sample and its number of samples."""
 
 
@@ -34,8 +34,8 @@ class SharedPart(NamedTuple):
         block_length: samples of a block.
     """
 
-    step: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
-    end_block: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
+    step: Callable[[Sequence[Any], Any], tuple[Leaves, Leaves]]
+    end_block: Callable[[Sequence[Any], Any], tuple[Leaves, Leaves]]
     state: list[jax.ShapeDtypeStruct]
     sides: tuple[str, ...]
     steps: int
@@ -61,7 +61,7 @@ class SharedPartScan:
     """Runs a shared part by XLA, sample by sample."""
 
     def __init__(self, part: SharedPart):
-        def run_block(state: list[Any], inputs: Any) -> SharedValues:
+        def run_block(state: Leaves, inputs: Any) -> SharedValues:
             state, sample_outputs = jax.lax.scan(part.step, state, inputs)
             return *part.end_block(state, ()), sample_outputs
 
@@ -69,7 +69,7 @@ class SharedPartScan:
         lengths = {min(part.block_length, part.steps), part.steps % part.block_length} - {0}
         self._programs = {n: jax.jit(run_block).lower(part.state, part.input_shapes(n)).compile() for n in lengths}
 
-    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
+    def __call__(self, state: Leaves, seed: int, first: int, count: int) -> SharedValues:
         outputs = []
         for start in range(0, count, self._part.block_length):
             length = min(self._part.block_length, count - start)
@@ -98,7 +98,7 @@ class SharedPartLoop:
         dtypes = [leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(compute_stateless, inputs))]
         self._groups = [[i for i, other in enumerate(dtypes) if other == dtype] for dtype in dict.fromkeys(dtypes)]
 
-        def compute_stacked(inputs: Any) -> list[Any]:
+        def compute_stacked(inputs: Any) -> Leaves:
             leaves = jax.tree.leaves(compute_stateless(inputs))
             return [jnp.stack([leaves[i] for i in group]) for group in self._groups]
 
@@ -113,7 +113,7 @@ class SharedPartLoop:
             self._sample_dtypes = [out.dtype for out in split.step.out_avals[count:]]
             self._loop = Loop(split.step, np.dtype(float), carry=count, lanes=1, after_block=end_block)
 
-    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
+    def __call__(self, state: Leaves, seed: int, first: int, count: int) -> SharedValues:
         part = self._part
         stacks = self._compute_stacked(part.sample_inputs(seed, first, part.span_length))
         columns: dict[int, np.ndarray] = {}

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import program_cache
+from . import Leaves, program_cache
 
-SampleFunction = Callable[[list[Any], list[Any], list[Any]], tuple[list[Any], list[Any]]]
+SampleFunction = Callable[[Leaves, Leaves, Leaves], tuple[Leaves, Leaves]]
 """From values, carry and a sample's inputs to the next carry and the sample's outputs."""
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 

@@ -19,7 +19,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, correct_by_readings, move_plant
 from jaxbl.workers import map_in_threads
 
-from . import Unsupported, program_cache
+from . import Leaves, Unsupported, program_cache
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -313,12 +313,12 @@ class _PlantStructure(NamedTuple):
     def build_experiment(self, numbers: Sequence[Any], replacements: Mapping[int, Any]) -> Experiment:
         """The experiment from the numbers that a step reads, with replacements by leaf index; all other leaves are zero."""
         # of NumPy, so that they leave no trace
-        leaves: list[Any] = [np.zeros(shape, dtype) for shape, dtype in self.leaf_types]
+        leaves: Leaves = [np.zeros(shape, dtype) for shape, dtype in self.leaf_types]
         for i, number in zip(_read_indices(self), numbers, strict=True):
             leaves[i] = replacements.get(i, number)
         return self.experiment_tree.unflatten(leaves)
 
-    def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> list[Any]:
+    def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> Leaves:
         """Leaves of the plant's state one sample later."""
         new = move_plant(experiment.plant, experiment.run, self.state_tree.unflatten(state), torque, time)
         return jax.tree.leaves(new)
@@ -344,7 +344,7 @@ def _read_indices(structure: _PlantStructure) -> tuple[int, ...]:
 def _find_read_indices(structure: _PlantStructure) -> tuple[int, ...]:
     from .jaxprs import trace_inlined
 
-    def step(leaves: list[Any], state: list[Any], torque: Any, time: Any) -> list[Any]:
+    def step(leaves: Leaves, state: Leaves, torque: Any, time: Any) -> Leaves:
         return structure.step(structure.experiment_tree.unflatten(leaves), state, torque, time)
 
     leaves = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in structure.leaf_types]
@@ -373,7 +373,7 @@ def _compile_once(define: Callable[..., program_cache.LoopDefinition]) -> Any:
 def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
     """The loop from state, numbers, first time and gains, and a sample's index, torque, readings and varying numbers."""
 
-    def sample(state: list[Any], numbers: list[Any], start: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
+    def sample(state: Leaves, numbers: Leaves, start: Any, gains: Leaves, index: Any, inputs: Leaves) -> Any:
         torque, *readings = inputs[: 1 + len(sides)]
         experiment = structure.build_experiment(numbers, dict(zip(varying, inputs[1 + len(sides) :], strict=True)))
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
@@ -396,9 +396,9 @@ def _derivatives_loop(structure: _PlantStructure, varying: tuple[int, ...] = ())
     torque."""
 
     def differentiate(
-        state: list[Any], torque: Any, time: Any, varied: list[Any], numbers: list[Any], tangent: tuple[Any, ...]
-    ) -> tuple[list[Any], list[Any]]:
-        def step(numbers: list[Any], state: list[Any], torque: Any) -> list[Any]:
+        state: Leaves, torque: Any, time: Any, varied: Leaves, numbers: Leaves, tangent: tuple[Any, ...]
+    ) -> tuple[Leaves, Leaves]:
+        def step(numbers: Leaves, state: Leaves, torque: Any) -> Leaves:
             return structure.step(structure.build_experiment(numbers, {}), state, torque, time)
 
         replacements = dict(zip(varying, varied, strict=True))

@@ -23,7 +23,7 @@ from jaxbl.simulate import (
     initial_carry,
 )
 
-from . import Unsupported
+from . import Leaves, Unsupported
 from .jaxprs import trace_inlined
 from .llvm import Loop
 from .noise import host_device
@@ -47,13 +47,13 @@ def record_run(
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
         names: list[str] = []
 
-        def step(state: Any, sample_inputs: Any) -> tuple[list[Any], list[Any]]:
+        def step(state: Any, sample_inputs: Any) -> tuple[Leaves, Leaves]:
             carry, signals = advance_sample(experiment, reducers, tree.unflatten(state), *sample_inputs)
             row = record(carry[0], signals)
             names[:] = row
             return jax.tree.leaves(carry), list(row.values())
 
-        def finish_block(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
+        def finish_block(state: Any, _: Any) -> tuple[Leaves, Leaves]:
             return jax.tree.leaves(end_block(experiment, tree.unflatten(state))), []
 
         def finish(*state: Any) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def record_run(
     return metrics, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}
 
 
-def _call_once(function: Callable[..., Any], *numbers: Any) -> list[Any]:
+def _call_once(function: Callable[..., Any], *numbers: Any) -> Leaves:
     """Call a function of numbers; returns the leaves of its result. A loop compiles faster than XLA."""
     closed = trace_inlined(function, *(jax.ShapeDtypeStruct((), jnp.result_type(number)) for number in numbers))
     try:

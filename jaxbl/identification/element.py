@@ -15,6 +15,7 @@ from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFricti
 from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, Number, element_error
 from jaxbl.records.inspection import element_displacement, element_noise, fit_record_element
@@ -71,9 +72,9 @@ class ElementIdentification:
 
     task: ElementTask
     found: Element
-    summary: dict[str, Any]
+    summary: JsonObject
     trace: pd.DataFrame
-    tables: dict[str, Any]
+    tables: JsonObject
 
 
 def read_element_task(
@@ -148,7 +149,7 @@ def _path(name: str) -> str:
     return f"effects.{effect}.{key}" if effect else name
 
 
-def _entry(one: Number) -> dict[str, Any]:
+def _entry(one: Number) -> JsonObject:
     return {
         "value": one.value,
         "standard_error": one.error,
@@ -158,7 +159,7 @@ def _entry(one: Number) -> dict[str, Any]:
     }
 
 
-def _summary(task: ElementTask, found: Element) -> dict[str, Any]:
+def _summary(task: ElementTask, found: Element) -> JsonObject:
     record = task.record
     kept = {name: one for name, one in found.numbers.items() if name not in found.open}
     summary = {
@@ -188,13 +189,13 @@ def _summary(task: ElementTask, found: Element) -> dict[str, Any]:
     return summary
 
 
-def _tables(found: Element) -> dict[str, Any]:
+def _tables(found: Element) -> JsonObject:
     value = {name: one.value for name, one in found.numbers.items() if name not in found.open}
     law = DeadZone if "half_gap" in value else LinearShaft
     transmission = {"law": law.name, "stiffness": value["stiffness"]}
     if "half_gap" in value:
         transmission["half_gap"] = value["half_gap"]
-    effects: dict[str, dict[str, Any]] = {}
+    effects: dict[str, JsonObject] = {}
     for name, (kind, key) in _EFFECTS.items():
         if name in value:
             effects.setdefault(kind, {"kind": kind})[key] = value[name]

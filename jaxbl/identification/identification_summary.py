@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxbl.config import Config
 from jaxbl.drive.parameters import leaf_paths, set_leaves
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
@@ -23,15 +24,13 @@ from .segments import long_enough, reading_noise, segments_of, windows_of
 from .trajectory import Fit, projected_residual
 
 
-def torque_errors(
-    record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int
-) -> dict[str, dict[str, Any]]:
+def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
     """How far a model misses the torques of a log after decimation, by equation, with units."""
     found = errors(experiment, parts, factor) if parts else {}
     return {name: one | {"unit": record.unit_of(name, "N m")} for name, one in found.items()}
 
 
-def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
+def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> JsonObject:
     """How well the numbers found serve another log, beside the nominal ones, in windows of `samples` where it is so long."""
     period = jnp.asarray(record.sample_period)
     rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
@@ -59,12 +58,12 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     }
 
 
-def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
+def _derived(experiment: Experiment, found: Found) -> JsonObject:
     """What else the law's numbers say (half_gap beside dead_zone), with standard errors by the delta method."""
     if experiment.transmission is None:
         return {}
 
-    def others(theta: jax.Array) -> dict[str, Any]:
+    def others(theta: jax.Array) -> JsonObject:
         at = set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(found.free)})
         assert at.transmission is not None
         known = {path.rpartition(".")[2] for path in leaf_paths(at) if path.startswith("transmission.")}
@@ -79,7 +78,7 @@ def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     return derived
 
 
-def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
+def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, JsonObject]:
     """Values with standard errors and 95 % intervals, by path."""
     theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
     return {
@@ -96,7 +95,7 @@ def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: 
 
 def by_regression(
     nominal: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, record: Record
-) -> dict[str, Any]:
+) -> JsonObject:
     """Least squares on the equations of motion; numbers that they do not show are left out."""
     found = regress(nominal, free, parts, factor)
     information = np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian)
@@ -114,10 +113,10 @@ def by_regression(
     }
 
 
-def by_trajectories(found: Found, record: Record) -> dict[str, Any]:
+def by_trajectories(found: Found, record: Record) -> JsonObject:
     """How the trajectory fit went."""
 
-    def by_path(values: Any) -> dict[str, Any]:
+    def by_path(values: Any) -> JsonObject:
         return dict(zip([one.path for one in found.free], values, strict=True))
 
     return {
@@ -134,7 +133,7 @@ def by_trajectories(found: Found, record: Record) -> dict[str, Any]:
     }
 
 
-def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> dict[str, Any]:
+def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> JsonObject:
     """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
     noise = {side: float(one) for side, one in found.windows.noise.items()}
     record, width = task.record, np.asarray(found.spread.covariance)

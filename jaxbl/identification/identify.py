@@ -6,17 +6,16 @@ with the recursive identifier (27)-(28) on their equivalent control.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, read_model, with_values
+from jaxbl.config import Config, ConfigSource, read_model, with_values
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
@@ -51,14 +50,14 @@ class Identification:
     config: Config
     model: Config
     record: Record
-    summary: dict[str, Any]
+    summary: JsonObject
     trace: pd.DataFrame
     replays: bool
 
 
 def read_identification_task(
     log: Logs,
-    model: str | Path | Mapping[str, Any] | Config,
+    model: ConfigSource,
     *,
     parameters: Sequence[str] | None = None,
     holdout: Logs | None = None,
@@ -82,7 +81,7 @@ def read_identification_task(
 
 def identify(
     log: Logs,
-    model: str | Path | Mapping[str, Any] | Config,
+    model: ConfigSource,
     *,
     parameters: Sequence[str] | None = None,
     holdout: Logs | None = None,
@@ -143,7 +142,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         trace = pd.DataFrame(columns_of(record, segments, fitted, found) | chain)
         factor = decimation(config, record)
         parts = long_enough(segments, factor)
-        method: dict[str, Any] = {"recursive": recursive, "trajectory": by_trajectories(found, record)}
+        method: JsonObject = {"recursive": recursive, "trajectory": by_trajectories(found, record)}
         if parts:
             method["regression"] = by_regression(nominal, found.free, parts, factor, record)
         done()

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
@@ -56,8 +57,8 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
 
 @jit
 def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    def keep(state: State, signals: Signals) -> dict[str, Any]:
-        row: dict[str, Any] = {}
+    def keep(state: State, signals: Signals) -> JsonObject:
+        row: JsonObject = {}
         if signals.twist is not None:
             row["twist"] = signals.twist
         for side in experiment.sides:
@@ -74,7 +75,7 @@ def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax
 
 def observer_chain(
     experiment: Experiment, segments: Sequence[Segment], samples: int
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+) -> tuple[dict[str, np.ndarray], JsonObject]:
     """The paper's chain on the longest segment: observers, and the recursive identifier on their equivalent control.
 
     Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.
@@ -88,7 +89,7 @@ def observer_chain(
     columns = {name: np.full(samples, np.nan) for name in dict.fromkeys([*names, *kept])}
     for name, column in columns.items():
         column[longest.rows] = np.asarray(kept[name])
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     if experiment.transmission is not None:
         for name in experiment.transmission.truth():
             found[name] = {side: float(kept[f"{side}.{name}"][-1]) for side in experiment.sides}

@@ -13,6 +13,7 @@ from jaxbl.config import Config
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
@@ -225,7 +226,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     return columns
 
 
-def gap_summary(alone: Alone) -> dict[str, Any] | None:
+def gap_summary(alone: Alone) -> JsonObject | None:
     """What the motor says of the gap, as `backlash` of `identification.json`; None where the model has none."""
     if alone.gap is None:
         return None
@@ -245,7 +246,7 @@ def gap_summary(alone: Alone) -> dict[str, Any] | None:
     }
 
 
-def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.ndarray | None = None) -> dict[str, Any]:
+def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
     """How well the numbers found predict another log of the motor, beside the nominal ones.
 
     `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.

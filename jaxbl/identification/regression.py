@@ -28,6 +28,11 @@ _PASSES = 3
 """Fits, each with the weights of the residuals of the one before."""
 
 
+Samples = Float[Array, " samples"]
+SideSamples = dict[str, Samples]
+"""A number a sample, of each side."""
+
+
 class Path(eqx.Module):
     """What effects see along a log.
 
@@ -38,10 +43,10 @@ class Path(eqx.Module):
         before: commanded before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
-    time: Float[Array, " samples"]
-    torque: Float[Array, " samples"]
-    position: dict[str, Float[Array, " samples"]]
-    velocity: dict[str, Float[Array, " samples"]]
+    time: Samples
+    torque: Samples
+    position: SideSamples
+    velocity: SideSamples
     before: Float[Array, " earlier"] | None = eqx.field(default=None, kw_only=True)
 
 
@@ -53,8 +58,8 @@ class Kinematics(Path):
         transmitted: measured transmitted torque in N m, shape (samples,), or None.
     """
 
-    acceleration: dict[str, Float[Array, " samples"]]
-    transmitted: Float[Array, " samples"] | None = None
+    acceleration: SideSamples
+    transmitted: Samples | None = None
 
 
 def kinematics_from(
@@ -88,8 +93,8 @@ class Balance(NamedTuple):
         drive: torque that drives the side (input or transmitted torque; the measured one for the transmission), N m.
     """
 
-    residual: Float[Array, " samples"]
-    drive: Float[Array, " samples"]
+    residual: Samples
+    drive: Samples
 
 
 def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance]:
@@ -114,9 +119,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
 
 
 @jit
-def model_torques(
-    experiment: Experiment, kinematics: Kinematics, deviation: dict[str, Float[Array, " samples"]]
-) -> dict[str, Float[Array, " samples"]]:
+def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: SideSamples) -> SideSamples:
     """Torques by a model at known kinematics, N m: `transmission`, and what effects take on each side that has any.
 
     Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
@@ -143,13 +146,13 @@ def model_torques(
 
 
 @jit
-def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples"]:
+def transmitted(experiment: Experiment, k: Kinematics) -> Samples:
     """Transmitted torque by a model at known kinematics, N m."""
     gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))
     return _transmitted(gear.plant, k, effect_path(gear, k)[0])
 
 
-def _transmitted(plant: Plant, k: Kinematics, states: EffectStates) -> Float[Array, " samples"]:
+def _transmitted(plant: Plant, k: Kinematics, states: EffectStates) -> Samples:
     return jax.vmap(plant.transmitted_torque)(k.position, k.velocity, states)[0]
 
 
@@ -167,7 +170,7 @@ def remembers_input(effect: AbstractEffect) -> bool:
 @jit
 def begun(
     experiment: Experiment,
-    torque: Float[Array, " samples"],
+    torque: Samples,
     before: Float[Array, " earlier"] | None = None,
     from_rest: bool = False,
 ) -> EffectStates:
@@ -194,9 +197,7 @@ def begun(
 
 
 @jit
-def effect_path(
-    experiment: Experiment, path: Path, from_rest: bool = False
-) -> tuple[EffectStates, Float[Array, " samples"]]:
+def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[EffectStates, Samples]:
     """The effects' own states at each sample of a known motion, and the torque (N m) that acts; they begin as
     :func:`begun` says."""
     plant, period = experiment.plant, experiment.run.sample_period
@@ -232,7 +233,7 @@ def effect_states(experiment: Experiment, path: Path) -> EffectStates:
     return effect_path(experiment, path)[0] if jax.tree.leaves(none) else none
 
 
-def decimate(values: Float[Array, " samples"], factor: int) -> Float[Array, " less"]:
+def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
     """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
     if factor == 1:
         return values

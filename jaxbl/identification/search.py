@@ -3,13 +3,13 @@
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment
 
 from .free_parameters import FreeParameter, set_free_parameters
@@ -79,7 +79,7 @@ class Found(Fitted):
     refused: list[Refusal]
     held: list[str]
     condition: float
-    starts: list[dict[str, Any]]
+    starts: list[JsonObject]
 
 
 def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ class ParameterSearch:
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
         return windows_of(self.segments, self.experiment, samples, self.rest)
 
-    def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[JsonObject]]:
         """Best of several starts, on short windows from all over the record.
 
         Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.

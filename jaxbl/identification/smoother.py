@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbl.fused import Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
 _SMOOTHNESS = 1e-14, 1e4
@@ -81,7 +82,7 @@ _FULL = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Where they stand in it."""
 
 
-def _predicted(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+def _predicted(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the Kalman filter, in units of noise and period; kept: state and covariance of the prediction, its error
     and that one's variance."""
     (smoothness,), x, (y,) = values, carry[:3], inputs
@@ -99,20 +100,20 @@ def _predicted(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[
     return [a + b + 0.5 * c, b + c, c, *new], [*carry, e, s]
 
 
-def _innovation(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+def _innovation(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """As :func:`_predicted`; kept: error and variance alone."""
     new, found = _predicted(values, carry, inputs)
     return new, found[-2:]
 
 
-def _corrected(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the backward pass, from what the filter kept there; kept: smoothed state and covariance."""
     x, (e, s) = inputs[:3], inputs[9:]
     p = [[inputs[3 + i] for i in row] for row in _FULL]
     large = [[carry[3 + i] for i in row] for row in _FULL]
     gain = [p[i][0] / s for i in range(3)]
 
-    def dot(some: list[Any], others: list[Any]) -> Any:
+    def dot(some: Leaves, others: Leaves) -> Any:
         return some[0] * others[0] + some[1] * others[1] + some[2] * others[2]
 
     # with C = 1 - K C: C' small, less the error; C' large C, and the precision of the reading
@@ -137,13 +138,13 @@ def _corrected(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[
     return [a, a + b, 0.5 * a + b + c, *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
 
 
-def _along(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[np.ndarray]:
+def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> list[np.ndarray]:
     """What a function of a sample keeps along a signal, or along several side by side; numbers are one lane."""
     found = scan_signal(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
     return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
 
 
-def _start(position: Any) -> list[Any]:
+def _start(position: Any) -> Leaves:
     """Nothing is known at first but the size of things."""
     largest = np.max(np.abs(np.diff(position, axis=0)), axis=0)
     spread = [_SPREAD**2 * size**2 + 1.0 for size in (1.0, largest, largest)]
@@ -151,7 +152,7 @@ def _start(position: Any) -> list[Any]:
     return [position[0], zero, zero, spread[0] + zero, zero, zero, spread[1], zero, spread[2]]
 
 
-def _first(position: Any, smoothness: Any) -> list[Any]:
+def _first(position: Any, smoothness: Any) -> Leaves:
     """State and covariance at the first sample by a filter that runs backwards, as good as unknown: the spread tenfold.
 
     From an altogether unknown one the backward pass would lose all digits in the covariance of the first samples.

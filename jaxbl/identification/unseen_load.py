@@ -25,7 +25,7 @@ from scipy.special import chdtri
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.drive.plant import EffectStates, PlantState
+from jaxbl.drive.plant import AbstractDrive, EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
@@ -668,24 +668,22 @@ class _Search:
 
     def _crossings(self, point: Point) -> int:
         """How often the load changes flanks."""
-        half = self.half(point.theta[self.place])
-        ratio = float(self.model.experiment.plant.drive.ratio("load"))
-        states = self.model.states(point.theta, point.start, point.smoothness)
-        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), half) for one in states)
+        return self._turns(point, self.model.experiment.plant.drive, self.half(point.theta[self.place]))
 
     def _reversals(self, point: Point) -> int:
         """How often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
         experiment = set_leaves(self.model.experiment, self.model.numbers(point.theta))
         plant = experiment.plant
         assert plant.transmission is not None
-        ratio, least = float(plant.drive.ratio("load")), 0.05 * self.model.torque / float(plant.transmission.stiffness)
-        states = self.model.states(point.theta, point.start, point.smoothness)
-        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), least) for one in states)
+        return self._turns(point, plant.drive, 0.05 * self.model.torque / float(plant.transmission.stiffness))
 
-
-def _changes(values: np.ndarray, size: float) -> int:
-    """Changes of sign between values of at least some size."""
-    return int(np.count_nonzero(np.diff(np.sign(values[np.abs(values) >= size]))))
+    def _turns(self, point: Point, drive: AbstractDrive, size: float) -> int:
+        """Changes of sign of the twist between values of at least some size, rad."""
+        ratio, changes = float(drive.ratio("load")), 0
+        for one in self.model.states(point.theta, point.start, point.smoothness):
+            twist = np.asarray(one.position["motor"] - ratio * one.position["load"])
+            changes += int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size]))))
+        return changes
 
 
 def fitted(model: UnseenLoad) -> Point:

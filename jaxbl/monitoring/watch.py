@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import pandas as pd
@@ -18,6 +17,7 @@ from jaxbl.config import Config, ConfigSource, prepare, read_model
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import on_record, read_logs
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import (
     Datagrams,
@@ -51,7 +51,7 @@ _POLL = 0.1
 _QUIET = 10.0
 """Seconds between remarks on a stream from which nothing comes, or from which rows are left out."""
 
-Values = dict[str, Any]
+Values = JsonObject
 """What is known at a time; keys are the columns of `watch.csv`."""
 
 
@@ -91,7 +91,7 @@ class Watch:
     """
 
     task: WatchTask
-    summary: dict[str, Any]
+    summary: JsonObject
     values: pd.DataFrame
 
 
@@ -390,7 +390,7 @@ def _surely_differ(first: Number, second: Number) -> bool:
     return abs(first.value - second.value) > _BOUND * math.hypot(first.error, second.error)
 
 
-def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
+def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> JsonObject:
     determined = [values for values in watcher.values if values["side"]]
     alarms = [values for values in determined if values["alarm"]]
 

@@ -2,9 +2,9 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 from jaxbl.files import json_with_checksum, remove, write_atomic
+from jaxbl.json_types import JsonObject
 
 from .figures import COLOURS, Drawn, style, subplots
 from .page import PageTable
@@ -21,7 +21,7 @@ ASSUMPTIONS = (
 """Of every certificate, in words; the numbers are beside them."""
 
 
-def write_certificates(summary: dict[str, Any], folder: Path) -> None:
+def write_certificates(summary: JsonObject, folder: Path) -> None:
     """Write `certificate.json` of the sides of which something is proven; where there is none, remove an earlier one."""
     proven = {side: found for side, found in summary.get("certificates", {}).items() if found["certified"]}
     if not proven:
@@ -31,13 +31,13 @@ def write_certificates(summary: dict[str, Any], folder: Path) -> None:
     write_atomic(folder / "certificate.json", json_with_checksum(data))
 
 
-def certificate_lines(summary: dict[str, Any]) -> list[str]:
+def certificate_lines(summary: JsonObject) -> list[str]:
     """The certificates in sentences."""
     found = summary.get("certificates", {})
     return [line for side in found for line in _lines(side, found[side], summary["passed_over"][side])]
 
 
-def refuted(summary: dict[str, Any]) -> bool:
+def refuted(summary: JsonObject) -> bool:
     """Whether the search found an error above what was proven: that is said before all else."""
     return any(found.get("search", {}).get("violations") for found in summary.get("certificates", {}).values())
 
@@ -55,7 +55,7 @@ def _below(value: float) -> float:
     return _above(value, -1.0)
 
 
-def _lines(side: str, found: dict[str, Any], passed_over: int) -> list[str]:
+def _lines(side: str, found: JsonObject, passed_over: int) -> list[str]:
     if not found["certified"]:
         return [f"{side}: no certificate: {found['why_none']}."]
     given = {name: _below(value) for name, value in found["assumptions"].items() if name != "discretisation"}
@@ -84,7 +84,7 @@ def _lines(side: str, found: dict[str, Any], passed_over: int) -> list[str]:
     return lines
 
 
-def certificate_tables(summary: dict[str, Any]) -> list[PageTable]:
+def certificate_tables(summary: JsonObject) -> list[PageTable]:
     """The certificates' numbers and assumptions, if there are any."""
     found = {side: one for side, one in summary.get("certificates", {}).items() if one["certified"]}
     if not found:
@@ -105,12 +105,12 @@ def certificate_tables(summary: dict[str, Any]) -> list[PageTable]:
 
 
 @style()
-def draw_certificates(summary: dict[str, Any]) -> list[Drawn]:
+def draw_certificates(summary: JsonObject) -> list[Drawn]:
     """The proven bound over time on each side, and the worst that was found."""
     return [_bounds(side, one) for side, one in summary.get("certificates", {}).items() if one["certified"]]
 
 
-def _bounds(side: str, found: dict[str, Any]) -> Drawn:
+def _bounds(side: str, found: JsonObject) -> Drawn:
     figure, (ax,) = subplots(6.6, 4.4, beside=True)
     curve, tried = found["curve"], found["search"]
     # beyond its last point the bound stays as it is

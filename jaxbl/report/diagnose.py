@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
@@ -33,7 +34,7 @@ def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextS
     return write_log_results(found, folder, "diagnosis", lead, draw_diagnosis(found), tables, remarks, steps)
 
 
-def diagnosis_lines(summary: dict[str, Any]) -> list[str]:
+def diagnosis_lines(summary: JsonObject) -> list[str]:
     """The lines for the terminal, from a `diagnosis.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
@@ -42,7 +43,7 @@ _FAR = 10.0
 """Factor between the torque and what [log] u says from which a unit is rather wrong: torque constants are known better."""
 
 
-def _headline(summary: dict[str, Any]) -> list[str]:
+def _headline(summary: JsonObject) -> list[str]:
     gains = [1.0 + one["parameters"]["relative"]["value"] for one in summary["findings"] if "relative" in one["parameters"]]
     lines = [
         f"Doubtful: the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
@@ -62,7 +63,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
 
 
-def _contradiction_lines(summary: Mapping[str, Any]) -> list[str]:
+def _contradiction_lines(summary: JsonObject) -> list[str]:
     """Numbers that the logs do not agree on."""
     found = []
     for one in summary["contradictions"]:
@@ -83,7 +84,7 @@ _NO_MORE = "no more is left on data not used for the fit than noise and the unce
 _TOO_LITTLE = "the data not used for the fit are too noisy, or too few, to show it"
 
 
-def verdict_sentence(summary: Mapping[str, Any]) -> str:
+def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
     names = _listed([one["effect"] for one in summary["findings"]])
     them = "it" if len(summary["findings"]) == 1 else "them"
@@ -121,7 +122,7 @@ def _percent(share: float) -> str:
 _OVER = {"position": "position", "turn": "position within a turn", "speed": "speed"}
 
 
-def _table_lines(summary: Mapping[str, Any]) -> list[str]:
+def _table_lines(summary: JsonObject) -> list[str]:
     """What tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
@@ -148,7 +149,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _reasons(summary: Mapping[str, Any]) -> list[str]:
+def _reasons(summary: JsonObject) -> list[str]:
     """Why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
@@ -178,7 +179,7 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _plainest(gap: Mapping[str, Any]) -> list[tuple[str, float | None, float | None]]:
+def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:
     """Of each channel the failed test that shows it best, its error and limit: a torque may fail at several bandwidths."""
     slow = gap.get("slow_torques", {})
     tested = {name: (slow[name]["after"], slow[name]["limit"]) for name in slow}
@@ -195,7 +196,7 @@ def _plainest(gap: Mapping[str, Any]) -> list[tuple[str, float | None, float | N
     return [(name, *tested[name]) for name in best.values()]
 
 
-def _number(leaf: str, one: Mapping[str, Any]) -> str:
+def _number(leaf: str, one: JsonObject) -> str:
     unit = f" {one['unit']}" if one.get("unit") else ""
     error = f" ± {one['standard_error']:.2g}" if one["standard_error"] else ""
     return f"{leaf} = {one['value']:.5g}{error}{unit}"
@@ -206,7 +207,7 @@ def probability(value: float) -> str:
     return "> 0.999" if value > 0.999 else f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
 
 
-def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
+def _gap_lines(gap: JsonObject) -> list[str]:
     before, after, floor, units = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor", "units"))
     if gap["holdout"]["separate"]:
         place = f"On {Path(gap['holdout']['file']).name}"
@@ -238,7 +239,7 @@ def rms_text(value: float | None) -> str:
     return "diverges" if value is None else f"{value:.3g}"
 
 
-def _remarks(summary: dict[str, Any]) -> list[str]:
+def _remarks(summary: JsonObject) -> list[str]:
     lines = []
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"Residual of the model as given: {one['sentence']}." for one in summary["where"].values()]
@@ -273,7 +274,7 @@ def _worse(control: Mapping[str, float | None], after: Mapping[str, float | None
     return np.inf if one is None or other is None else one / max(other, np.finfo(float).tiny)
 
 
-def _by_observer(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> str:
+def _by_observer(side: str, where: JsonObject, units: Mapping[str, str]) -> str:
     """The residual by a side's observer; empty where there is none or it does not converge."""
     one = where.get("observed")
     if not one or not one["converged"]:
@@ -295,7 +296,7 @@ _FREE = {
 }  # fmt: skip
 
 
-def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
+def _finding_tables(summary: JsonObject) -> list[PageTable]:
     rows: list[list[object]] = []
     for one in summary["findings"]:
         for leaf, number in one["parameters"].items():
@@ -307,7 +308,7 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
     return [PageTable("Missing effects", columns, rows)] if rows else []
 
 
-def _gap_table(gap: Mapping[str, Any]) -> PageTable:
+def _gap_table(gap: JsonObject) -> PageTable:
     controls = gap["controls"]
     rows: list[list[Any]] = [
         [_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
@@ -323,7 +324,7 @@ def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     return PageTable("Held-out data, rms", head, rows)
 
 
-def _number_table(summary: Mapping[str, Any]) -> PageTable:
+def _number_table(summary: JsonObject) -> PageTable:
     rows = [
         [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
         for path, one in summary["parameters"].items()
@@ -366,7 +367,7 @@ def _tables(found: Diagnosis) -> Drawn:
     return Drawn("torque_tables", figure, caption)
 
 
-def _verdict(summary: Mapping[str, Any]) -> Drawn:
+def _verdict(summary: JsonObject) -> Drawn:
     """Each channel's error over its noise, before and after, with the controls; and the probability of each effect."""
     gap = summary["gap"]
     names = list(gap["holdout_rmse_before"])
@@ -385,7 +386,7 @@ def _verdict(summary: Mapping[str, Any]) -> Drawn:
     return Drawn("gap", figure, caption)
 
 
-def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
+def _gap_panel(ax: Axes, gap: JsonObject, names: list[str]) -> None:
     floor = np.array([gap["noise_floor"][name] for name in names])
 
     def over(errors: Mapping[str, float | None]) -> np.ndarray:
@@ -427,7 +428,7 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
     legend(ax, 3, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2)
 
 
-def _bars(summary: Mapping[str, Any]) -> list[tuple[str, float, bool]]:
+def _bars(summary: JsonObject) -> list[tuple[str, float, bool]]:
     """Effects, their probabilities, and whether they are findings."""
     bars: list[tuple[str, float, bool]] = []
     for one in summary["findings"]:

@@ -1,11 +1,11 @@
 """What `jaxbl identify` leaves of a transmission on a test rig: numbers with intervals, torque over displacement."""
 
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 
 from jaxbl.identification.element import ElementIdentification
+from jaxbl.json_types import JsonObject
 
 from .figures import COLOURS, FAINT, Drawn, legend, outline, stacked, style, subplots
 from .page import PageTable, write_results
@@ -40,12 +40,12 @@ def write_element_report(found: ElementIdentification, folder: Path) -> list[str
     )
 
 
-def element_lines(summary: dict[str, Any]) -> list[str]:
+def element_lines(summary: JsonObject) -> list[str]:
     """The lines for the terminal, from an `identification.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
 
-def _headline(summary: dict[str, Any]) -> list[str]:
+def _headline(summary: JsonObject) -> list[str]:
     lines = [*summary["warnings"]]
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
@@ -54,7 +54,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _remarks(summary: dict[str, Any]) -> list[str]:
+def _remarks(summary: JsonObject) -> list[str]:
     element, torque = summary["method"]["element"], summary["torque"]["element"]
     lines = [f"Not identifiable: {next(iter(one['direction']))}: {one['why']}." for one in summary["refused"]]
     for term, gain in element["gains"].items():

@@ -8,6 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
+from jaxbl.json_types import JsonObject
 
 from .figures import COLOURS, Drawn, legend, literal, style, subplots
 
@@ -37,7 +38,7 @@ class ErrorPath(NamedTuple):
     majorant: tuple[np.ndarray, np.ndarray]
 
 
-def error_path(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> ErrorPath:
+def error_path(trace: pd.DataFrame, side: str, found: JsonObject) -> ErrorPath:
     """The path of an observer's error. Arguments as of :func:`error_plane`."""
     error = (trace[f"{side}.position"] - trace[f"{side}.position_estimate"]).to_numpy()
     rate = (trace[f"{side}.velocity"] - trace[f"{side}.velocity_estimate"]).to_numpy()
@@ -55,7 +56,7 @@ def error_path(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> ErrorPa
 
 
 @style()
-def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
+def error_plane(trace: pd.DataFrame, side: str, found: JsonObject) -> Drawn:
     """The error of an observer in its phase plane, and its peaks, beside the majorant of the proof.
 
     Args:
@@ -120,7 +121,7 @@ _TURNS = 6
 
 
 @style()
-def draw_worst_planes(marks: Sequence[dict[str, Any]]) -> Drawn | None:
+def draw_worst_planes(marks: Sequence[JsonObject]) -> Drawn | None:
     """The worst path of the error and the majorant of the proof for marked gains (`marks` of a verdict), normalised so that
     f⁺ and the first peak are 1; None where no alpha is above f⁺."""
     known = [one for one in marks if (one["alpha_ratio"] or 0.0) > 1.0 and one["lambda_ratio"] > 0.0][:_MOST_PLANES]

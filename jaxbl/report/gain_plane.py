@@ -8,6 +8,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 
 from .figures import MISSING, Drawn, mark, style, subplots
@@ -40,7 +41,7 @@ def name_ratio(ax: Axes, which: str, unit: float, label: str) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def conditions_line(side: str, found: dict[str, Any], which: str) -> str:
+def conditions_line(side: str, found: JsonObject, which: str) -> str:
     """Which conditions hold for a side's gains at an f⁺ (`which` says whose), and how far the exact one is from failing."""
     lambda_, alpha, bound, largest = (found[name] for name in ("lambda", "alpha", "f_plus", "largest_f_plus"))
     at = f"{side}: at f⁺ = {bound:.3g} rad/s², {which},"
@@ -67,7 +68,7 @@ def conditions_line(side: str, found: dict[str, Any], which: str) -> str:
 
 
 @style()
-def draw_gain_plane(side: str, found: dict[str, Any]) -> Drawn:
+def draw_gain_plane(side: str, found: JsonObject) -> Drawn:
     """The plane of gains with all conditions at one f⁺ > 0, and where the gains lie in it.
 
     Args:

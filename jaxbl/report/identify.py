@@ -6,6 +6,7 @@ from typing import Any
 
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import is_noise
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep
 
 from .figures import SIDES
@@ -28,7 +29,7 @@ def write_identification_report(found: Identification, folder: Path, steps: Sequ
     return write_log_results(found, folder, "identification", lead, draw_identification(found), tables, remarks, steps)
 
 
-def identification_lines(summary: dict[str, Any]) -> list[str]:
+def identification_lines(summary: JsonObject) -> list[str]:
     """The lines for the terminal, from an `identification.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
@@ -38,7 +39,7 @@ _FAR = 10.0
 know them within a factor of two."""
 
 
-def _headline(summary: dict[str, Any]) -> list[str]:
+def _headline(summary: JsonObject) -> list[str]:
     far = [
         f"{path} is {one['value'] / one['nominal']:.3g} times its nominal value"
         for path, one in summary["parameters"].items()
@@ -65,7 +66,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _backlash(summary: dict[str, Any]) -> list[str]:
+def _backlash(summary: JsonObject) -> list[str]:
     """What a log without the load's encoder says of a gap."""
     said = summary.get("backlash")
     if said is None:
@@ -80,7 +81,7 @@ def _backlash(summary: dict[str, Any]) -> list[str]:
     ]
 
 
-def _remarks(summary: dict[str, Any]) -> list[str]:
+def _remarks(summary: JsonObject) -> list[str]:
     lines, unseen = [], (summary.get("backlash") or {}).get("why")
     for refusal in summary["refused"]:
         if refusal["why"] == unseen:
@@ -111,7 +112,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     return [*lines, *summary["notes"]]
 
 
-def _residuals(summary: dict[str, Any]) -> list[tuple[bool, str]]:
+def _residuals(summary: JsonObject) -> list[tuple[bool, str]]:
     """Of each side, whether no more than noise is left of its positions, and a sentence that says so."""
     found = []
     for side, residual in summary["residual"].items():
@@ -125,17 +126,17 @@ def _residuals(summary: dict[str, Any]) -> list[tuple[bool, str]]:
     return found
 
 
-def _shares(torque: dict[str, Any]) -> str:
+def _shares(torque: JsonObject) -> str:
     return ", ".join(f"{_share(one)} ({name})" for name, one in torque.items())
 
 
-def _share(one: dict[str, Any], which: str = "") -> str:
+def _share(one: JsonObject, which: str = "") -> str:
     """A torque error as a share of the driving torque, or in its unit where nothing drives."""
     relative = one[f"{which}relative"]
     return f"{one[f'{which}rms']:.2g} {one['unit']} rms" if relative is None else f"{100.0 * relative:.2g} %"
 
 
-def _on_holdout(holdout: dict[str, Any]) -> list[str]:
+def _on_holdout(holdout: JsonObject) -> list[str]:
     name = Path(holdout["file"]).name
     lines = [
         f"On {name}, {side}: position residual over {holdout['window']:.3g} s {one['rms']:.2g} {one['unit']} rms, "
@@ -151,11 +152,11 @@ def _on_holdout(holdout: dict[str, Any]) -> list[str]:
 _COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
 
 
-def _row(path: str, one: dict[str, Any]) -> list[Any]:
+def _row(path: str, one: JsonObject) -> list[Any]:
     return [path, one["value"], one["standard_error"], *one["interval"]]
 
 
-def _parameter_table(summary: dict[str, Any]) -> PageTable:
+def _parameter_table(summary: JsonObject) -> PageTable:
     parameters = summary["parameters"]
     rows = [[*_row(path, one), one.get("unit", ""), one.get("nominal")] for path, one in parameters.items()]
     columns = [*_COLUMNS, "unit", "nominal"]
@@ -165,7 +166,7 @@ def _parameter_table(summary: dict[str, Any]) -> PageTable:
     return PageTable("Parameters", columns, rows)
 
 
-def _regression_table(regression: dict[str, Any]) -> PageTable:
+def _regression_table(regression: JsonObject) -> PageTable:
     by = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
     title = f"Least squares on the equations of motion, {by}, up to {regression['bandwidth']:.3g} Hz"
     return PageTable(title, _COLUMNS, [_row(path, one) for path, one in regression["parameters"].items()])

@@ -4,7 +4,7 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from matplotlib.ticker import LogLocator
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MISSING, SIDE_COLOURS, Drawn, style, subplots, with_unit
@@ -53,17 +54,17 @@ def draw_choice(choice: ObserverChoice) -> list[Drawn]:
     return [_map(choice.config, summary, side) for side in sides]
 
 
-def _error(summary: Mapping[str, Any]) -> str:
+def _error(summary: JsonObject) -> str:
     about = SIDE_METRICS[f"{summary['objective']}_rmse"]
     return with_unit(about.label, about.unit)
 
 
-def _ordered(found: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+def _ordered(found: JsonObject) -> list[tuple[str, JsonObject]]:
     """Kinds with a ratio, best first."""
     return [(kind, one) for kind, one in found.items() if one["ratio"] is not None]
 
 
-def _bars(summary: Mapping[str, Any], sides: Sequence[str]) -> Drawn:
+def _bars(summary: JsonObject, sides: Sequence[str]) -> Drawn:
     """Ratios with their intervals, a panel for each side."""
     count = len(summary["observers"])
     figure, axes = subplots(5.4 * len(sides), 1.3 + 0.34 * count, 1, len(sides), beside=True)
@@ -92,13 +93,13 @@ def _bars(summary: Mapping[str, Any], sides: Sequence[str]) -> Drawn:
     return Drawn("observers", figure, caption)
 
 
-def _ratio(one: Mapping[str, Any]) -> str:
+def _ratio(one: JsonObject) -> str:
     """The ratio, with its interval if runs differ; more digits where it would read as one."""
     ratio, low, high = (f"{x:.{3 if abs(x - 1.0) > 0.005 else 6}g}" for x in (one["ratio"], one["low"], one["high"]))
     return ratio if runs_are_equal(one) else f"{ratio} ({low} to {high})"
 
 
-def _varied(config: Config, summary: Mapping[str, Any], side: str) -> dict[str, list[Any]]:
+def _varied(config: Config, summary: JsonObject, side: str) -> dict[str, list[Any]]:
     """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
     the first."""
     together: dict[str, list[str]] = {}
@@ -125,14 +126,14 @@ def _place(ax: Axes, which: str, values: Sequence[Any]) -> np.ndarray:
     return np.arange(len(values), dtype=float)
 
 
-def _lines(config: Config, summary: Mapping[str, Any], side: str) -> Drawn:
+def _lines(config: Config, summary: JsonObject, side: str) -> Drawn:
     """Errors over the one axis that has several values."""
     ((path, values),) = _varied(config, summary, side).items()
     figure, (ax,) = subplots(8.4, 4.6, beside=True)
     xs = _place(ax, "x", values)
     for i, kind in enumerate(summary["observers"]):
         errors = [point["sides"][side]["kinds"][kind]["error"] for point in summary["points"]]
-        look: dict[str, Any] = {"color": COLOURS[i % len(COLOURS)], "ls": ("-", "--", ":")[i // len(COLOURS) % 3]}
+        look: JsonObject = {"color": COLOURS[i % len(COLOURS)], "ls": ("-", "--", ":")[i // len(COLOURS) % 3]}
         ax.plot(xs, [np.nan if one is None else one for one in errors], "o", ms=4, label=kind, **look)
     ax.set(yscale="log", xlabel=_axis_label(config, path), ylabel=f"{side}: {_error(summary)}", title=side)
     figure.legend(handles=ax.get_legend_handles_labels()[0], loc="outside right center")
@@ -161,7 +162,7 @@ def short_names(kinds: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _map(config: Config, summary: Mapping[str, Any], side: str) -> Drawn:
+def _map(config: Config, summary: JsonObject, side: str) -> Drawn:
     """The best kind at each point; a panel for each value of further axes."""
     varied, short = _varied(config, summary, side), short_names(summary["observers"])
     (x, xs), (y, ys) = list(varied.items())[-1:-3:-1]
@@ -235,7 +236,7 @@ def write_choice_report(choice: ObserverChoice, folder: Path) -> list[str]:
     )
 
 
-def observer_toml(summary: Mapping[str, Any]) -> str | None:
+def observer_toml(summary: JsonObject) -> str | None:
     """The kind that is best on both sides together, with its gains, as TOML that a study can `include`; None where several
     points were compared, or no kind converges on both sides."""
     kind = summary.get("for_both_sides")
@@ -250,7 +251,7 @@ def observer_toml(summary: Mapping[str, Any]) -> str | None:
         '# To use it, put include = "gains.toml" at the top of a study and leave its own [observer] out.',
         "",
     ]
-    data: dict[str, Any] = {"observer": {"kind": kind}}
+    data: JsonObject = {"observer": {"kind": kind}}
     for side, one in sides.items():
         data["observer"][side] = {key: value for key, value in one["gains"].items() if key != TIME_CONSTANT}
     constants = {side: one["gains"][TIME_CONSTANT] for side, one in sides.items() if TIME_CONSTANT in one["gains"]}
@@ -262,7 +263,7 @@ def observer_toml(summary: Mapping[str, Any]) -> str | None:
     return "\n".join(lines) + tomli_w.dumps(data)
 
 
-def _where(summary: Mapping[str, Any]) -> str:
+def _where(summary: JsonObject) -> str:
     """Which runs were compared."""
     held = summary["holdout"]
     first, last = held["seeds"]
@@ -270,7 +271,7 @@ def _where(summary: Mapping[str, Any]) -> str:
     return f"{other}, {last - first + 1} seeds"
 
 
-def choice_headline(summary: Mapping[str, Any]) -> list[str]:
+def choice_headline(summary: JsonObject) -> list[str]:
     """Which kind is best, and by how much, in sentences."""
     points = summary["points"]
     unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
@@ -283,7 +284,7 @@ def choice_headline(summary: Mapping[str, Any]) -> list[str]:
     return [line for side in points[0]["sides"] for line in _said_of_map(side, summary)]
 
 
-def _said(side: str, found: Mapping[str, Any], summary: Mapping[str, Any], unit: str) -> str:
+def _said(side: str, found: JsonObject, summary: JsonObject, unit: str) -> str:
     shown = _ordered(found["kinds"])
     lost = [kind for kind, one in found["kinds"].items() if one["ratio"] is None]
     if not shown:
@@ -301,7 +302,7 @@ def _said(side: str, found: Mapping[str, Any], summary: Mapping[str, Any], unit:
     return f"{lead}: {summary['objective']} error {one['error']:.3g} {unit} rms with {best} ({_where(summary)}).{rest}{bad}"
 
 
-def _said_of_map(side: str, summary: Mapping[str, Any]) -> list[str]:
+def _said_of_map(side: str, summary: JsonObject) -> list[str]:
     points = [one["sides"][side] for one in summary["points"]]
     alone, shared = {}, {}
     for found in points:
@@ -326,7 +327,7 @@ def _said_of_map(side: str, summary: Mapping[str, Any]) -> list[str]:
     return [*lines, f"{side}, times the best one's error: {', '.join(spans)}."]
 
 
-def _tables(config: Config, summary: Mapping[str, Any]) -> list[PageTable]:
+def _tables(config: Config, summary: JsonObject) -> list[PageTable]:
     points, kinds = summary["points"], summary["observers"]
     tables = []
     if len(points) == 1:

@@ -18,6 +18,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 
+from jaxbl.json_types import JsonObject
+
 from .figures import Drawn, style
 
 _MOST_MARKS = 800
@@ -41,7 +43,7 @@ class Picture(NamedTuple):
     size: tuple[int, int]
     caption: str
     described: str
-    panels: list[dict[str, Any]]
+    panels: list[JsonObject]
 
     @property
     def source(self) -> str:
@@ -97,14 +99,14 @@ def _lines(ax: Axes) -> list[Line2D]:
     return [line for line in ax.get_lines() if line.get_transform() == ax.transData and len(_xy(line))]
 
 
-def _panel(figure: Figure, ax: Axes, value: str | None, every: int) -> dict[str, Any]:
+def _panel(figure: Figure, ax: Axes, value: str | None, every: int) -> JsonObject:
     """What a page needs to read values off axes.
 
     Place (left, top, width, height) as shares of the figure; label, ends, scale and named ticks of both axes; lines (names,
     x and y); the cells of a map (edges along x and y, values by row); bars (left, bottom, width, height).
     """
     place = ax.get_position()
-    panel: dict[str, Any] = {
+    panel: JsonObject = {
         "place": [round(float(one), 5) for one in (place.x0, 1.0 - place.y1, place.width, place.height)],
         "title": _plain(ax.get_title() or ax.get_title("left")).replace("\n", ", "),
         "x": _axis(ax.xaxis, ax.get_xlim()),
@@ -146,8 +148,8 @@ def _siblings(ax: Axes, label: str) -> list[Axes]:
     return shared.get_siblings(ax)
 
 
-def _axis(axis: Any, ends: tuple[float, float]) -> dict[str, Any]:
-    found: dict[str, Any] = {
+def _axis(axis: Any, ends: tuple[float, float]) -> JsonObject:
+    found: JsonObject = {
         "label": _plain(axis.label.get_text()).replace("\n", " "),
         "ends": [float(f"{end:.8g}") for end in ends],
         "log": axis.get_scale() == "log",
@@ -158,7 +160,7 @@ def _axis(axis: Any, ends: tuple[float, float]) -> dict[str, Any]:
     return found
 
 
-def _line(line: Line2D, every: int) -> dict[str, Any]:
+def _line(line: Line2D, every: int) -> JsonObject:
     label = str(line.get_label())
     x, y = _xy(line)[::every].T
     return {
@@ -184,7 +186,7 @@ def _plain(text: str) -> str:
     return text.replace(r"\$", "$")
 
 
-def _described(panel: dict[str, Any]) -> str:
+def _described(panel: JsonObject) -> str:
     """One panel in words."""
     head = f"{panel['title']}: " if panel["title"] else ""
     axes = [

@@ -17,6 +17,7 @@ from jaxbl.files import write_atomic
 from jaxbl.gains.limits import PLACES
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import called_gains
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -43,7 +44,7 @@ def _label(tuning: Tuning) -> str:
     return with_unit(f"worst {about.label}", about.unit)
 
 
-def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
+def _others(tuning: Tuning, side: str) -> list[tuple[str, str, JsonObject]]:
     """Name, marker and figures on the study's own excitation of the gains that the tuned ones are compared with."""
     rows = [row for row in tuning.summary["named"] if row["side"] == side and row["name"] != "tuned"]
     return [(literal(row["name"]), MARKERS[i % len(MARKERS)], row) for i, row in enumerate(rows)]
@@ -98,7 +99,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     return Drawn(f"tuning_{side}", figure, caption)
 
 
-def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: dict[str, Any]) -> list[Line2D]:
+def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: JsonObject) -> list[Line2D]:
     """The line on the coarse map along which a constraint that binds is just met. Returns the legend's handles."""
     values = tables[PLACES[name]]
     xs, ys, level = values.columns.to_numpy(float), values.index.to_numpy(float), found.get("limit", 0.5)
@@ -117,7 +118,7 @@ _LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#3F51B5", "margin_exact": "#
 """Colours of constraints."""
 
 
-def _called(name: str, found: dict[str, Any]) -> str:
+def _called(name: str, found: JsonObject) -> str:
     """A constraint with its limit, and whether it binds."""
     limit = f" = {found['limit']:g}" if "limit" in found else ""
     return f"{name}{limit}{' (binds)' if found['binds'] else ''}"
@@ -136,15 +137,15 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
     found, gains, error = summary["limits"][side], summary["gains"][side], summary["achieved"][side]
     velocity = summary["objective"] == "velocity"
     figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
-    shaded: dict[str, Any] = {}
-    handles: dict[str, Any] = {}
+    shaded: JsonObject = {}
+    handles: JsonObject = {}
     for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
         line = pd.DataFrame(found["profiles"][gain])
         x, y = line[gain].to_numpy(float), line["error"].to_numpy(float)
         edges = cell_edges(x, True)
         ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]])
         for name, one in found["constraints"].items():
-            look: dict[str, Any] = {"facecolor": _LIMITS[name], "alpha": 0.4 if one["binds"] else 0.15, "lw": 0.0}
+            look: JsonObject = {"facecolor": _LIMITS[name], "alpha": 0.4 if one["binds"] else 0.15, "lw": 0.0}
             missed = line["missed"].map(lambda names, name=name: name in names).to_numpy(bool)
             for first, last in _stretches(missed):
                 ax.axvspan(edges[first], edges[last], **look)
@@ -191,7 +192,7 @@ def _stretches(there: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(steps[::2], steps[1::2], strict=True))
 
 
-def _short(way: dict[str, Any]) -> str:
+def _short(way: JsonObject) -> str:
     """What limits a gain towards one side, in few words."""
     if way["limit"] == "constraint":
         return " and ".join(way["missed"])
@@ -207,7 +208,7 @@ def _size(change: float) -> str:
     return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{100.0 * change:+.2g} %"
 
 
-def _limits_text(found: dict[str, Any]) -> str:
+def _limits_text(found: JsonObject) -> str:
     """What limits gains towards smaller and larger values (`limits` of a side), in sentences."""
     binding = [f"{_called(name, one | {'binds': False})} (here {one['value']:.4g})" if "limit" in one else name
                for name, one in found["constraints"].items() if one["binds"]]  # fmt: skip
@@ -226,7 +227,7 @@ def _limits_text(found: dict[str, Any]) -> str:
     return " ".join(lines)
 
 
-def _way(way: str, symbol: str, unit: str, found: dict[str, Any]) -> str:
+def _way(way: str, symbol: str, unit: str, found: JsonObject) -> str:
     """What limits a gain towards one side, as part of a sentence."""
     if found["limit"] == "range":
         return f"{way} {symbol}: outside of the range searched (tune.{'lambda' if symbol == 'λ' else 'alpha'}_ratio)"
@@ -292,7 +293,7 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     return Drawn("tuning_holdout", figure, caption)
 
 
-def _bars(ax: Axes, key: str, rows: list[dict[str, Any]]) -> None:
+def _bars(ax: Axes, key: str, rows: list[JsonObject]) -> None:
     """Bars of a figure's worst value for each of the gains, with a stroke at the median."""
     shown = [row[key]["worst"] for row in rows if row[key]["worst"] is not None]
     log = bool(shown) and min(shown) > 0.0 and max(shown) > 30.0 * min(shown)
@@ -333,7 +334,7 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     return write_report(folder, title, lead, draw_tuning(tuning), tables, config, summary["remarks"])
 
 
-def gains_toml(summary: dict[str, Any]) -> str:
+def gains_toml(summary: JsonObject) -> str:
     """The chosen gains as TOML that a study can `include`; comments say what they were chosen for."""
     margins, title = summary["margins"], " ".join(summary["title"].split())
     lines = [
@@ -358,20 +359,20 @@ def gains_toml(summary: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _runs_behind(summary: dict[str, Any]) -> str:
+def _runs_behind(summary: JsonObject) -> str:
     first, last = summary["seeds"]
     seeds, drives = last - first + 1, len(summary["scenarios"])
     return f"{seeds} noise seed{'s' * (seeds > 1)} and {drives} drive{'s' * (drives > 1)}"
 
 
-def _where(summary: dict[str, Any]) -> str:
+def _where(summary: JsonObject) -> str:
     """Which runs were held out."""
     held = summary["holdout"]
     other = f"on the held-out excitation ({held['excitation']['kind']})"
     return "on the study's excitation with other noise" if held["same_excitation"] else other
 
 
-def tune_headline(summary: dict[str, Any]) -> list[str]:
+def tune_headline(summary: JsonObject) -> list[str]:
     """The chosen gains and their errors on the held-out runs, in sentences."""
     lines, metric = [], f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
@@ -407,7 +408,7 @@ def tune_headline(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _gains_table(summary: dict[str, Any]) -> PageTable:
+def _gains_table(summary: JsonObject) -> PageTable:
     rows = []
     for side, gains in summary["gains"].items():
         found, step = summary["achieved"][side], summary["resolution"][side]
@@ -421,7 +422,7 @@ def _gains_table(summary: dict[str, Any]) -> PageTable:
     return PageTable("Chosen gains, worst of all runs", columns, rows)
 
 
-def _comparison_table(heading: str, found: list[dict[str, Any]]) -> PageTable:
+def _comparison_table(heading: str, found: list[JsonObject]) -> PageTable:
     rows = [
         [row["side"], row["name"], row["lambda"], row["alpha"], 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
@@ -433,7 +434,7 @@ def _comparison_table(heading: str, found: list[dict[str, Any]]) -> PageTable:
     return PageTable(heading, columns, rows)
 
 
-def _pareto_tables(summary: dict[str, Any]) -> list[PageTable]:
+def _pareto_tables(summary: JsonObject) -> list[PageTable]:
     unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
     columns = ["λ", "α", "λ/√f⁺", "α/f⁺", "convergence time (s)", f"{summary['objective']} error ({unit})"]
     return [

@@ -10,6 +10,7 @@ from matplotlib.patches import Patch
 
 from jaxbl.gains.rules import RULES, Spans, holds
 from jaxbl.gains.under_tuned import SINE_LIMIT
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.sweeps.elementwise import apply_elementwise
 
@@ -24,7 +25,7 @@ _MARKERS = ("D", "o", "s", "^")
 
 
 @style()
-def draw_rules(rules: list[dict[str, Any]]) -> Drawn:
+def draw_rules(rules: list[JsonObject]) -> Drawn:
     """The plane of gains with the exact border and the borders of all rules (`rules` of a verdict) at f⁺ = 1 rad/s²."""
     figure, axes = subplots(10.4, 6.4, columns=2, beside=True, sharex=True, sharey=True)
     wrong = [one for one in rules if not one["sufficient"]]
@@ -65,9 +66,9 @@ def _plane(ax: Axes) -> list[Any]:
     below = {"color": MISSING, "alpha": 0.55, "lw": 0}
     ax.axvspan(_ALPHA[0], 1.0, **below)
     ax.fill_between(np.r_[1.0, alpha], _LAMBDA[0], np.r_[exact[0], exact], **below)
-    border: dict[str, Any] = {"color": "black", "lw": 2.4, "label": "exact, ρ < 1"}
+    border: JsonObject = {"color": "black", "lw": 2.4, "label": "exact, ρ < 1"}
     ax.plot(np.r_[1.0, alpha], np.r_[_LAMBDA[1], exact], **border)
-    sine: dict[str, Any] = {"color": "black", "lw": 1.2, "ls": ":", "label": "a sine's limit cycle"}
+    sine: JsonObject = {"color": "black", "lw": 1.2, "ls": ":", "label": "a sine's limit cycle"}
     ax.plot(alpha, SINE_LIMIT / np.sqrt(alpha), **sine)
     return [Line2D([], [], **border), Line2D([], [], **sine), Patch(**below, label="does not converge")]
 
@@ -78,10 +79,10 @@ def _spans(name: str, alpha: np.ndarray) -> Spans:
     return spans(alpha, np.ones_like(alpha))
 
 
-def _region(ax: Axes, one: dict[str, Any], colour: str, dashes: Any) -> Line2D:
+def _region(ax: Axes, one: JsonObject, colour: str, dashes: Any) -> Line2D:
     """Borders of a rule's region; where it is wrong it is shaded. Returns the legend's handle."""
     alpha = np.geomspace(*_ALPHA, 1201)
-    look: dict[str, Any] = {"color": colour, "ls": dashes, "lw": 2.0, "label": one["title"]}
+    look: JsonObject = {"color": colour, "ls": dashes, "lw": 2.0, "label": one["title"]}
     for low, high in _spans(one["name"], alpha):
         given = low < high
         ax.plot(alpha, np.where(given & (low > 0.0), low, np.nan), **look)
@@ -97,7 +98,7 @@ def _region(ax: Axes, one: dict[str, Any], colour: str, dashes: Any) -> Line2D:
     return Line2D([], [], **look)
 
 
-def rule_lines(rules: list[dict[str, Any]]) -> list[str]:
+def rule_lines(rules: list[JsonObject]) -> list[str]:
     """What was found about the rules, in sentences."""
     good = [one for one in rules if one["sufficient"]]
     shares = "; ".join(
@@ -113,7 +114,7 @@ def rule_lines(rules: list[dict[str, Any]]) -> list[str]:
     return lines + [f"Tuning rule {one['title']}: not sufficient. {_wrong(one)}" for one in rules if not one["sufficient"]]
 
 
-def _covers(one: dict[str, Any]) -> str:
+def _covers(one: JsonObject) -> str:
     shares = [entry["share"] for entry in one["covers"]]
     if one["scale_free"]:
         return f"{100.0 * shares[0]:.0f} %"
@@ -121,7 +122,7 @@ def _covers(one: dict[str, Any]) -> str:
     return f"{100.0 * min(shares):.0f} to {100.0 * max(shares):.0f} %, by units (f⁺ from {ends[0]:g} to {ends[1]:g} rad/s²)"
 
 
-def _wrong(one: dict[str, Any]) -> str:
+def _wrong(one: JsonObject) -> str:
     """A counterexample in a sentence."""
     found = one["counterexample"]
     gains = f"It allows λ = {found['lambda']:.3g} √rad/s, α = {found['alpha']:.3g} rad/s² at f⁺ = {found['f_plus']:g} rad/s²"
@@ -131,7 +132,7 @@ def _wrong(one: dict[str, Any]) -> str:
     return f"{gains}: simulated under the worst disturbance, each peak of the error is {rho:.3g} times the last."
 
 
-def rule_table(rules: list[dict[str, Any]]) -> PageTable:
+def rule_table(rules: list[JsonObject]) -> PageTable:
     """All rules, with what was read of each."""
     rows = [
         [

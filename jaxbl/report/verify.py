@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from jaxbl.files import to_jsonable
 from jaxbl.gains.error_system import conditions_of
 from jaxbl.gains.verify import Verdict, judged_sides
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 
 from .error_plane import draw_worst_planes
@@ -157,7 +158,7 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
     return Drawn(f"levels_{side}", figure, caption)
 
 
-def _name(level: dict[str, Any]) -> str:
+def _name(level: JsonObject) -> str:
     return ", ".join(level[key] for key in ("level", "side") if level.get(key))
 
 
@@ -269,7 +270,7 @@ def _headline(verdict: Verdict) -> list[str]:
     return lines
 
 
-def _below_line(verdict: Verdict, side: str, below: dict[str, Any]) -> str:
+def _below_line(verdict: Verdict, side: str, below: JsonObject) -> str:
     runs = "" if below["runs"] == below["converged_runs"] else f" {below['runs']} of them were looked at:"
     return (
         f"{side}: {below['converged_runs']} runs converge though α is below the true f⁺, where no condition can hold.{runs} "
@@ -306,7 +307,7 @@ def _mark_lines(verdict: Verdict) -> list[str]:
     return lines
 
 
-def _by_disturbance(one: dict[str, Any]) -> str:
+def _by_disturbance(one: JsonObject) -> str:
     """What the run's own disturbance d does to gains that miss the exact condition, in sentences."""
     found = one["on_this_disturbance"]
     if found is None:
@@ -336,7 +337,7 @@ def _by_disturbance(one: dict[str, Any]) -> str:
     return said
 
 
-def _level_table(level: dict[str, Any]) -> PageTable:
+def _level_table(level: JsonObject) -> PageTable:
     name = "Normalised error system, worst disturbance"
     if level["level"] != "normalised":
         name = f"{_LEVELS[level['level']].capitalize()}; {level['side']} observer"
@@ -349,7 +350,7 @@ def _level_table(level: dict[str, Any]) -> PageTable:
     return PageTable(f"{name}: {level['cells']} {kind}, {level['converged']} converged", [*head, "at least"], rows)
 
 
-def _claimed_tables(level: dict[str, Any]) -> list[PageTable]:
+def _claimed_tables(level: JsonObject) -> list[PageTable]:
     if not (inputs := level.get("claimed_bound", {}).get("by_input")):
         return []
     keys = list(inputs[0]["input"])

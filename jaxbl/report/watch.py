@@ -1,7 +1,7 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
 import csv
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
 
@@ -45,18 +46,18 @@ def write_watch_report(found: Watch, folder: Path, steps: list[NextStep] | None 
     return lines
 
 
-def _at(values: Mapping[str, Any] | None, side: str, name: str) -> list[float | None]:
+def _at(values: JsonObject | None, side: str, name: str) -> list[float | None]:
     return [(values or {}).get(f"{side}.{name}{end}") for end in ("", "_error")]
 
 
 @contextmanager
-def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject], None]]:
     """`watch.csv` while it grows, from the first values on: a function that adds values, which others can read at once."""
     with ExitStack() as stack:
         out: csv.DictWriter[str] | None = None
         file: Any = None
 
-        def add(values: Mapping[str, Any]) -> None:
+        def add(values: JsonObject) -> None:
             nonlocal out, file
             nothing = {name: "" for name, value in values.items() if isinstance(value, float) and np.isnan(value)}
             with catch_write_errors(folder):
@@ -70,7 +71,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[Mapping[str
         yield add
 
 
-def watch_lines(summary: Mapping[str, Any]) -> list[str]:
+def watch_lines(summary: JsonObject) -> list[str]:
     """The lines for the terminal, from a `watch.json`."""
     first, last, limit = summary["first"], summary["last"], summary["alarm_gap"]
     units, count = summary["units"]["motor"], summary["values"]
@@ -108,7 +109,7 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
     return [*lines, *_left_out(summary)]
 
 
-def _left_out(summary: Mapping[str, Any]) -> list[str]:
+def _left_out(summary: JsonObject) -> list[str]:
     return [f"Of the stream: {describe_counts(summary['left_out'])}."] if summary["left_out"] else []
 
 

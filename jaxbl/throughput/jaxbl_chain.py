@@ -12,7 +12,7 @@ from jaxbl.drive import set_leaves
 from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.simulate import scan
 
-from .workload import CHAIN_METRICS, RANGES, SEED, ChunkedProgram, Workload
+from .workload import CHAIN_METRICS, RANGES, SEED, ChunkedProgram, Metrics, Workload
 
 LANES = 2**12
 """That a device scans at once: what they carry then stays in a core's cache (benchmarks/NOTES.md)."""
@@ -42,7 +42,7 @@ class FusedChain:
         self._simulator = HostSimulator(workload.experiment(), (CHAIN_METRICS,), tuple(RANGES), workload.lanes, threads)
         self._values, self._seeds = workload.values(), count(SEED)
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         # nothing is kept for the next lanes
         self._simulator.keep_seeds(())
         return self._simulator(self._values, next(self._seeds))

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from jaxbl.errors import NoResult
+from jaxbl.json_types import JsonObject
 from jaxbl.workers import Progress, count_cores
 
 from .jaxbl_chain import FusedChain, ScanChain
@@ -27,9 +28,9 @@ from .rivals.diffrax_chain import DiffraxChain
 from .rivals.numba_chain import NumbaChain, clear_compiled
 from .rivals.python_chain import PythonChain
 from .studies import STUDIES, FusedStudy, prepare_study
-from .workload import Workload
+from .workload import Metrics, Workload
 
-Runner = Callable[[], dict[str, np.ndarray]]
+Runner = Callable[[], Metrics]
 
 CPP_NAME, FUSED_NAME, SCAN_NAME = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
 PRECISIONS = ("float32", "float64")
@@ -117,11 +118,11 @@ class BenchResult:
         failures: a sentence for each entry or study whose results are wrong; its time is not taken.
     """
 
-    machine: dict[str, Any]
+    machine: JsonObject
     rows: list[BenchRow]
-    curve: list[dict[str, Any]]
-    study: list[dict[str, Any]]
-    studies: list[dict[str, Any]]
+    curve: list[JsonObject]
+    study: list[JsonObject]
+    studies: list[JsonObject]
     left_out: dict[str, str]
     failures: list[str] = field(default_factory=list)
 
@@ -251,13 +252,13 @@ def _spread_lanes(lanes: int) -> np.ndarray:
     return np.unique(np.linspace(0, lanes - 1, _REFERENCE_LANES).round().astype(int))
 
 
-def _reference_metrics(lanes: int, steps: int) -> dict[str, np.ndarray]:
+def _reference_metrics(lanes: int, steps: int) -> Metrics:
     """Figures of some of so many lanes by the plainest entry, in float64."""
     with _enable_precision("float64"):
         return PythonChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
 
 
-def _check_entry(entry: Entry, precision: str, metrics: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
+def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metrics) -> float:
     largest = 0.0
     for name, values in metrics.items():
         sampled, expected = np.asarray(values, float)[_spread_lanes(len(values))], reference[name]
@@ -268,7 +269,7 @@ def _check_entry(entry: Entry, precision: str, metrics: dict[str, np.ndarray], r
     return largest
 
 
-def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[dict[str, Any]]:
+def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[JsonObject]:
     points = []
     for precision in precisions:
         curve_entries = [
@@ -288,7 +289,7 @@ def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions:
     return points
 
 
-def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -> list[dict[str, Any]]:
+def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -> list[JsonObject]:
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
     workload = Workload(lanes, 3000, "float32")
@@ -309,9 +310,7 @@ def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -
     return rows
 
 
-def compare_study(
-    name: str, folder: Path, threads: int, steps: int, rounds: int, lanes: int | None = None
-) -> dict[str, Any]:
+def compare_study(name: str, folder: Path, threads: int, steps: int, rounds: int, lanes: int | None = None) -> JsonObject:
     """A study as it stands by this package and in C++, after a look at whether both give the same figures.
 
     Args:
@@ -350,7 +349,7 @@ _VECTOR_COUNTS = 1, 2, 4
 """That the kernel of a study takes at a time: the fastest counts."""
 
 
-def check_run_metrics(name: str, metrics: dict[str, Any], reference: dict[str, np.ndarray]) -> float:
+def check_run_metrics(name: str, metrics: Metrics, reference: Metrics) -> float:
     """Compare the figures of a study with those of the reference, run by run.
 
     A run in which both are NaN counts as equal. Runs in which only one is NaN are counted, and left out of the median.
@@ -386,7 +385,7 @@ def check_run_metrics(name: str, metrics: dict[str, Any], reference: dict[str, n
     return largest
 
 
-def check_medians(name: str, metrics: dict[str, Any], reference: dict[str, np.ndarray]) -> None:
+def check_medians(name: str, metrics: Metrics, reference: Metrics) -> None:
     """Raises `NoResult` where the median of a figure over all runs is not that of the reference; errors of identified
     parameters, which are about zero, do not count."""
     for metric, expected in reference.items():
@@ -399,7 +398,7 @@ def check_medians(name: str, metrics: dict[str, Any], reference: dict[str, np.nd
             )
 
 
-def _describe_machine(threads: int) -> dict[str, Any]:
+def _describe_machine(threads: int) -> JsonObject:
     packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
     lines: list[str] = []
     with suppress(OSError):

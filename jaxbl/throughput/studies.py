@@ -12,7 +12,7 @@ from jaxbl.simulate import Experiment
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Layout, Program, compile_program
 
-from .workload import DRIVE
+from .workload import DRIVE, Metrics
 
 _LAW = {"law": "sigmoid_backlash", "stiffness": 1.0, "dead_zone": 0.02, "slope": 20.0}
 STUDIES: dict[str, dict[str, Any]] = {
@@ -120,7 +120,7 @@ class FusedStudy:
                 study.experiment, layout, devices, "fused", study.values, require_backend=True
             )
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         """Figures `(seeds, lanes)` by name."""
         first_seed = self._round * self._study.seeds
         self._round += 1

@@ -22,6 +22,8 @@ from jaxbl.sweeps.metrics import window_start
 SEED = 0
 """Of the encoders' noise: any one, the same for all."""
 SIDES = ("motor", "load")
+Metrics = dict[str, np.ndarray]
+"""Metrics of the lanes, `(lanes,)` each, by name."""
 RANGES = {
     "observer.motor.alpha": (8.0, 40.0),
     "observer.motor.lambda": (2.0, 10.0),
@@ -155,7 +157,7 @@ class ChunkedProgram:
         ]
         self.compiled = jax.jit(function).lower(self._chunks[0], *shared_arguments).compile()
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         chunks = [self.compiled(values, *self._shared_arguments) for values in self._chunks]
         return {name: np.concatenate([np.asarray(chunk[name]) for chunk in chunks])[: self._lanes] for name in chunks[0]}
 
@@ -172,7 +174,7 @@ def chain_constants() -> dict[str, float]:
     }
 
 
-def metrics_from_sums(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
+def metrics_from_sums(workload: Workload, sums: list[np.ndarray]) -> Metrics:
     """Figures `(lanes,)` from the nine sums over the run that rivals keep: of products of both regressors (3), of regressors
     and torques (2 a side), of squared velocity errors (1 each)."""
     twist_squares, products, bend_squares, *side_sums = (np.asarray(column, np.float64) for column in sums)

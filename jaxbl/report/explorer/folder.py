@@ -16,6 +16,7 @@ import pandas as pd
 
 from jaxbl.errors import InputError
 from jaxbl.files import catch_write_errors, is_empty, json_with_checksum, make_folder, read_json
+from jaxbl.json_types import JsonObject
 from jaxbl.report.maps import drawn_values
 
 ROW_GROUP = 1 << 17
@@ -75,7 +76,7 @@ def write_static(source: Source, out: Path) -> Path:
     return out / "index.html"
 
 
-def write_page(out: Path, parts: Sequence[str], about: Mapping[str, Any], *, scripts: bool = True) -> None:
+def write_page(out: Path, parts: Sequence[str], about: JsonObject, *, scripts: bool = True) -> None:
     """Write a page into a folder that has `points.parquet`.
 
     Args:

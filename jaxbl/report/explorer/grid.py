@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.picture import packed
 from jaxbl.sweeps.points import AxisColumns, Points
@@ -51,7 +52,7 @@ def _places(dim: AxisColumns, frame: pd.DataFrame) -> np.ndarray:
     return pd.MultiIndex.from_arrays([*dim.values()]).get_indexer(pd.MultiIndex.from_arrays([frame[path] for path in dim]))
 
 
-def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -> dict[str, Any]:
+def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -> JsonObject:
     """Write `points.parquet`, and return what the page says of it.
 
     Args:
@@ -63,7 +64,7 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
     dims, units = dimensions(result.config), numeric_paths(result.config)
     assert dims is not None
 
-    def axis(path: str, values: np.ndarray) -> dict[str, Any]:
+    def axis(path: str, values: np.ndarray) -> JsonObject:
         return {"path": path, "unit": units[path].unit if path in units else "", "values": to_jsonable(values)}
 
     return {
@@ -72,7 +73,7 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
     } | _write_points(result, metrics, first, out, dims)
 
 
-def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> dict[str, Any]:
+def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
     """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
     Returns what the page needs to read it, and its first picture."""
     shape = [_length(one) for one in dims]
@@ -99,7 +100,7 @@ def _write_table(out: Path, columns: Mapping[str, np.ndarray], rows: int) -> Non
             writer.write_table(pa.table(part, schema=schema), row_group_size=ROW_GROUP)
 
 
-def _overview(values: np.ndarray, shape: list[int]) -> dict[str, Any]:
+def _overview(values: np.ndarray, shape: list[int]) -> JsonObject:
     """The first picture: the map over the last two axes that vary, at the first value of the others, median over seeds."""
     y, x = [i for i, size in enumerate(shape[:-1]) if size > 1][-2:]
     index: list[Any] = [0] * len(shape)
@@ -111,7 +112,7 @@ def _overview(values: np.ndarray, shape: list[int]) -> dict[str, Any]:
     return {"x": x, "y": y, "shape": list(cells.shape), "values": packed(cells)}
 
 
-def _conditions() -> list[dict[str, Any]]:
+def _conditions() -> list[JsonObject]:
     """Each condition as a curve: it is homogeneous, lambda / sqrt(f) over alpha / f."""
     ratios = np.geomspace(1.0005, 2000.0, 600)
     curves = []

@@ -14,6 +14,7 @@ from matplotlib.colors import to_hex
 from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
 from jaxbl.files import read_json, to_path
+from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import diagnosis_lines
 from jaxbl.report.element import element_lines
@@ -70,7 +71,7 @@ def _read(file: Path) -> Any:
         ) from None
 
 
-def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, out: Path) -> dict[str, Any]:
+def write_log(summary: JsonObject, trace: pd.DataFrame, out: Path) -> JsonObject:
     """Write `points.parquet`, and return what the page says of its columns.
 
     Args:
@@ -101,7 +102,7 @@ def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, out: Path) -> dic
     }
 
 
-def _units(summary: Mapping[str, Any]) -> dict[str, str]:
+def _units(summary: JsonObject) -> dict[str, str]:
     """Unit of each side's position: m on a linear axis."""
     if "gap" in summary:
         return {side: summary["gap"]["units"].get(name, "rad") for side, name in POSITION_CHANNELS.items()}
@@ -145,7 +146,7 @@ _NAMES = {
 """Columns of what a diagnosis looks at missing torques along."""
 
 
-def _first(summary: Mapping[str, Any], frame: pd.DataFrame) -> list[str]:
+def _first(summary: JsonObject, frame: pd.DataFrame) -> list[str]:
     """Two coordinates that a log is looked at over at first: of a diagnosis those that explain most on the motor's side."""
     explained = {
         name: one["explained"] for name, one in summary.get("where", {}).get("motor", {}).get("coordinates", {}).items()
@@ -154,12 +155,10 @@ def _first(summary: Mapping[str, Any], frame: pd.DataFrame) -> list[str]:
     return [_NAMES[name] for name in sorted(names, key=lambda name: -(explained.get(name) or 0.0))[:2]]
 
 
-def _groups(summary: Mapping[str, Any], frame: pd.DataFrame, units: Mapping[str, str]) -> Iterable[dict[str, Any]]:
+def _groups(summary: JsonObject, frame: pd.DataFrame, units: Mapping[str, str]) -> Iterable[JsonObject]:
     """What is drawn in one figure: a quantity, and its lines, the first two at the beginning."""
 
-    def group(
-        name: str, quantity: str, unit: str, lines: Mapping[str, str], bandwidth: float | None = None
-    ) -> dict[str, Any]:
+    def group(name: str, quantity: str, unit: str, lines: Mapping[str, str], bandwidth: float | None = None) -> JsonObject:
         kept = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
         return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": kept}
 

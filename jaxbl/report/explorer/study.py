@@ -12,6 +12,7 @@ from matplotlib.colors import to_hex
 
 from jaxbl.config import Config, is_boolean, with_values
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
@@ -37,7 +38,7 @@ def study_source(folder: str | Path) -> Source:
         now = open_study(folder)
         return write_study(now, out, _lead(now), served=served)
 
-    def answer(to: Callable[[Config, Any], dict[str, Any]], asked: Any) -> dict[str, Any]:
+    def answer(to: Callable[[Config, Any], JsonObject], asked: Any) -> JsonObject:
         with one_at_a_time:
             return to(result.config, asked)
 
@@ -108,7 +109,7 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     return with_values(config, values).model_copy(update={"axes": [], "figures": [], "notes": []}), seed
 
 
-def simulated(config: Config, asked: Any) -> dict[str, Any]:
+def simulated(config: Config, asked: Any) -> JsonObject:
     """One run of a study, for its page: metrics, traces (float32 in base64), the path of each error, the point as TOML.
     Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
@@ -134,13 +135,13 @@ _NEARBY = 6
 """Runs that show how far apart rounding brings figures."""
 
 
-def nearby(config: Config, asked: Any) -> dict[str, Any]:
+def nearby(config: Config, asked: Any) -> JsonObject:
     """Metrics of runs whose numbers differ from a point's in their last digits. Arguments and errors as of
     :func:`point_of`."""
     return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}
 
 
-def _about(config: Config, columns: list[str]) -> dict[str, Any]:
+def _about(config: Config, columns: list[str]) -> JsonObject:
     """What the page says of a study and its columns."""
     known = {axis.path for axis in config.axes} | {"seed"}
     names = [name for name in columns if name not in known]
@@ -158,7 +159,7 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
     }
 
 
-def _gains(config: Config) -> dict[str, Any]:
+def _gains(config: Config) -> JsonObject:
     """Gains of each side's observer, where no axis changes them."""
     experiment = config.build()
     return {side: getattr(experiment.observer, side).gains() for side in experiment.sides}

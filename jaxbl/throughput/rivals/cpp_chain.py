@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..workload import SEED, SINE, Workload, chain_constants, metrics_from_sums
+from ..workload import SEED, SINE, Metrics, Workload, chain_constants, metrics_from_sums
 
 _COMPILER_FLAGS = (
     "-std=c++20",
@@ -84,7 +84,7 @@ class CppChain:
         self._constants = _Constants(**chain_constants(), **SINE)
         self._table = [array_pointers(arrays) for arrays in (self._values, self._out)]
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         workload = self.workload
         self._function(
             ctypes.byref(self._constants), workload.steps, workload.start, workload.window, self._torque.ctypes,

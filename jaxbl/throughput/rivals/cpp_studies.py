@@ -14,7 +14,7 @@ from jaxbl.simulate import block_length, unit_noise
 from jaxbl.sweeps.metrics import window_start
 
 from ..studies import BenchStudy
-from ..workload import SIDES
+from ..workload import SIDES, Metrics
 from .cpp_chain import PADDING, array_pointers, compile_library
 
 _NUMBER_NAMES = (
@@ -81,14 +81,14 @@ class CppStudy:
         self._samples = np.zeros((run.steps, 7))
         self._table = array_pointers(self._values), array_pointers(self._out)
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         """Figures `(seeds, lanes)` by name."""
         first = self._round * self._study.seeds
         self._round += self._makes_noise
         runs = [self._run(seed) for seed in range(first, first + self._study.seeds)]
         return {name: np.stack([run[name] for run in runs]) for name in runs[0]}
 
-    def _run(self, seed: int) -> dict[str, np.ndarray]:
+    def _run(self, seed: int) -> Metrics:
         if not self._makes_noise:
             noise = unit_noise(jnp.asarray(seed), jnp.arange(self._study.config.run.steps, dtype=jnp.int32), SIDES)
             self._noise[: self._study.config.run.steps] = np.stack([noise[side] for side in SIDES], axis=1)

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from ..workload import Workload, metrics_from_sums
+from ..workload import Metrics, Workload, metrics_from_sums
 from .python_chain import chain_loop, constants_as, moreau_step, super_twisting_step
 
 BLOCK_LANES = 64
@@ -28,7 +28,7 @@ class NumbaChain:
         self._values = np.stack([np.resize(column, padded) for column in workload.values().values()])
         self._constants = constants_as(workload.dtype.type)
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         import numba
 
         workload = self._workload

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..workload import Workload, chain_constants, metrics_from_sums
+from ..workload import Metrics, Workload, chain_constants, metrics_from_sums
 
 _ARRAY_FUNCTIONS = np.tanh, np.sqrt, np.sign
 _NUMBER_FUNCTIONS = math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0)
@@ -48,7 +48,7 @@ class PythonChain:
         self._values: list[Any] = [column.item() for column in values] if scalar else values
         self._constants = constants_as(float if scalar else workload.dtype.type)
 
-    def __call__(self) -> dict[str, np.ndarray]:
+    def __call__(self) -> Metrics:
         workload, (tanh, sqrt, sign) = self._workload, _NUMBER_FUNCTIONS if self._scalar else _ARRAY_FUNCTIONS
         plant = moreau_step(tanh) if self._solver is None else _scipy_step(self._solver)
         motor = load = super_twisting_step(sqrt, sign)
