@@ -32,8 +32,7 @@ from scipy.optimize import brentq  # noqa: E402
 
 from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
-from jaxbl.identification import identify as whole  # noqa: E402
-from jaxbl.identification import log_columns  # noqa: E402
+from jaxbl.identification import identify as whole, log_columns  # noqa: E402
 from jaxbl.identification.free_parameters import make_free_parameters  # noqa: E402
 from jaxbl.identification.intervals import spread  # noqa: E402
 from jaxbl.identification.logs import arrays, gains_for, on_record  # noqa: E402

@@ -7,46 +7,36 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .config import Config as Config
-    from .config import read_config as read_config
-    from .diagnosis.diagnose import Diagnosis as Diagnosis
-    from .diagnosis.diagnose import diagnose as diagnose
-    from .errors import InputError as InputError
-    from .errors import NoResult as NoResult
-    from .exports import Export as Export
-    from .exports import export as export
-    from .gains.accuracy_laws import Law as Law
-    from .gains.accuracy_laws import accuracy_laws as accuracy_laws
-    from .gains.tune import Tuning as Tuning
-    from .gains.tune import tune as tune
-    from .gains.verify import Verdict as Verdict
-    from .gains.verify import verify as verify
-    from .identification.element import ElementIdentification as ElementIdentification
-    from .identification.element import identify_element as identify_element
-    from .identification.identify import Identification as Identification
-    from .identification.identify import identify as identify
-    from .monitoring.watch import Watch as Watch
-    from .monitoring.watch import watch as watch
-    from .records import Inspection as Inspection
-    from .records import LogTable as LogTable
-    from .records import Record as Record
-    from .records import inspect as inspect
-    from .records import read_record as read_record
-    from .report.results import draw as draw
-    from .report.results import write_report as write_report
-    from .sweeps.compare import Comparison as Comparison
-    from .sweeps.compare import compare as compare
-    from .sweeps.status import Status as Status
-    from .sweeps.status import status as status
-    from .sweeps.sweep import StudyResult as StudyResult
-    from .sweeps.sweep import dry_run as dry_run
-    from .sweeps.sweep import open_study as open_study
-    from .sweeps.sweep import repair as repair
-    from .sweeps.sweep import share as share
-    from .sweeps.sweep import submit as submit
-    from .sweeps.sweep import sweep as sweep
-    from .sweeps.trial import Trial as Trial
-    from .sweeps.trial import run as run
+    from .config import Config as Config, read_config as read_config
+    from .diagnosis.diagnose import Diagnosis as Diagnosis, diagnose as diagnose
+    from .errors import InputError as InputError, NoResult as NoResult
+    from .exports import Export as Export, export as export
+    from .gains.accuracy_laws import Law as Law, accuracy_laws as accuracy_laws
+    from .gains.tune import Tuning as Tuning, tune as tune
+    from .gains.verify import Verdict as Verdict, verify as verify
+    from .identification.element import ElementIdentification as ElementIdentification, identify_element as identify_element
+    from .identification.identify import Identification as Identification, identify as identify
+    from .monitoring.watch import Watch as Watch, watch as watch
+    from .records import (
+        Inspection as Inspection,
+        LogTable as LogTable,
+        Record as Record,
+        inspect as inspect,
+        read_record as read_record,
+    )
+    from .report.results import draw as draw, write_report as write_report
+    from .sweeps.compare import Comparison as Comparison, compare as compare
+    from .sweeps.status import Status as Status, status as status
+    from .sweeps.sweep import (
+        StudyResult as StudyResult,
+        dry_run as dry_run,
+        open_study as open_study,
+        repair as repair,
+        share as share,
+        submit as submit,
+        sweep as sweep,
+    )
+    from .sweeps.trial import Trial as Trial, run as run
     from .throughput import bench as bench
 
 # the same for loading; a test compares the two

@@ -15,37 +15,38 @@ from .units import on_a_line
 
 Unit = float | Callable[[float], float]
 """A factor to SI, or a function that gives the SI value."""
+Units = Mapping[str, Unit]
 
 _DEGREE = math.pi / 180.0
 _RPM = math.pi / 30.0
-_ANGLE: dict[str, Unit] = {
+_ANGLE: Units = {
     "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "arcmin": _DEGREE / 60.0, "arcsec": _DEGREE / 3600.0,
 }  # fmt: skip
-_TORQUE: dict[str, Unit] = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "N mm": 1e-3}
-_INERTIA: dict[str, Unit] = {"kg m²": 1.0, "kg cm²": 1e-4, "kg mm²": 1e-6, "g cm²": 1e-7}
-_VISCOUS: dict[str, Unit] = {
+_TORQUE: Units = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "N mm": 1e-3}
+_INERTIA: Units = {"kg m²": 1.0, "kg cm²": 1e-4, "kg mm²": 1e-6, "g cm²": 1e-7}
+_VISCOUS: Units = {
     "N m s/rad": 1.0, "mN m s/rad": 1e-3, "N m/rpm": 1.0 / _RPM, "mN m/rpm": 1e-3 / _RPM, "mN m/krpm": 1e-6 / _RPM,
 }  # fmt: skip
-_STIFFNESS: dict[str, Unit] = {
+_STIFFNESS: Units = {
     "N m/rad": 1.0, "kN m/rad": 1e3, "N m/deg": 1.0 / _DEGREE, "N m/arcmin": 60.0 / _DEGREE,
 }  # fmt: skip
-_LENGTH: dict[str, Unit] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
-_FORCE: dict[str, Unit] = {"N": 1.0, "kN": 1e3}
-_MASS: dict[str, Unit] = {"kg": 1.0, "g": 1e-3, "t": 1e3}
-_DRAG: dict[str, Unit] = {"N s/m": 1.0, "N s/mm": 1e3, "N/(m/min)": 60.0}
-_AXIAL: dict[str, Unit] = {"N/m": 1.0, "N/mm": 1e3, "kN/mm": 1e6, "N/um": 1e6}
-_VELOCITY: dict[str, Unit] = {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0}
-_LEAD: dict[str, Unit] = {
+_LENGTH: Units = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+_FORCE: Units = {"N": 1.0, "kN": 1e3}
+_MASS: Units = {"kg": 1.0, "g": 1e-3, "t": 1e3}
+_DRAG: Units = {"N s/m": 1.0, "N s/mm": 1e3, "N/(m/min)": 60.0}
+_AXIAL: Units = {"N/m": 1.0, "N/mm": 1e3, "kN/mm": 1e6, "N/um": 1e6}
+_VELOCITY: Units = {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0}
+_LEAD: Units = {
     "m": lambda travel: 2.0 * math.pi / travel, "mm": lambda travel: 2e3 * math.pi / travel,
 }  # fmt: skip
 """Travel of a load for one turn of the motor: it becomes a gear ratio, rad/m."""
-_STEP: dict[str, Unit] = _ANGLE | {
+_STEP: Units = _ANGLE | {
     "counts": lambda count: 2.0 * math.pi / count,
     "lines": lambda count: 0.5 * math.pi / count,  # of which each makes four counts
     "bit": lambda bits: 2.0 * math.pi / 2.0**bits,
 }
-_PERIOD: dict[str, Unit] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "Hz": lambda rate: 1.0 / rate, "kHz": lambda rate: 1e-3 / rate}
-_SPEED: dict[str, Unit] = {"rad/s": 1.0, "rpm": _RPM, "deg/s": _DEGREE}
+_PERIOD: Units = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "Hz": lambda rate: 1.0 / rate, "kHz": lambda rate: 1e-3 / rate}
+_SPEED: Units = {"rad/s": 1.0, "rpm": _RPM, "deg/s": _DEGREE}
 _SPELLINGS = {
     "²": "2", "µ": "u", "μ": "u", "°": "deg", "′": "arcmin", "″": "arcsec", "1/min": "rpm", "min-1": "rpm", "bits": "bit",
     ":1": "",
@@ -73,7 +74,7 @@ class Item(NamedTuple):
 
     name: str
     question: str
-    units: Mapping[str, Unit]
+    units: Units
     example: str
     default: str = ""
     least: float = 0.0
@@ -137,6 +138,10 @@ class Answer(NamedTuple):
 
     value: float
     text: str
+
+
+Answers = Mapping[str, Answer]
+"""What was answered, by the name of the item."""
 
 
 def _normalise_unit(unit: str) -> str:
@@ -266,7 +271,7 @@ _ERROR_SHARE = 0.05
 """Of the largest speed: the velocity error that an observer may have."""
 
 
-def write_first_study(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> tuple[str, JsonObject]:
+def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[str, JsonObject]:
     """Write a study with comments that `simulate`, `sweep` and `tune` can run.
 
     Args:
@@ -312,7 +317,7 @@ def _check_motion(kind: DriveKind, pilot_metrics: JsonObject) -> None:
         raise InputError(f"the load does not move: {options['backlash']} should be smaller, or {options['frequency']} lower")
 
 
-def rename_to_geared(kind: DriveKind, answers: Mapping[str, Answer]) -> dict[str, Answer]:
+def rename_to_geared(kind: DriveKind, answers: Answers) -> dict[str, Answer]:
     """Return the answers by the names that they have on a geared drive."""
     return {item.key or item.name: answers[item.name] for item in kind.items}
 
@@ -327,7 +332,7 @@ def _format_number(value: float, digits: int = 6) -> str:
     return repr(float(f"{value:.{digits}g}"))
 
 
-def _write_drive(kind: DriveKind, answers: Mapping[str, Answer], title: str) -> str:
+def _write_drive(kind: DriveKind, answers: Answers, title: str) -> str:
     """The tables of the drive, its input and its sensors; numbers are :func:`rename_to_geared`."""
     import tomli_w
 
@@ -399,7 +404,7 @@ def _to_motor(ratio: float) -> tuple[float, float]:
     return ratio**-2, 0.5 * ratio
 
 
-def _write_notes(kind: DriveKind, answers: Mapping[str, Answer]) -> list[str]:
+def _write_notes(kind: DriveKind, answers: Answers) -> list[str]:
     """Write notes for readers of the study's pages on its units and sensors."""
     notes = []
     if kind.linear:
@@ -415,7 +420,7 @@ def _write_notes(kind: DriveKind, answers: Mapping[str, Answer]) -> list[str]:
 
 def _write_transmission(
     kind: DriveKind,
-    answers: Mapping[str, Answer],
+    answers: Answers,
     write_side_numbers: Callable[..., list[str]],
     write_line: Callable[..., str],
 ) -> list[str]:
@@ -442,7 +447,7 @@ def _write_transmission(
     return lines
 
 
-def _choose_amplitude(answers: Mapping[str, Answer], waves: int) -> float:
+def _choose_amplitude(answers: Answers, waves: int) -> float:
     """Choose the amplitude (N m, N) of an input of several waves: the lowest wave takes the rigid drive to its rated speed.
 
     It is at most the rated torque.
@@ -455,7 +460,7 @@ def _choose_amplitude(answers: Mapping[str, Answer], waves: int) -> float:
     return min(value["torque"], lowest * math.sqrt(waves) + value["motor_friction"])
 
 
-def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: JsonObject) -> tuple[float, float]:
+def _choose_tolerances(answers: Answers, pilot_metrics: JsonObject) -> tuple[float, float]:
     """Choose the velocity and position error (rad/s, rad; m/s, m) that the motor's observer may have.
 
     A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what
@@ -474,7 +479,7 @@ def _choose_tolerances(answers: Mapping[str, Answer], pilot_metrics: JsonObject)
     return velocity, velocity * period + 4.0 * max(reading_errors)
 
 
-def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metrics: JsonObject) -> str:
+def describe_obstacle(kind: DriveKind, answers: Answers, pilot_metrics: JsonObject) -> str:
     """Describe in a sentence why estimates will be poor; "" if they will not."""
     velocity, _ = _choose_tolerances(rename_to_geared(kind, answers), pilot_metrics)
     share = velocity / pilot_metrics["motor"]["largest_velocity"]
@@ -488,7 +493,7 @@ def describe_obstacle(kind: DriveKind, answers: Mapping[str, Answer], pilot_metr
 
 def _write_observers(
     kind: DriveKind,
-    answers: Mapping[str, Answer],
+    answers: Answers,
     pilot_metrics: JsonObject,
     gains: Mapping[str, tuple[float, float]],
     usual: tuple[float, float],

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .drive.effects import AbstractEffect
@@ -27,6 +28,8 @@ from .observer.recursive import Identifier, IdentifierState
 UNROLL_SUBSTEPS = False
 # if they are unrolled, XLA fuses each substep with copies of all before it: quadratic work (benchmarks/NOTES.md)
 
+NamedArrays = dict[str, np.ndarray]
+"""Arrays by the name of a side, a metric or a number."""
 Number = Any  # a number of one lane: Float[Array, ""] inside a step
 
 
@@ -297,6 +300,9 @@ class Reducer(NamedTuple):
     done: Callable[[Experiment, Any, State], Array] | None = None
 
 
+Reducers = tuple[Reducer, ...]
+
+
 def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
     """Draw standard normal noise for each side, shape (samples,), which depends on seed and sample index alone.
 
@@ -323,13 +329,13 @@ Carry = tuple[State, tuple[Any, ...]]
 """The state of the chain, and the carry of each reducer."""
 
 
-def initial_carry(experiment: Experiment, reducers: tuple[Reducer, ...], state: State | None = None) -> Carry:
+def initial_carry(experiment: Experiment, reducers: Reducers, state: State | None = None) -> Carry:
     """Return the carry before the first sample, with the given state of the chain or that at t = 0."""
     return initial_state(experiment) if state is None else state, tuple(reducer.init(experiment) for reducer in reducers)
 
 
 def advance_sample(
-    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], *sample_inputs: Any
+    experiment: Experiment, reducers: Reducers, carry: Carry, index: Int[Array, ""], *sample_inputs: Any
 ) -> tuple[Carry, Signals]:
     """Advance the carry by sample `index`, and return the signals there.
 
@@ -353,7 +359,7 @@ def end_block(experiment: Experiment, carry: Carry) -> Carry:
     return eqx.tree_at(lambda state: state.identifier, state, identifier), totals
 
 
-def compute_metrics(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> dict[str, Array]:
+def compute_metrics(experiment: Experiment, reducers: Reducers, carry: Carry) -> dict[str, Array]:
     """Compute the metrics of all reducers from the last carry, by name."""
     state, totals = carry
     metrics: dict[str, Array] = {}
@@ -362,7 +368,7 @@ def compute_metrics(experiment: Experiment, reducers: tuple[Reducer, ...], carry
     return metrics
 
 
-def all_done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> Array | None:
+def all_done(experiment: Experiment, reducers: Reducers, carry: Carry) -> Array | None:
     """Return True if no further sample can change any metric; None if a reducer needs all samples."""
     state, totals = carry
     if not reducers or any(reducer.done is None for reducer in reducers):
@@ -374,7 +380,7 @@ def all_done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry
 def scan(
     experiment: Experiment,
     seed: Int[Array, ""],
-    reducers: tuple[Reducer, ...] = (),
+    reducers: Reducers = (),
     record: Callable[[State, Signals], Any] | None = None,
     stride: int = 1,
 ) -> tuple[dict[str, Array], Any]:
@@ -404,7 +410,7 @@ def replay(
     experiment: Experiment,
     torque: Float[Array, " samples"],
     measured: dict[str, Float[Array, " samples"]],
-    reducers: tuple[Reducer, ...] = (),
+    reducers: Reducers = (),
     record: Callable[[State, Signals], Any] | None = None,
     stride: int = 1,
     state: State | None = None,
@@ -441,7 +447,7 @@ def _scan(
     carry: Carry,
     steps: int,
     sample_inputs: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
-    reducers: tuple[Reducer, ...],
+    reducers: Reducers,
     record: Callable[[State, Signals], Any] | None,
     stride: int,
 ) -> tuple[dict[str, Array], Any]:

@@ -1,8 +1,7 @@
 """What a terminal shows: tables of 80 columns, whatever is in them."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxbl.lines import TERMINAL_WIDTH, NextStep, format_descriptions, format_steps, format_table
 

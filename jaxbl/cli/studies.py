@@ -108,8 +108,7 @@ def sweep(
     run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
     collect = functools.partial(compute, context, config, study, out, overwrite, chosen, run, "sweep", after_sweep)
     if detach or share_numbers is not None:
-        from jaxbl.sweeps.sweep import share as run_share
-        from jaxbl.sweeps.sweep import submit
+        from jaxbl.sweeps.sweep import share as run_share, submit
 
         folder = folder_of(config, out)
         with run_with_progress(context, config, folder) as progress:

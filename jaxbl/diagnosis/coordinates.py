@@ -10,7 +10,7 @@ from jaxbl.identification.regression import Kinematics, transmitted
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
-from .residuals import Residual
+from .residuals import Residual, SideResiduals
 
 EVERYWHERE = "all"
 """The coordinate that is the same all along a log."""
@@ -100,7 +100,7 @@ def within_turn(position: np.ndarray) -> np.ndarray | None:
 def all_coordinates(
     experiment: Experiment,
     segments: Sequence[Segment],
-    residuals: Mapping[str, Sequence[Residual]],
+    residuals: SideResiduals,
     sliding: Collection[str],
 ) -> dict[str, list[dict[str, CoordinateValues]]]:
     """Those of each side's residuals (:func:`coordinates_of`), segment by segment."""

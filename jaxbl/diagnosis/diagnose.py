@@ -5,7 +5,7 @@ the fit has seen.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -44,7 +44,7 @@ from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
 from .proof import SEEN, SURE, Accepted, Control, Proof, beaten, free_values
 from .reference_log import at_period
-from .residuals import Residual, residual_torques
+from .residuals import Residual, SideResiduals, residual_torques
 from .setup import Setup, set_up
 from .torque_fit import fit_to_torque
 from .torque_regression import extended
@@ -87,7 +87,7 @@ class Diagnosis:
     holdout: Record
     summary: JsonObject
     trace: pd.DataFrame
-    residuals: dict[str, list[Residual]]
+    residuals: SideResiduals
     observed: dict[str, list[Observed]]
     coordinates: dict[str, list[dict[str, CoordinateValues]]]
     located: dict[str, Localised]
@@ -198,7 +198,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
 
 def _missing(
     setup: Setup, proof: Proof, accepted: Accepted, controls: Sequence[Control]
-) -> dict[str, tuple[dict[str, list[Residual]], dict[str, list[Residual]]]]:
+) -> dict[str, tuple[SideResiduals, SideResiduals]]:
     """Torques that models lack on the log and on what was held out, by names of columns: the model as given, the one with
     the effects, that without each of them, and the one with another effect in place of the last."""
     fitted = accepted.fitted
@@ -207,7 +207,7 @@ def _missing(
     after = residual_torques(fitted.experiment, setup.fitted.segments), accepted.after.torques
     found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
     for name, experiment in others.items():
-        held: dict[str, list[Residual]] = {}
+        held: SideResiduals = {}
         # the trace has no samples of another log
         if not setup.task.separate:
             held = residual_torques(at_period(experiment, setup.holdout.period), setup.holdout.segments)
@@ -215,9 +215,7 @@ def _missing(
     return found
 
 
-def _paired(
-    before: Mapping[str, list[Residual]], after: Mapping[str, list[Residual]]
-) -> dict[str, list[tuple[Residual, Residual]]]:
+def _paired(before: SideResiduals, after: SideResiduals) -> dict[str, list[tuple[Residual, Residual]]]:
     return {side: list(zip(pieces, after[side], strict=True)) for side, pieces in before.items()}
 
 

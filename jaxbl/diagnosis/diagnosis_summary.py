@@ -28,7 +28,8 @@ from .neutral_effects import with_added
 from .numbers_by_log import Contradiction
 from .observer_residual import Observed, compared
 from .proof import Accepted, Control, FittedModel, free_values
-from .residuals import Residual
+from .reference_log import Errors
+from .residuals import SideResiduals
 from .sentences import sentence_of
 from .setup import Setup
 
@@ -121,8 +122,8 @@ def _finding(
 
 def tested(
     judgement: Judgement,
-    before: Mapping[str, float],
-    after: Mapping[str, float],
+    before: Errors,
+    after: Errors,
     expected: Mapping[str, Expected],
     controls: Sequence[Control],
 ) -> JsonObject:
@@ -220,13 +221,9 @@ def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> 
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
 
 
-Torques = Mapping[str, Sequence[Residual]]
-"""Torques that a model lacks, by side, segment by segment."""
-
-
 def trace_of(
     setup: Setup,
-    missing: Mapping[str, tuple[Torques, Torques]],
+    missing: Mapping[str, tuple[SideResiduals, SideResiduals]],
     observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]],
 ) -> pd.DataFrame:
     """One row a sample of the log, its held-out part included; of another log that was held out there is nothing.

@@ -22,7 +22,7 @@ from jaxbl.simulate import Experiment
 from .effect_search import LEAST
 from .input_noise import smoothed_input
 from .proof import FittedModel
-from .reference_log import Comparison, ReferenceLog
+from .reference_log import Comparison, Errors, ReferenceLog
 from .setup import InputNoise
 
 LEVEL = 0.01
@@ -80,7 +80,7 @@ def expected_errors(
     values, vectors = np.linalg.eigh(fitted.white)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
-    def apart(other: Comparison) -> dict[str, float]:
+    def apart(other: Comparison) -> Errors:
         every = other.samples | log.slow(other.torques)
         return {name: float(np.mean((one - samples[name]) ** 2)) for name, one in every.items()}
 
@@ -111,7 +111,7 @@ def expected_errors(
     return found
 
 
-def failed(errors: Mapping[str, float], expected: Mapping[str, Expected]) -> list[str]:
+def failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
     """Channels in which a model leaves more than a complete one would, or in which nobody can say: draws of it diverge."""
     return [name for name, one in expected.items() if not errors[name] <= one.limit < np.inf]
 

@@ -5,7 +5,6 @@ derivatives of their steps by loops for this machine's processor, and no more va
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
 from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, NamedArrays
 
 from .neutral_effects import lean
 
@@ -41,7 +40,7 @@ class _Model(NamedTuple):
 
     experiment: Experiment
     windows: Windows
-    varying: Mapping[str, np.ndarray]
+    varying: NamedArrays
 
     def states(self, starts: np.ndarray, which: np.ndarray) -> list[np.ndarray]:
         """Along some windows, from starts of shape (windows, states)."""
@@ -79,9 +78,7 @@ class _Model(NamedTuple):
         return -found.transpose(1, 0, 2, 3) / noise[:, None]
 
 
-def best_runs(
-    experiment: Experiment, windows: Windows, passes: int, rest: bool, varying: Mapping[str, np.ndarray] | None = None
-) -> Run:
+def best_runs(experiment: Experiment, windows: Windows, passes: int, rest: bool, varying: NamedArrays | None = None) -> Run:
     """Runs from the best initial states, found by damped Gauss-Newton.
 
     Args:

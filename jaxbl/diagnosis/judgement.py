@@ -14,6 +14,7 @@ from jaxbl.simulate import Experiment
 from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model, contains
 from .expected_errors import Expected, failed
 from .proof import SEEN, SURE, Control, FittedModel, special_case
+from .reference_log import Errors
 
 _LEAST_SHARE = 0.5
 """Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
@@ -46,8 +47,8 @@ class Judgement(NamedTuple):
 def judged(
     found: Explanation,
     fitted: FittedModel,
-    before: Mapping[str, float],
-    errors: Mapping[str, float],
+    before: Errors,
+    errors: Errors,
     expected: Mapping[str, Expected],
     controls: Sequence[Control],
     prior: np.ndarray,
@@ -173,13 +174,11 @@ def is_little(share: float | None) -> bool:
     return share is not None and share < _LEAST_SHARE
 
 
-def explained_share(
-    experiment: Experiment, before: Mapping[str, float], after: Mapping[str, float], expected: Mapping[str, Expected]
-) -> float | None:
+def explained_share(experiment: Experiment, before: Errors, after: Errors, expected: Mapping[str, Expected]) -> float | None:
     """Share of the missing torque's power, beyond what a complete model leaves, that a model takes away on held-out data;
     both sides at the motor. None where nothing is missing."""
 
-    def beyond(errors: Mapping[str, float]) -> float:
+    def beyond(errors: Errors) -> float:
         total = 0.0
         for side in experiment.sides:
             one = expected[f"torque_{side}"]

@@ -20,7 +20,7 @@ from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues
-from .residuals import Residual, narrowed, noise_spectrum
+from .residuals import Residual, SideResiduals, narrowed, noise_spectrum
 
 _BINS = 24
 """Of a coordinate: fine enough for a picture, each with a few per cent of the samples."""
@@ -425,7 +425,7 @@ def residual_spectrum(residual: Residual) -> tuple[np.ndarray, np.ndarray, np.nd
 
 def localise(
     experiment: Experiment,
-    residuals: Mapping[str, Sequence[Residual]],
+    residuals: SideResiduals,
     segments: Sequence[Segment],
     coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
 ) -> dict[str, Localised]:

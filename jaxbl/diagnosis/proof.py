@@ -15,7 +15,7 @@ from jaxbl.simulate import Experiment
 from .diagnosis_task import input_rms
 from .effect_search import FAR, FLOOR, EffectSearch, Explanation, Model
 from .linearised_model import Linear
-from .reference_log import PREDICTABLE, Comparison, ReferenceLog
+from .reference_log import PREDICTABLE, Comparison, Errors, ReferenceLog
 from .setup import Setup
 
 _WORSE, _WORSE_SPEED = 1.02, 1.05
@@ -123,7 +123,7 @@ class Control(NamedTuple):
     """
 
     kind: str
-    errors: dict[str, float]
+    errors: Errors
     z: float
     effect: str = ""
     experiment: Experiment | None = None
@@ -330,7 +330,7 @@ def _standard_errors(control: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
 
 
-def is_better(new: Mapping[str, float], old: Mapping[str, float]) -> bool:
+def is_better(new: Errors, old: Errors) -> bool:
     """Whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return bool(np.sum(np.log([new[name] for name in old]) - np.log(list(old.values()))) < 0.0)

@@ -20,11 +20,11 @@ from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, NamedArrays
 
 from .free_starts import Run, best_runs
 from .neutral_effects import lean, with_torques
-from .residuals import Residual, narrowed, residual_torques
+from .residuals import SideResiduals, narrowed, residual_torques
 
 WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
@@ -52,6 +52,10 @@ def at_period(experiment: Experiment, period: float) -> Experiment:
     return eqx.tree_at(lambda e: e.run.sample_period, experiment, np.asarray(period, float))
 
 
+Errors = dict[str, float]
+"""Rms errors by channel: `theta_e`, `velocity_motor`, `torque_motor` and so on."""
+
+
 class Comparison(NamedTuple):
     """A model beside a log.
 
@@ -63,9 +67,9 @@ class Comparison(NamedTuple):
         gain: torque on the motor for one unit of the input.
     """
 
-    errors: dict[str, float]
-    torques: dict[str, list[Residual]]
-    samples: dict[str, np.ndarray]
+    errors: Errors
+    torques: SideResiduals
+    samples: NamedArrays
     gain: float
 
 
@@ -98,14 +102,14 @@ class ReferenceLog:
         """Length of a window."""
         return min(max(round(WINDOW / self.period), _LEAST_IN_WINDOW), max(map(len, self.segments)))
 
-    def noise_floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
+    def noise_floor(self, torques: SideResiduals) -> Errors:
         """Noise of each channel: what a perfect model would leave."""
         found = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
         for side in self.noise:
             found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
         return found | {name: _rms([one]) for name, one in self._narrowed(torques, "deviation").items()}
 
-    def noise_of(self, compared: Comparison) -> dict[str, float]:
+    def noise_of(self, compared: Comparison) -> Errors:
         """Noise of each channel, slow torques among them: what the smoother finds or, where that is more, the white part of
         a model's errors.
 
@@ -120,11 +124,11 @@ class ReferenceLog:
                     found[name] *= more
         return found
 
-    def with_slow(self, compared: Comparison) -> dict[str, float]:
+    def with_slow(self, compared: Comparison) -> Errors:
         """Errors of a comparison, and those of slow torques besides: `torque_motor below 12 Hz`, ..."""
         return compared.errors | _all_rms(self.slow(compared.torques))
 
-    def slow(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, np.ndarray]:
+    def slow(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
         """Missing torques, or their noise, behind narrower low-passes, N m, by `torque_motor below 12 Hz` and so on."""
         found = {}
         for side, pieces in torques.items():
@@ -134,14 +138,14 @@ class ReferenceLog:
                     found[f"torque_{side} below {cutoff:.3g} Hz"] = np.concatenate(values)
         return found
 
-    def _narrowed(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, np.ndarray]:
+    def _narrowed(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
         """Missing torques, or their noise, behind the low-pass, N m."""
         return {
             f"torque_{side}": np.concatenate([getattr(narrowed(one, self.bandwidth[side])[0], name) for one in pieces])
             for side, pieces in torques.items()
         }
 
-    def largest_departures(self, experiment: Experiment) -> dict[str, float]:
+    def largest_departures(self, experiment: Experiment) -> Errors:
         """How far a model departs from each side's motion on short windows from the smoothed states, over its range."""
         experiment, added = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.rest)[0])
@@ -152,7 +156,7 @@ class ReferenceLog:
             found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
 
-    def compare(self, experiment: Experiment, added: Mapping[str, np.ndarray] | None = None) -> Comparison:
+    def compare(self, experiment: Experiment, added: NamedArrays | None = None) -> Comparison:
         """Errors of a model at this log's period on short windows, and the torques that it lacks; `added`: torques on its
         sides besides, N m, sample by sample from the first to the last."""
         experiment = at_period(experiment, self.period)
@@ -163,7 +167,7 @@ class ReferenceLog:
         samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
         return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain))
 
-    def rounding(self, experiment: Experiment) -> dict[str, float]:
+    def rounding(self, experiment: Experiment) -> Errors:
         """Torques that a model seems to lack along its own motion, rms, N m, by channel, since a smoother rounds jumps of
         friction, and with them the motion on both sides of a spring.
 
@@ -192,7 +196,7 @@ class ReferenceLog:
         torques = residual_torques(experiment, pieces)
         return _all_rms(self._narrowed(torques) | self.slow(torques))
 
-    def missing(self, experiment: Experiment, name: str = "torque") -> dict[str, np.ndarray]:
+    def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
         torques = residual_torques(at_period(experiment, self.period), self.segments)
         return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
@@ -201,7 +205,7 @@ class ReferenceLog:
         """Sampling periods from the log's first sample to each sample, segment by segment."""
         return [np.round((one.time - self.segments[0].time[0]) / self.period).astype(int) for one in self.segments]
 
-    def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
+    def free_run(self, experiment: Experiment) -> tuple[Errors, float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
 
         The latter over the motion's; large where a free run cannot be predicted. Up to a ninth at the end may be left out,
@@ -216,9 +220,7 @@ class ReferenceLog:
         deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
         return errors, one._growth(experiment, length, deviation)
 
-    def _samples(
-        self, experiment: Experiment, length: int, passes: int, added: Mapping[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
+    def _samples(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> NamedArrays:
         """Errors of positions and speeds on windows of a length, under torques added sample by sample; shape
         (windows, samples)."""
         run, firsts = self._runs(experiment, length, passes, added)
@@ -233,9 +235,7 @@ class ReferenceLog:
             found[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
         return found
 
-    def _runs(
-        self, experiment: Experiment, length: int, passes: int, added: Mapping[str, np.ndarray]
-    ) -> tuple[Run, np.ndarray]:
+    def _runs(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> tuple[Run, np.ndarray]:
         """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
         experiment, paths = with_torques(experiment)
         windows, firsts = windows_of(self.segments, experiment, length, self.rest)
@@ -293,7 +293,7 @@ def _run(experiment: Experiment, windows: Windows, start: PlantState, added: Map
     return simulate_plants(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
 
 
-def _all_rms(samples: Mapping[str, np.ndarray]) -> dict[str, float]:
+def _all_rms(samples: NamedArrays) -> Errors:
     return {name: _rms([one]) for name, one in samples.items()}
 
 

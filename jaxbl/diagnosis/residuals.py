@@ -59,6 +59,10 @@ class Residual:
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
 
 
+SideResiduals = dict[str, list[Residual]]
+"""Residuals of each side, segment by segment."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Response:
     """A smoother away from the ends, over frequencies from 0 to half the sampling rate, in units of noise and period.
@@ -212,7 +216,7 @@ def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[
     return {side: (one.beyond, one.friction) for side, one in _along(experiment, segment).items()}
 
 
-def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dict[str, list[Residual]]:
+def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> SideResiduals:
     """Torques that a model lacks on each side of a record, segment by segment.
 
     Noise: that of the readings through smoother and equation of motion, of a measured transmitted torque, and of position
@@ -220,7 +224,7 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     leave open.
     The model has array leaves, and the sample period of the record.
     """
-    found: dict[str, list[Residual]] = {side: [] for side in experiment.sides}
+    found: SideResiduals = {side: [] for side in experiment.sides}
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])

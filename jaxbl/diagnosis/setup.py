@@ -21,7 +21,7 @@ from .linearised_model import Linear
 from .localise import Localised, localise
 from .neutral_effects import candidates, complete
 from .reference_log import WINDOW, ReferenceLog
-from .residuals import Residual, residual_torques
+from .residuals import SideResiduals, residual_torques
 
 _DIVERGED = 10.0
 """Departure from the motion on short windows, over its range, from which on a model counts as diverging."""
@@ -73,7 +73,7 @@ class Setup(NamedTuple):
     recorded: Sequence[Segment]
     fitted: ReferenceLog
     holdout: ReferenceLog
-    lacking: dict[str, list[Residual]]
+    lacking: SideResiduals
     coordinates: dict[str, list[dict[str, CoordinateValues]]]
     located: dict[str, Localised]
     input_noise: InputNoise

@@ -7,7 +7,7 @@ into the model, all numbers are fitted, and the models are compared on the log b
 Reference: S. Arlot, A. Celisse, A survey of cross-validation procedures, Statistics Surveys 4 (2010), section 8.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from .candidates import Candidate, Forces, Numbers, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .proof import SEEN, FittedModel, beaten, fit_model
 from .reference_log import Comparison, ReferenceLog
-from .residuals import Residual, as_smoothed, low_passed, narrowed
+from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 
 _BLOCKS = 10
 """Of consecutive samples, each left out once: more than the eight of which a standard error is any use."""
@@ -118,9 +118,7 @@ def _replaced(name: str, by: str) -> bool:
     return contains(by, name) or exclusive(by, [name])
 
 
-def _proposals(
-    search: EffectSearch, model: Model, lacking: Mapping[str, Sequence[Residual]], log: ReferenceLog
-) -> list[_Proposal]:
+def _proposals(search: EffectSearch, model: Model, lacking: SideResiduals, log: ReferenceLog) -> list[_Proposal]:
     """Candidates that take away a part of the missing torque by cross-validation, the best one of each name, best first."""
     linear = model.linear
     # frequencies are sought in what this leaves
@@ -145,7 +143,7 @@ class _Regression:
     def __init__(
         self,
         model: Model,
-        lacking: Mapping[str, Sequence[Residual]],
+        lacking: SideResiduals,
         log: ReferenceLog,
         base: Sequence[Candidate],
         variants: Sequence[Candidate],

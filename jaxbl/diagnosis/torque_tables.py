@@ -19,7 +19,7 @@ from jaxbl.simulate import Experiment, with_effects
 
 from .proof import SURE, Proof, beaten
 from .reference_log import Comparison, ReferenceLog
-from .residuals import Residual, as_smoothed, low_passed, narrowed
+from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
 """Points of a table: waves of 12 periods over the range, or 18 a turn, still show; speeds have them where samples are."""
@@ -83,7 +83,7 @@ def tabulated(
     proof: Proof,
     experiment: Experiment,
     after: Comparison,
-    lacking: Mapping[str, Sequence[Residual]],
+    lacking: SideResiduals,
     sliding: Sequence[str],
 ) -> Tabulation | None:
     """Tables of what a model still lacks, if it predicts held-out data better with them; else None.

@@ -2,9 +2,8 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from .parameters import Scalar, parameter
+from .parameters import Scalar, ScalarArray, parameter
 
 
 class Encoders(eqx.Module):
@@ -26,9 +25,7 @@ class Encoders(eqx.Module):
             return self.noise
         return self.noise / ratio if self.load_noise is None else self.load_noise
 
-    def measure(
-        self, side: str, position: Float[Array, ""], unit_noise: Float[Array, ""], ratio: Scalar
-    ) -> Float[Array, ""]:
+    def measure(self, side: str, position: ScalarArray, unit_noise: ScalarArray, ratio: Scalar) -> ScalarArray:
         """Read a true position (rad).
 
         Args:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.registry import Registry, check_module
 
-from .parameters import Scalar, option, parameter
+from .parameters import Scalar, ScalarArray, option, parameter
 
 
 class AbstractExcitation(eqx.Module):
@@ -25,7 +25,7 @@ class AbstractExcitation(eqx.Module):
     name: ClassVar[str]
 
     @abc.abstractmethod
-    def __call__(self, time: Float[Array, ""]) -> Float[Array, ""]:
+    def __call__(self, time: ScalarArray) -> ScalarArray:
         """Torque u, N m, at a time in s."""
 
     @classmethod
@@ -124,12 +124,12 @@ class Chirp(AbstractExcitation):
         return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
 
 
-def _rounding_bound(time: Float[Array, ""]) -> Float[Array, ""]:
+def _rounding_bound(time: ScalarArray) -> ScalarArray:
     """Bound on the rounding error of a time (or a ratio of times) that is a multiple of a rounded period."""
     return 4.0 * float(jnp.finfo(jnp.result_type(time)).eps) * time
 
 
-def _hold_index(hold: Scalar, time: Float[Array, ""]) -> Array:
+def _hold_index(hold: Scalar, time: ScalarArray) -> Array:
     """Index of the hold interval at a time; at an edge a little early, since rounding must not make it a sample late."""
     holds = time / hold
     return jnp.floor(holds + 1e-4 + _rounding_bound(holds)).astype(jnp.int32)

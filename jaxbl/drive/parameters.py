@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-Scalar = float | Float[Array, ""]
+ScalarArray = Float[Array, ""]
+Scalar = float | ScalarArray
 """A number of a module: a Python float at first, a zero-dimensional array after :func:`as_arrays`."""
 
 Tree = TypeVar("Tree")

@@ -21,13 +21,12 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .effects import AbstractEffect, ActuatorEffect, EncoderEffect, Motion
-from .parameters import Scalar, parameter
+from .parameters import Scalar, ScalarArray, parameter
 from .transmission import AbstractTransmission
 
-SideValues = dict[str, Float[Array, ""]]
+SideValues = dict[str, ScalarArray]
 """One number for each side of the drive: keys "motor" and, on two inertias, "load"."""
 EffectStates = tuple[Any, ...]
 """The state of each effect, in the order of the effects."""
@@ -153,13 +152,13 @@ class Plant(eqx.Module):
         gap = 0.0 if self.transmission is None else float(self.transmission.half_gap)
         return gap + sum(float(effect.free_play()) for effect in self.effects)
 
-    def twist(self, position: SideValues) -> Float[Array, ""]:
+    def twist(self, position: SideValues) -> ScalarArray:
         """Twist of the transmission, z = theta_e - N_0 theta_s, rad."""
         return position["motor"] - self.drive.ratio("load") * position["load"]
 
     def transmitted_torque(
         self, position: SideValues, velocity: SideValues, states: EffectStates
-    ) -> tuple[Float[Array, ""], Scalar]:
+    ) -> tuple[ScalarArray, Scalar]:
         """Transmitted torque C (N m) of law and effects, and the gear ratio at this position (N_0 without effects)."""
         assert self.transmission is not None
         deflection, rate, ratio = self._elastic_motion(position, velocity, states)
@@ -175,7 +174,7 @@ class Plant(eqx.Module):
 
     def _elastic_motion(
         self, position: SideValues, velocity: SideValues, states: EffectStates
-    ) -> tuple[Float[Array, ""], Scalar, Scalar]:
+    ) -> tuple[ScalarArray, Scalar, Scalar]:
         """Elastic deflection of the transmission (rad), its rate (rad/s), and the gear ratio at this position.
 
         A transmission error e adds e(theta_s) to the twist; the ratio is then N_0 - e'(theta_s), so that no power is lost.
@@ -372,7 +371,7 @@ def _mean_torque(first: Scalar, then: Scalar, switch: Scalar, since: Scalar, ste
     return then + (first - then) * jnp.clip((switch - since) / step, 0.0, 1.0)
 
 
-def _apply_dry_friction(before: Float[Array, ""], free: Scalar, loss: Scalar) -> Float[Array, ""]:
+def _apply_dry_friction(before: ScalarArray, free: Scalar, loss: Scalar) -> ScalarArray:
     """Velocity after a step under set-valued dry friction; all arguments in rad/s.
 
     Args:

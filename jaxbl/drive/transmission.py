@@ -13,11 +13,10 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jaxbl.registry import Registry, check_module
 
-from .parameters import Scalar, parameter
+from .parameters import Scalar, ScalarArray, parameter
 
 
 class AbstractTransmission(eqx.Module):
@@ -35,20 +34,20 @@ class AbstractTransmission(eqx.Module):
     stiffness: eqx.AbstractVar[Scalar]
     half_gap: eqx.AbstractVar[Scalar]
 
-    def deflection(self, z: Float[Array, ""]) -> Float[Array, ""]:
+    def deflection(self, z: ScalarArray) -> ScalarArray:
         """Elastic deflection (rad) at a twist z (rad): the part of z beyond the free play."""
         return z
 
     @abc.abstractmethod
-    def torque(self, deflection: Float[Array, ""]) -> Float[Array, ""]:
+    def torque(self, deflection: ScalarArray) -> ScalarArray:
         """Transmitted torque C (N m) on the motor shaft, at a deflection (rad)."""
 
     @abc.abstractmethod
-    def regressors(self, z: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+    def regressors(self, z: ScalarArray) -> tuple[ScalarArray, ...]:
         """Functions r_i of the twist z (rad) such that C = sum_i r_i(z) theta_i, with unknown coefficients theta_i."""
 
     @abc.abstractmethod
-    def from_theta(self, theta: tuple[Float[Array, ""], ...]) -> dict[str, Float[Array, ""]]:
+    def from_theta(self, theta: tuple[ScalarArray, ...]) -> dict[str, ScalarArray]:
         """Convert regression coefficients theta into the numbers of :meth:`truth`."""
 
     @abc.abstractmethod

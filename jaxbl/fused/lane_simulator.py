@@ -14,7 +14,8 @@ import numpy as np
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.simulate import (
     Experiment,
-    Reducer,
+    NamedArrays,
+    Reducers,
     advance_sample,
     all_done,
     block_length,
@@ -79,9 +80,7 @@ class LaneSimulator(abc.ABC):
         Unsupported: a step does something that a compiled loop cannot do.
     """
 
-    def __init__(
-        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, multiple: int
-    ):
+    def __init__(self, experiment: Experiment, reducers: Reducers, paths: tuple[str, ...], lanes: int, multiple: int):
         self._paths, self._steps = paths, experiment.run.steps
         self._lanes, self._padded_lanes = lanes, -(-lanes // multiple) * multiple
         self._block_length = block_length(self._steps)
@@ -131,7 +130,7 @@ class LaneSimulator(abc.ABC):
         names = sorted(jax.eval_shape(finish, values, carry, ()))
         self._is_lane_metric = dict(zip(names, finish_split.is_lane_result, strict=True))
 
-    def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
+    def __call__(self, values: NamedArrays, seed: int) -> NamedArrays:
         """Simulate the lanes with one seed.
 
         Args:
@@ -166,7 +165,7 @@ class LaneSimulator(abc.ABC):
         if room >= 0:
             self._cached_inputs[seed] = computed
 
-    def pad_lanes(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
+    def pad_lanes(self, values: NamedArrays) -> list[np.ndarray]:
         """Return the values of the lanes, `(padded lanes,)` for each path in order, padded by repeating the last lane."""
         columns = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
         for path, column in zip(self._paths, columns, strict=True):
@@ -199,9 +198,7 @@ class LaneSimulator(abc.ABC):
 class HostSimulator(LaneSimulator):
     """Simulates lanes by code for this machine's processor; `threads` share the lanes."""
 
-    def __init__(
-        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, threads: int
-    ):
+    def __init__(self, experiment: Experiment, reducers: Reducers, paths: tuple[str, ...], lanes: int, threads: int):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._vector_lanes = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._vector_lanes)
@@ -378,7 +375,7 @@ class DeviceSimulator(LaneSimulator):
     def __init__(
         self,
         experiment: Experiment,
-        reducers: tuple[Reducer, ...],
+        reducers: Reducers,
         paths: tuple[str, ...],
         lanes: int,
         *,

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, correct_by_readings, move_plant
+from jaxbl.simulate import Experiment, NamedArrays, correct_by_readings, move_plant
 from jaxbl.workers import map_in_threads
 
 from . import Leaves, Unsupported, program_cache
@@ -44,8 +44,8 @@ def simulate_plant(
     start: PlantState,
     torque: np.ndarray,
     time: float = 0.0,
-    measured: dict[str, np.ndarray] | None = None,
-    gain: dict[str, np.ndarray] | None = None,
+    measured: NamedArrays | None = None,
+    gain: NamedArrays | None = None,
 ) -> PlantState:
     """Simulate one plant; arguments as for :func:`jaxbl.simulate.plant_trajectory`.
 
@@ -62,9 +62,9 @@ def simulate_plants(
     starts: PlantState,
     torque: np.ndarray,
     time: np.ndarray,
-    measured: Mapping[str, np.ndarray] | None = None,
-    gain: Mapping[str, np.ndarray] | None = None,
-    varying: Mapping[str, np.ndarray] | None = None,
+    measured: NamedArrays | None = None,
+    gain: NamedArrays | None = None,
+    varying: NamedArrays | None = None,
 ) -> PlantState:
     """Simulate several runs of a plant.
 
@@ -148,8 +148,8 @@ class PlantSimulator:
         starts: PlantState,
         torque: np.ndarray,
         time: np.ndarray,
-        measured: Mapping[str, np.ndarray],
-        gain: Mapping[str, np.ndarray],
+        measured: NamedArrays,
+        gain: NamedArrays,
     ) -> PlantState:
         """Simulate with these values of the varied numbers; other arguments as for :func:`simulate_plants`."""
         if self.loop is None:
@@ -170,7 +170,7 @@ def step_derivatives(
     torque: np.ndarray,
     time: np.ndarray,
     directions: Sequence[Direction],
-    varying: Mapping[str, np.ndarray] | None = None,
+    varying: NamedArrays | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the step that follows each sample, and the state after it.
 

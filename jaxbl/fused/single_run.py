@@ -13,7 +13,8 @@ import numpy as np
 
 from jaxbl.simulate import (
     Experiment,
-    Reducer,
+    NamedArrays,
+    Reducers,
     Signals,
     State,
     advance_sample,
@@ -33,10 +34,10 @@ from .shared_part import SharedPart, compile_shared_part
 def record_run(
     experiment: Experiment,
     seed: int,
-    reducers: tuple[Reducer, ...],
+    reducers: Reducers,
     record: Callable[[State, Signals], dict[str, Any]],
     every: int = 1,
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+) -> tuple[NamedArrays, NamedArrays]:
     """Simulate one experiment, in its precision; arguments as for :func:`jaxbl.simulate.scan`.
 
     Returns:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment, Signals, State, replay
+from jaxbl.simulate import Experiment, NamedArrays, Signals, State, replay
 
 from .compilation import jit
 from .regression import model_torques
@@ -17,7 +17,7 @@ from .search import Found
 from .segments import Segment
 
 
-def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> dict[str, np.ndarray]:
+def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> NamedArrays:
     """Columns of a log and its fit, each of shape (samples,); NaN where the log gives none.
 
     `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration` with
@@ -73,9 +73,7 @@ def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax
     return replay(experiment, torque, measured, record=keep)[1]
 
 
-def observer_chain(
-    experiment: Experiment, segments: Sequence[Segment], samples: int
-) -> tuple[dict[str, np.ndarray], JsonObject]:
+def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples: int) -> tuple[NamedArrays, JsonObject]:
     """The paper's chain on the longest segment: observers, and the recursive identifier on their equivalent control.
 
     Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.identification.compilation import jit
-from jaxbl.simulate import Experiment, Sample, State, initial_state, step
+from jaxbl.simulate import Experiment, NamedArrays, Sample, State, initial_state, step
 
 BLOCKS = (256, 2048, 16_384)
 """Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""
@@ -42,7 +42,7 @@ class LiveChain:
         self._experiment = dataclasses.replace(experiment, identifier=None)
         self._state: State | None = None
 
-    def take(self, torque: np.ndarray, measured: dict[str, np.ndarray], restarts: bool) -> dict[str, np.ndarray]:
+    def take(self, torque: np.ndarray, measured: NamedArrays, restarts: bool) -> NamedArrays:
         """Take in samples.
 
         Args:
@@ -57,7 +57,7 @@ class LiveChain:
         if self._state is None or restarts:
             first = {side: jnp.asarray(values[0]) for side, values in measured.items()}
             self._state = initial_state(self._experiment, first)
-        blocks: list[dict[str, np.ndarray]] = []
+        blocks: list[NamedArrays] = []
         done = 0
         while done < len(torque):
             remaining = len(torque) - done

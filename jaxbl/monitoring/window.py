@@ -28,7 +28,7 @@ from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.identification.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.records.linear_filters import savitzky_golay_slopes
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, NamedArrays
 
 BLOCKS = 10
 """Blocks of a window, of which the jackknife leaves out one at a time."""
@@ -121,7 +121,7 @@ class Window:
         self._constant = constant = float(experiment.equivalent_control.time_constant)
         self._settling = math.ceil(max(SETTLING * constant, float(experiment.identifier.start)) / self._period)
         self._half = max(math.ceil(_SLOPE * constant / self._period), 2)
-        self._rows: dict[str, np.ndarray] = {}
+        self._rows: NamedArrays = {}
         self._rows_until_settled = 0
         self._last_estimates: dict[str, SideNumbers] = {}
 
@@ -130,7 +130,7 @@ class Window:
         """True if there are rows for the whole length, counted or not."""
         return bool(self._rows) and len(self._rows["twist"]) == self.samples
 
-    def add(self, rows: dict[str, np.ndarray], restarts: bool) -> None:
+    def add(self, rows: NamedArrays, restarts: bool) -> None:
         """Add rows from :meth:`.live_chain.LiveChain.take`.
 
         Where it began anew, samples do not count until the observers have settled, and neither do those before whose
@@ -166,7 +166,7 @@ class Window:
                 self._last_estimates[side] = side_numbers
         return estimates
 
-    def _estimate_side(self, side: str, rows: dict[str, np.ndarray]) -> SideNumbers | None:
+    def _estimate_side(self, side: str, rows: NamedArrays) -> SideNumbers | None:
         experiment = self._experiment
         matched = experiment.identifier is not None and experiment.identifier.regressor_filter == "matched"
         last = self._last_estimates.get(side)

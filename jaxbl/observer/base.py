@@ -11,9 +11,8 @@ from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
-from jaxtyping import Array, Float
 
-from jaxbl.drive.parameters import Scalar, config_key, parameter, parameters
+from jaxbl.drive.parameters import Scalar, ScalarArray, config_key, parameter, parameters
 from jaxbl.registry import Registry, check_module
 
 Acceleration = Callable[[Scalar], Scalar]
@@ -38,7 +37,11 @@ class Estimate(NamedTuple):
 
     position: Scalar
     velocity: Scalar
-    control: Float[Array, ""]
+    control: ScalarArray
+
+
+GainRanges = Mapping[str, tuple[float, float]]
+"""The least and the largest value of each gain."""
 
 
 class OperatingConditions(NamedTuple):
@@ -74,7 +77,7 @@ class AbstractObserver(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         """Return the range of each gain, by config key, in which a search for gains should try.
 
         Args:
@@ -101,7 +104,7 @@ class AbstractObserver(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self, state: ObserverState, measured: Float[Array, ""], acceleration: Acceleration, period: Scalar
+        self, state: ObserverState, measured: ScalarArray, acceleration: Acceleration, period: Scalar
     ) -> tuple[ObserverState, Estimate]:
         """Estimate the motion at a sample, and predict the next one.
 

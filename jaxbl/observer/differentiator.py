@@ -21,7 +21,16 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predict_next
+from .base import (
+    OBSERVERS,
+    AbstractObserver,
+    Acceleration,
+    Estimate,
+    GainRanges,
+    ObserverState,
+    OperatingConditions,
+    predict_next,
+)
 from .super_twisting import ImplicitSuperTwisting
 
 COEFFICIENTS: Mapping[int, tuple[float, ...]] = {
@@ -132,7 +141,7 @@ class AbstractDifferentiator(AbstractObserver):
     lipschitz: eqx.AbstractVar[Scalar]  # pyright: ignore[reportGeneralTypeIssues]
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         # L is f_plus times n - 1 rates, of motions from slow ones to those as fast as the sampling
         slow, fast = (rate ** (cls.order - 1) for rate in (1e-3 / conditions.period, 1.0 / conditions.period))
         return {"lipschitz": (0.01 * conditions.f_plus * slow, 100.0 * conditions.f_plus * fast)}

@@ -2,9 +2,8 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from jaxbl.drive.parameters import Scalar, parameter
+from jaxbl.drive.parameters import Scalar, ScalarArray, parameter
 
 
 class EquivalentControl(eqx.Module):
@@ -12,7 +11,7 @@ class EquivalentControl(eqx.Module):
 
     time_constant: Scalar = parameter("s", "time constant of the low-pass on z_2", default=0.01, minimum=0.0)
 
-    def filter(self, filtered: Float[Array, ""], value: Float[Array, ""], step: Scalar) -> Float[Array, ""]:
+    def filter(self, filtered: ScalarArray, value: ScalarArray, step: Scalar) -> ScalarArray:
         """Advance the filtered value by `step` seconds with the input `value`, in the same unit."""
         positive = jnp.where(self.time_constant > 0.0, self.time_constant, 1.0)
         share = jnp.where(self.time_constant > 0.0, -jnp.expm1(-step / positive), 1.0)

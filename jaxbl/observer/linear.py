@@ -5,7 +5,6 @@ fixed shares L of the innovation: x_hat = x_predicted + L (y - x_predicted). The
 """
 
 import abc
-from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -13,7 +12,16 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predict_next
+from .base import (
+    OBSERVERS,
+    AbstractObserver,
+    Acceleration,
+    Estimate,
+    GainRanges,
+    ObserverState,
+    OperatingConditions,
+    predict_next,
+)
 
 _SLOWEST, _FASTEST = 1e-3, 3.0
 """Range of bandwidths for a search of gains, rad/s times the sampling period: poles at 0.999 and 0.05."""
@@ -75,7 +83,7 @@ class Luenberger(AbstractLinearObserver):
     damping: Scalar = parameter("", "damping ratio of the observer's poles", default=1.0, above=0.0)
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period), "damping": (0.003, 10.0)}
 
     def correction(self, acceleration, period):
@@ -104,7 +112,7 @@ class ExtendedState(AbstractLinearObserver):
     bandwidth: Scalar = parameter("rad/s", "natural frequency of the observer's poles", above=0.0)
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period)}
 
     def correction(self, acceleration, period):
@@ -132,7 +140,7 @@ class Kalman(AbstractLinearObserver):
     )
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         # since only ratios matter, the noise of an ideal encoder is arbitrary. A bandwidth w needs a disturbance noise of
         # position_noise sqrt(h) w^3, or an acceleration noise of position_noise sqrt(h) w^2
         noise = max(conditions.noise, 1e-9)
@@ -249,7 +257,7 @@ class DirtyDerivative(AbstractObserver):
     time_constant: Scalar = parameter("s", "time constant of the low-pass on each difference", minimum=0.0)
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         return {"time_constant": (conditions.period / _FASTEST, conditions.period / _SLOWEST)}
 
     def start(self, position, velocity, acceleration, period):

@@ -15,14 +15,13 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from jaxbl.drive.parameters import Scalar, option, parameter
+from jaxbl.drive.parameters import Scalar, ScalarArray, option, parameter
 from jaxbl.drive.transmission import AbstractTransmission
 
 from .equivalent_control import EquivalentControl
 
-Number = Float[Array, ""]
+Number = ScalarArray
 
 
 class RunningSum(NamedTuple):

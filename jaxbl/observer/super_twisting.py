@@ -1,13 +1,12 @@
 """Super-twisting observers (7)-(8) of one side, discretised explicitly or implicitly."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Estimate, ObserverState, OperatingConditions, predict_next
+from .base import OBSERVERS, AbstractObserver, Estimate, GainRanges, ObserverState, OperatingConditions, predict_next
 
 
 class AbstractSuperTwisting(AbstractObserver):
@@ -30,7 +29,7 @@ class AbstractSuperTwisting(AbstractObserver):
         return DISCRETISATIONS[discretisation]
 
     @classmethod
-    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> GainRanges:
         root = conditions.f_plus**0.5
         # with alpha below f_plus the observer does not follow every disturbance exactly, but may have less noise
         return {"lambda": (0.01 * root, 1e3 * root), "alpha": (0.01 * conditions.f_plus, 1e3 * conditions.f_plus)}

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, residual_spectrum
 from jaxbl.diagnosis.observer_residual import Observed
-from jaxbl.diagnosis.residuals import Residual, narrowed
+from jaxbl.diagnosis.residuals import Residual, SideResiduals, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
 
 from . import figures
@@ -30,7 +30,7 @@ _LABELLED = 0.1
 
 @style()
 def draw_residuals(
-    residuals: Mapping[str, Sequence[Residual]],
+    residuals: SideResiduals,
     coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
     found: Mapping[str, Localised],
     unit: str = "N m",
@@ -53,7 +53,7 @@ def plot_torque(ax: Axes, residual: Residual, bandwidth: float, *, noise: bool =
 
 
 def _over_time(
-    residuals: Mapping[str, Sequence[Residual]],
+    residuals: SideResiduals,
     found: Mapping[str, Localised],
     unit: str,
     observed: Mapping[str, Sequence[Observed]],
@@ -144,7 +144,7 @@ def _means(ax: Axes, coordinate: Coordinate) -> None:
     ax.plot(x[~sure], y[~sure], "o", ms=4.0, mfc="white", mec=_MEAN, mew=0.9, zorder=4)
 
 
-def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
+def _spectra(residuals: SideResiduals, found: Mapping[str, Localised], unit: str) -> Drawn:
     marked = False
     figure, axes = stacked(len(residuals), 2.5, "frequency (Hz)", sharex=False)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):

@@ -3,5 +3,4 @@
 What rivals run is written once more in each one's own way (`rivals`), and used nowhere else.
 """
 
-from .run import BenchResult as BenchResult
-from .run import bench as bench
+from .run import BenchResult as BenchResult, bench as bench

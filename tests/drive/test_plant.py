@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from drive_reference import HOLD, LAWS, SIGMOID, START, TORQUES, plant, reference, trajectory
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from jaxbl.drive import DRIVES, Initial, LinearShaft, Plant, Rigid, SigmoidBacklash, TwoInertia, as_arrays, make_effect
 

@@ -15,8 +15,7 @@ from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
-from jaxbl.fused import Unsupported
-from jaxbl.fused import lane_simulator as module
+from jaxbl.fused import Unsupported, lane_simulator as module
 from jaxbl.fused.jaxprs import join_multiply_add, replace_primitives
 from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator, LaneSimulator
 from jaxbl.fused.pallas import LANES, Kernel

@@ -5,8 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from paper_drive import paper
 
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, ObserverState

@@ -6,8 +6,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from measured import EMPS, GEAR_RATIO, SERVO, XL330, made, real
 
 from jaxbl.errors import InputError
