@@ -679,11 +679,14 @@ class _Search:
 
     def _turns(self, point: Point, drive: AbstractDrive, size: float) -> int:
         """Changes of sign of the twist between values of at least some size, rad."""
-        ratio, changes = float(drive.ratio("load")), 0
-        for one in self.model.states(point.theta, point.start, point.smoothness):
-            twist = np.asarray(one.position["motor"] - ratio * one.position["load"])
-            changes += int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size]))))
-        return changes
+        ratio = float(drive.ratio("load"))
+        states = self.model.states(point.theta, point.start, point.smoothness)
+        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), size) for one in states)
+
+
+def _changes(values: np.ndarray, size: float) -> int:
+    """Changes of sign between values of at least some size."""
+    return int(np.count_nonzero(np.diff(np.sign(values[np.abs(values) >= size]))))
 
 
 def fitted(model: UnseenLoad) -> Point:
