@@ -3,7 +3,7 @@
 from jaxbl.config import AxisTable, Config, FigureTable
 from jaxbl.config.figures import check_selection
 from jaxbl.errors import InputError
-from jaxbl.gains.accuracy_laws import sizes_for
+from jaxbl.gains.accuracy_laws import signal_size_columns
 from jaxbl.sweeps.metrics import explain_missing_metric
 from jaxbl.validation import suggest_word
 
@@ -43,7 +43,7 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
         needed = {
             "value": [figure.value],
             "overlays": [f"{figure.x.split('.')[1]}.{name}" for name in of_curves],
-            "theory": [] if figure.theory is None else sizes_for(figure.value),
+            "theory": [] if figure.theory is None else signal_size_columns(figure.value),
         }
         for key, names in needed.items():
             for name in names:

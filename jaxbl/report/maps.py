@@ -548,7 +548,7 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> Drawn:
 def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
     """One line: points, fit, and theory's slope through the middle of the fit. Returns the y drawn."""
     colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-    x, y, inside = law.x_values, law.y_values, law.inside
+    x, y, inside = law.x_values, law.y_values, law.in_range
     name = ", ".join(map(_text, law.series.values()))
     seen = np.isfinite(y) & (y > 0.0)
     ax.plot(x[seen & ~inside], y[seen & ~inside], marker, ms=6, mfc="none", color=colour)

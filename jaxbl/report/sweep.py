@@ -178,9 +178,9 @@ def _law_table(laws: list[Law]) -> PageTable:
     for law in laws:
         line, slope, halves, ends = f"{law.value} over {law.x}", "no law", "–", "–"
         if law.fit is not None:
-            slope, halves = _slope_of(law), f"{law.fit.halves[0]:.2f}, {law.fit.halves[1]:.2f}"
+            slope, halves = _slope_of(law), f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
         if law.range is not None:
-            ends = f"{law.range[0]:g} to {law.range[1]:g} ({law.inside.sum()})"
+            ends = f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
         slope, halves, ends = (text.replace(" ", "\u00a0") for text in (slope, halves, ends))
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]

@@ -29,9 +29,9 @@ def study(*figures, axes=None, **tables):
     return rigid({"run.duration": 1.0}, axes=axes, figures=list(figures), **tables)
 
 
-def only(data, **columns):
-    (found,) = accuracy_laws(made(data, **columns))
-    return found
+def fit_only_law(data, **columns):
+    (fitted_law,) = accuracy_laws(made(data, **columns))
+    return fitted_law
 
 
 @given(
@@ -64,11 +64,11 @@ def test_floor_and_saturation_are_left_out(exponent, seed):
 def test_the_standard_error_is_that_of_the_scatter():
     x = np.geomspace(1e-5, 1e-1, 12)
     rng = np.random.default_rng(1)
-    found = [fit_power_law(x, x**1.5 * np.exp(0.02 * rng.standard_normal(len(x)))) for _ in range(300)]
-    whole = [fit for fit in found if fit is not None and fit.last - fit.first == len(x) - 1]
-    assert len(whole) > 270
-    slopes = np.array([fit.slope for fit in whole])
-    errors = np.array([fit.standard_error for fit in whole])
+    fits = [fit_power_law(x, x**1.5 * np.exp(0.02 * rng.standard_normal(len(x)))) for _ in range(300)]
+    whole_fits = [fit for fit in fits if fit is not None and fit.last - fit.first == len(x) - 1]
+    assert len(whole_fits) > 270
+    slopes = np.array([fit.slope for fit in whole_fits])
+    errors = np.array([fit.standard_error for fit in whole_fits])
     assert errors.mean() == pytest.approx(slopes.std(), rel=0.15)
     # Student's t with 10 degrees of freedom: 1 in 20 beyond 2.23
     assert 0.9 < np.mean(np.abs(slopes - 1.5) < 2.23 * errors) < 0.99
@@ -111,78 +111,80 @@ def test_laws_of_each_series_and_panel_with_seeds_as_replicates():
         power = frame[LAMBDA] + 0.5 * (frame[WORDS] == "implicit")
         return frame[PERIOD] ** power * (1.0 + 0.5 * frame["seed"])
 
-    found = accuracy_laws(made(data, motor__velocity_rmse=error))
-    assert [(each.series[WORDS], each.where[LAMBDA], round(each.slope, 6)) for each in found] == [
+    laws = accuracy_laws(made(data, motor__velocity_rmse=error))
+    assert [(fitted_law.series[WORDS], fitted_law.where[LAMBDA], round(fitted_law.slope, 6)) for fitted_law in laws] == [
         ("explicit", 0.5, 0.5), ("implicit", 0.5, 1.0), ("explicit", 1.0, 1.0), ("implicit", 1.0, 1.5),
     ]  # fmt: skip
-    assert [each.agrees for each in found] == [False, True, True, False]
-    np.testing.assert_allclose(found[1].y_values, np.array(PERIODS) * 3.0 ** (1 / 3))
+    assert [fitted_law.agrees for fitted_law in laws] == [False, True, True, False]
+    np.testing.assert_allclose(laws[1].y_values, np.array(PERIODS) * 3.0 ** (1 / 3))
 
 
 def test_law_of_noise_ends_at_the_floor_of_the_period_and_at_the_signal():
-    found = only(
+    fitted_law = fit_only_law(
         study(law(NOISE, theory=0.5, where={PERIOD: 1e-3})),
         motor__velocity_rmse=lambda f: np.hypot(10.0 * f[PERIOD], np.minimum(20.0 * f[NOISE] ** 0.5, 1.0)),
     )
-    assert found.slope == pytest.approx(0.5, abs=0.02)
-    assert found.range == pytest.approx((10**-5.5, 1e-4))
-    assert found.stops["below"].startswith("sampling period: the error is 2.24 times that without noise")
-    assert found.stops["above"].startswith("saturation: the error is 36 % of the signal")
+    assert fitted_law.slope == pytest.approx(0.5, abs=0.02)
+    assert fitted_law.range == pytest.approx((10**-5.5, 1e-4))
+    assert fitted_law.stops["below"].startswith("sampling period: the error is 2.24 times that without noise")
+    assert fitted_law.stops["above"].startswith("saturation: the error is 36 % of the signal")
 
 
 def test_law_of_the_period_ends_at_the_floor_of_noise():
-    found = only(
+    fitted_law = fit_only_law(
         study(law(where={NOISE: 1e-7})),
         motor__velocity_rmse=lambda f: np.hypot(f[PERIOD], 0.1 * f[NOISE] ** 0.5),
     )
-    assert found.slope == pytest.approx(1.0, abs=0.03)
-    assert found.stops["below"].startswith("noise floor: the error is 1.45 times that without noise")
-    assert found.stops["above"] == "end of the sweep"
+    assert fitted_law.slope == pytest.approx(1.0, abs=0.03)
+    assert fitted_law.stops["below"].startswith("noise floor: the error is 1.45 times that without noise")
+    assert fitted_law.stops["above"] == "end of the sweep"
     # the same without noise
-    assert only(study(law(where={NOISE: "least"})), motor__velocity_rmse=lambda f: f[PERIOD]).inside.all()
+    assert fit_only_law(study(law(where={NOISE: "least"})), motor__velocity_rmse=lambda f: f[PERIOD]).in_range.all()
 
 
 def test_white_noise_that_the_period_still_averages_is_named():
-    found = only(
+    fitted_law = fit_only_law(
         study(law(NOISE, POSITION, where={PERIOD: "least"}), axes=[listed(PERIOD, 1e-5, 4e-5), listed(NOISE, *NOISES)]),
         motor__position_rmse=lambda f: np.hypot(0.1 * f[NOISE], 1.0 * f[NOISE] ** 0.75 * f[PERIOD] ** 0.5),
         motor__velocity_rmse=lambda f: 0.0 * f[NOISE],
     )
-    assert found.slope == pytest.approx(1.0, abs=0.1)
-    assert found.stops["below"].startswith("sampling period: the error grows with it as h^0.")
+    assert fitted_law.slope == pytest.approx(1.0, abs=0.1)
+    assert fitted_law.stops["below"].startswith("sampling period: the error grows with it as h^0.")
 
 
 def test_float_resolution_ends_a_law_and_leaves_none_where_all_is_zero():
     rounding = 1e-3 * np.finfo(np.float32).eps
     data = study(law(where={NOISE: 0.0}))
     data["run"]["precision"] = "float32"
-    found = only(
+    fitted_law = fit_only_law(
         data,
         motor__velocity_rmse=lambda f: np.hypot(f[PERIOD], rounding / f[PERIOD]),
         motor__position_size=lambda f: 1e-3 + 0.0 * f[PERIOD],
     )
-    assert found.slope == pytest.approx(1.0, abs=0.02)
-    assert found.stops["below"].startswith("float resolution: the error is ")
-    found = only(study(law(value=POSITION, where={NOISE: 0.0})), motor__position_rmse=lambda f: 0.0 * f[PERIOD])
-    assert found.fit is None
-    assert found.to_dict()["slope"] is None
-    assert found.stops == dict.fromkeys(("below", "above"), "float resolution: the error is exactly zero")
+    assert fitted_law.slope == pytest.approx(1.0, abs=0.02)
+    assert fitted_law.stops["below"].startswith("float resolution: the error is ")
+    fitted_law = fit_only_law(study(law(value=POSITION, where={NOISE: 0.0})), motor__position_rmse=lambda f: 0.0 * f[PERIOD])
+    assert fitted_law.fit is None
+    assert fitted_law.to_dict()["slope"] is None
+    assert fitted_law.stops == dict.fromkeys(("below", "above"), "float resolution: the error is exactly zero")
 
 
 def test_a_diverged_seed_takes_its_point_out():
     data = study(law(where={NOISE: 0.0}), sweep={"seeds": 2})
-    found = only(
+    fitted_law = fit_only_law(
         data,
         motor__velocity_rmse=lambda f: f[PERIOD],
         finite=lambda f: (f[PERIOD] < 9e-3) | (f["seed"] == 0),
     )
-    assert found.range == (1e-5, 3e-3)
-    assert found.stops["above"].startswith("no number: a run diverged")
+    assert fitted_law.range == (1e-5, 3e-3)
+    assert fitted_law.stops["above"].startswith("no number: a run diverged")
 
 
 def test_an_end_without_a_known_cause_says_so():
-    found = only(study(law(where={NOISE: 0.0})), motor__velocity_rmse=lambda f: 1e-3 * np.maximum(f[PERIOD], 1e-4))
-    assert found.stops == {"below": "other: local slope 0.00", "above": "end of the sweep"}
+    fitted_law = fit_only_law(
+        study(law(where={NOISE: 0.0})), motor__velocity_rmse=lambda f: 1e-3 * np.maximum(f[PERIOD], 1e-4)
+    )
+    assert fitted_law.stops == {"below": "other: local slope 0.00", "above": "end of the sweep"}
 
 
 BAD = {
@@ -217,8 +219,8 @@ def test_figures_that_cannot_be_fitted(case):
 def test_words_and_sampled_axes_in_where():
     axes = [listed(PERIOD, *PERIODS), listed(WORDS, "explicit", "implicit")]
     data = study(law(where={WORDS: "implicit"}), axes=axes)
-    found = only(data, motor__velocity_rmse=lambda f: f[PERIOD] ** np.where(f[WORDS] == "implicit", 2.0, 1.0))
-    assert found.slope == pytest.approx(2.0)
+    fitted_law = fit_only_law(data, motor__velocity_rmse=lambda f: f[PERIOD] ** np.where(f[WORDS] == "implicit", 2.0, 1.0))
+    assert fitted_law.slope == pytest.approx(2.0)
     with pytest.raises(InputError, match="has no value 'implict'; did you mean 'implicit'"):
         accuracy_laws(made(study(law(where={WORDS: "implict"}), axes=axes)))
     data = study(law(where={LAMBDA: 1.0}), axes=[axes[0], spaced(LAMBDA, 1.0, 2.0)], sweep={"design": "sobol", "points": 4})
@@ -279,14 +281,14 @@ def real():
 
 @pytest.mark.slow
 def test_slopes_of_a_real_sweep_are_theory_s(real):
-    found = {(each.figure, each.series[WORDS]): each for each in jaxbl.accuracy_laws(real)}
-    for key, each in found.items():
+    laws = {(fitted_law.figure, fitted_law.series[WORDS]): fitted_law for fitted_law in jaxbl.accuracy_laws(real)}
+    for key, fitted_law in laws.items():
         if key == (0, "implicit"):
-            assert each.fit is None
-            assert each.stops["above"].startswith("float resolution")
+            assert fitted_law.fit is None
+            assert fitted_law.stops["above"].startswith("float resolution")
         else:
-            assert each.agrees, (key, each.slope, each.stops)
-            assert each.standard_error < 0.05
+            assert fitted_law.agrees, (key, fitted_law.slope, fitted_law.stops)
+            assert fitted_law.standard_error < 0.05
 
 
 @pytest.mark.slow
