@@ -288,13 +288,13 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     """
     from .config import TuneTable, read_config, read_model
     from .gains.gain_search import usual_rule
-    from .gains.pilot import Scenarios, pilot
+    from .gains.pilot import Scenarios, run_pilot
 
     answers = rename_to_geared(kind, answers)
     text = _write_drive(kind, answers, title)
     try:
         model, _ = read_model(_parse_toml(text))
-        pilot_metrics = pilot(Scenarios(model, ["nominal"], {}), TuneTable())
+        pilot_metrics = run_pilot(Scenarios(model, ["nominal"], {}), TuneTable())
         _check_motion(kind, pilot_metrics)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0))

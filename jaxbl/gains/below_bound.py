@@ -1,5 +1,5 @@
-"""Runs that converge though alpha is below their true f_plus: how long their disturbance exceeds alpha, and what that makes
-of an error that is zero."""
+"""Runs that converge although alpha is below their true f_plus: how long the disturbance exceeds alpha, and which error it
+causes."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -17,67 +17,70 @@ from jaxbl.sweeps.trial import run
 from .under_tuned import excursion, simulate_error
 
 _MOST_INPUTS = 32
-"""Combinations of what drives the plant that are run once more, for their disturbance; spread evenly."""
+"""Combinations of inputs and plants, evenly spread, that are run once more for their disturbance."""
 
 
-def disturbance(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarray:
-    """The acceleration (rad/s^2) that the nominal model lacks at the true velocity, at the samples of a run's trace: f_plus
-    without the observer's own velocity error. It does not depend on the observer."""
+def missing_acceleration(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarray:
+    """Return the acceleration (rad/s^2) that the nominal model lacks at the true velocity, at the samples of a trace.
+
+    It does not depend on the observer: f_plus contains the observer's velocity error as well.
+    """
     with jax.enable_x64(True):
         nominal = drive.acceleration(side, *(jnp.asarray(trace[name].to_numpy()) for name in (f"{side}.velocity", "u")))
     return trace[f"{side}.acceleration"].to_numpy() - np.asarray(nominal)
 
 
-def friction_of(drive: Any, side: str) -> float:
-    """Viscous friction of a side over its inertia, 1/s."""
+def friction_rate(drive: Any, side: str) -> float:
+    """Return the viscous friction of a side over its inertia, 1/s."""
     return float(drive.viscous(side)) / float(drive.inertia(side))
 
 
-def share_above(alpha: float, values: np.ndarray) -> float:
-    """Part of the time in which a disturbance (rad/s^2), evenly sampled, exceeds alpha."""
-    return float(np.mean(np.abs(values) > alpha))
+def share_of_time_above(alpha: float, disturbance: np.ndarray) -> float:
+    """Return the share of the time in which an evenly sampled disturbance (rad/s^2) exceeds alpha."""
+    return float(np.mean(np.abs(disturbance) > alpha))
 
 
-def converged_below(study: Config, side: str, frame: pd.DataFrame) -> dict[str, Any] | None:
-    """Converged runs of a level (`frame`) with alpha at most f_plus: None where there is none.
+def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> dict[str, Any] | None:
+    """Summarise the converged runs of a level (`frame`) whose alpha is at most f_plus; None if there are none.
 
-    Their count, and those looked at (`runs`); of the latter how many have a disturbance above alpha at any time, the largest
-    share of the time in which it is, the largest `excursion` (rad/s) predicted from zero, and the same simulated for the run
-    that has it, with its values.
+    Returns the number of `converged_runs`, and of the `runs` that were repeated. For the latter: how many have a disturbance
+    that exceeds alpha, the largest share of time in which it does, and the largest excursion (rad/s) from zero, predicted
+    and simulated, with the axis values of its run.
     """
-    found = frame[frame[f"{side}.converged"].astype(bool) & (frame[f"{side}.margin_alpha"] <= 1.0)]
-    if not len(found):
+    runs_below = frame[frame[f"{side}.converged"].astype(bool) & (frame[f"{side}.margin_alpha"] <= 1.0)]
+    if not len(runs_below):
         return None
     paths = [axis.path for axis in study.axes]
     inputs = [path for path in paths if not path.startswith(("observer.", "equivalent_control.", "identifier."))]
-    groups = [part for _, part in found.groupby(inputs, sort=True)] if inputs else [found]
+    groups = [group for _, group in runs_below.groupby(inputs, sort=True)] if inputs else [runs_below]
     rows = []
-    for at in np.unique(np.linspace(0, len(groups) - 1, _MOST_INPUTS).astype(int)):
-        part = groups[at]
-        config = with_values(study, {path: part[path].iloc[0] for path in inputs})
+    for index in np.unique(np.linspace(0, len(groups) - 1, _MOST_INPUTS).astype(int)):
+        group = groups[index]
+        config = with_values(study, {path: group[path].iloc[0] for path in inputs})
         trace = run(config, backend="scan").trace
         drive = config.build().drive
-        values, times, friction = disturbance(drive, side, trace), trace["t"].to_numpy(), friction_of(drive, side)
-        for alpha, same in part.groupby(f"observer.{side}.alpha"):
-            predicted = excursion(float(alpha), times, values, friction)
-            rows.append((predicted, share_above(float(alpha), values), same, times, values, friction))
-    predicted, _, same, times, values, friction = max(rows, key=lambda row: row[0])
-    # the least lambda has the least to hold it back
-    one = same.loc[same[f"observer.{side}.lambda"].idxmin()]
-    path = simulate_error(
-        float(one[f"observer.{side}.lambda"]),
-        float(one[f"observer.{side}.alpha"]),
+        disturbance, times = missing_acceleration(drive, side, trace), trace["t"].to_numpy()
+        friction = friction_rate(drive, side)
+        for alpha, runs in group.groupby(f"observer.{side}.alpha"):
+            predicted = excursion(float(alpha), times, disturbance, friction)
+            rows.append((predicted, share_of_time_above(float(alpha), disturbance), runs, times, disturbance, friction))
+    predicted, _, runs, times, disturbance, friction = max(rows, key=lambda row: row[0])
+    # the least lambda damps the error least
+    worst_run = runs.loc[runs[f"observer.{side}.lambda"].idxmin()]
+    error_path = simulate_error(
+        float(worst_run[f"observer.{side}.lambda"]),
+        float(worst_run[f"observer.{side}.alpha"]),
         times,
-        values,
+        disturbance,
         damping=friction,
         velocity_error=0.0,
     )
     return {
-        "converged_runs": len(found),
+        "converged_runs": len(runs_below),
         "runs": sum(len(row[2]) for row in rows),
         "disturbance_exceeds": sum(len(row[2]) for row in rows if row[1] > 0.0),
         "share_above_alpha": max(row[1] for row in rows),
         "excursion_predicted": predicted,
-        "excursion_simulated": path.largest,
-        "at": {path: one[path] for path in paths},
+        "excursion_simulated": error_path.largest,
+        "at": {path: worst_run[path] for path in paths},
     }

@@ -1,4 +1,4 @@
-"""Runs in which a gain condition held and the observer failed: what made it fail, found by repeating them."""
+"""Causes of counterexamples (a gain condition held, and the observer failed), found by repeating the runs."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
@@ -15,49 +15,49 @@ from jaxbl.sweeps.points import Points
 
 from .stages import Stages
 
-_MOST_EXPLAINED = 4096
-"""Runs of a level that are repeated, spread evenly: one chunk of the scan on one device."""
+_MOST_REPEATED = 4096
+"""Runs of a level that are repeated, evenly spread: one chunk of the scan on one device."""
 
 
-def keys_of(config: Config) -> list[str]:
-    """Columns that tell runs of a study apart."""
+def run_columns(config: Config) -> list[str]:
+    """Return the columns that tell runs of a study apart."""
     return [*(axis.path for axis in config.axes), "seed"]
 
 
-def explained(found: pd.DataFrame, study: Config, level: str, side: str, stages: Stages) -> pd.DataFrame:
-    """Counterexamples of a level with a column that says what made the observer fail."""
-    # a claimed bound that the true one exceeds, with the condition failing at the true one, is cause enough
-    true = (found["bound"] == "true").to_numpy()
-    runs = pd.MultiIndex.from_frame(found[["condition", "row"]])
-    excused = ~true & ~runs.isin(runs[true])
-    rest = found[~excused].drop_duplicates("row")
-    causes = _causes(study, level, side, rest, stages) if len(rest) else pd.Series(dtype=object)
-    cause = found["row"].map(dict(zip(rest["row"], causes, strict=True)))
-    cause = cause.where(~excused, "f_plus underestimated")
-    keys = keys_of(study)
+def add_causes(counterexamples: pd.DataFrame, study: Config, level: str, side: str, stages: Stages) -> pd.DataFrame:
+    """Add a column with the cause of failure to the counterexamples of a level."""
+    # a claimed bound below the true one is the cause if the condition fails at the true one
+    is_true_bound = (counterexamples["bound"] == "true").to_numpy()
+    runs = pd.MultiIndex.from_frame(counterexamples[["condition", "row"]])
+    is_excused = ~is_true_bound & ~runs.isin(runs[is_true_bound])
+    unexcused = counterexamples[~is_excused].drop_duplicates("row")
+    causes = _find_causes(study, level, side, unexcused, stages) if len(unexcused) else pd.Series(dtype=object)
+    cause = counterexamples["row"].map(dict(zip(unexcused["row"], causes, strict=True)))
+    cause = cause.where(~is_excused, "f_plus underestimated")
+    keys = run_columns(study)
     lead = ["level", "side", "condition", "bound", "cause", *keys]
     return (
-        found.assign(cause=cause)
-        .drop(columns="row")[[*lead, *(c for c in found.columns if c not in (*lead, "row"))]]
+        counterexamples.assign(cause=cause)
+        .drop(columns="row")[[*lead, *(c for c in counterexamples.columns if c not in (*lead, "row"))]]
         .sort_values(["condition", "bound", *keys], ignore_index=True)
     )
 
 
-def _mended(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
-    """What can make a run fail, with the keys that mend it; `run` as it stands in those runs."""
-    # a factor of four: enough for an error that follows duration or period to change clearly
-    long, fine = 4.0 * run["duration"], run["sample_period"] / 4.0
-    mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
-    mended["period too long"] = {"run.sample_period": fine, "run.substeps": max(-(-run["substeps"] // 4), 1)}
+def _list_remedies(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
+    """List the possible causes of a failed run, each with the keys that remove it; `run` is the run's own table."""
+    # a factor of four clearly changes an error that depends on the duration or the period
+    long, short_period = 4.0 * run["duration"], run["sample_period"] / 4.0
+    remedies: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
+    remedies["period too long"] = {"run.sample_period": short_period, "run.substeps": max(-(-run["substeps"] // 4), 1)}
     if level == "sampled":
-        mended["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
-        mended["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
-        mended["explicit discretisation"] = {"observer.discretisation": "implicit"}
-    return mended
+        remedies["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
+        remedies["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
+        remedies["explicit discretisation"] = {"observer.discretisation": "implicit"}
+    return remedies
 
 
-def _with(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """A config's tables with some dotted keys set; None removes one."""
+def _set_keys(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Set dotted keys in a copy of a config's tables; None removes a key."""
     data = copy.deepcopy(tables)
     for path, value in values.items():
         *names, key = path.split(".")
@@ -71,52 +71,60 @@ def _with(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-def _causes(study: Config, level: str, side: str, rows: pd.DataFrame, stages: Stages) -> pd.Series:
-    """What made some runs fail, by experiment: each is run again with one thing mended at a time, then with all of them.
+def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stages: Stages) -> pd.Series:
+    """Find the cause of each failed run: it is repeated with one possible cause removed at a time, then with all of them.
 
-    The cause is what mended it (all such, joined by "or"), or "several" if only all together did. "f_plus underestimated":
-    that did not mend it either, but showed a bound that alpha does not exceed. Else "unexplained".
+    The cause is the one whose removal lets the run converge (several are joined by "or"), or "several" if only removing all
+    of them does. Otherwise it is "f_plus underestimated" if the repeated run shows a bound that alpha does not exceed, else
+    "unexplained".
     """
-    kept = rows.iloc[np.unique(np.linspace(0, len(rows) - 1, _MOST_EXPLAINED).astype(int))]
+    repeated_rows = rows.iloc[np.unique(np.linspace(0, len(rows) - 1, _MOST_REPEATED).astype(int))]
     structural = list(Points(study).groups[0].structural)
     causes = pd.Series("not tried", index=rows.index, dtype=object)
-    for number, (_, part) in enumerate(kept.groupby(structural, sort=False) if structural else [((), kept)]):
+    groups = repeated_rows.groupby(structural, sort=False) if structural else [((), repeated_rows)]
+    for number, (_, group) in enumerate(groups):
         name = f"{level}-{side}-{number}"
-        fixed = {path: part[path].iloc[0] for path in structural}
-        mended = _mended(_with(study.to_dict(), fixed)["run"], level)
-        together = {path: value for change in mended.values() for path, value in change.items()}
-        frames = {cause: repeated(study, part, fixed, change, stages, f"{name}-{cause}") for cause, change in mended.items()}
-        mends = {cause: frame[f"{side}.converged"].to_numpy(bool) for cause, frame in frames.items() if frame is not None}
-        alone = pd.Series(
-            [" or ".join(cause for cause in mends if mends[cause][i]) for i in range(len(part))],
-            index=part.index,
+        structural_values = {path: group[path].iloc[0] for path in structural}
+        remedies = _list_remedies(_set_keys(study.to_dict(), structural_values)["run"], level)
+        all_remedies = {path: value for remedy in remedies.values() for path, value in remedy.items()}
+        helps = {}
+        for cause, remedy in remedies.items():
+            frame = repeat_runs(study, group, structural_values, remedy, stages, f"{name}-{cause}")
+            if frame is not None:
+                helps[cause] = frame[f"{side}.converged"].to_numpy(bool)
+        group_causes = pd.Series(
+            [" or ".join(cause for cause in helps if helps[cause][i]) for i in range(len(group))],
+            index=group.index,
             dtype=object,
         )
-        rest = part[alone == ""]
-        if len(rest) and (frame := repeated(study, rest, fixed, together, stages, f"{name}-several")) is not None:
-            # an observer that fails can drag its own f_plus down; where it works, alpha turns out to be too small
-            low = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
-            alone[rest.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", low)
-        causes[part.index] = alone
+        failing = group[group_causes == ""]
+        frame = None
+        if len(failing):
+            frame = repeat_runs(study, failing, structural_values, all_remedies, stages, f"{name}-several")
+        if frame is not None:
+            # a failing observer can lower its own f_plus; once it works, alpha turns out to be too small
+            other_causes = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
+            group_causes[failing.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", other_causes)
+        causes[group.index] = group_causes
     return causes
 
 
-def repeated(
-    study: Config, rows: pd.DataFrame, fixed: dict[str, Any], change: dict[str, Any], stages: Stages, name: str
+def repeat_runs(
+    study: Config, rows: pd.DataFrame, structural_values: dict[str, Any], change: dict[str, Any], stages: Stages, name: str
 ) -> pd.DataFrame | None:
-    """Some runs once more with some keys changed, as a study of listed points; None where that changes nothing."""
-    unchanged = _with(study.to_dict(), fixed)
-    data = _with(unchanged, change)
-    paths = [axis.path for axis in study.axes if axis.path not in fixed and axis.path not in change]
-    dropped = [axis.path for axis in study.axes if axis.path in change and axis.path not in fixed]
+    """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect."""
+    unchanged = _set_keys(study.to_dict(), structural_values)
+    data = _set_keys(unchanged, change)
+    paths = [axis.path for axis in study.axes if axis.path not in structural_values and axis.path not in change]
+    removed_axes = [axis.path for axis in study.axes if axis.path in change and axis.path not in structural_values]
     before, after = (read_config({**tables, "axes": []}).to_dict() for tables in (unchanged, data))
-    if not dropped and before == after:
+    if not removed_axes and before == after:
         return None
     points = rows[paths].drop_duplicates()
     data["axes"] = [{"path": path, "values": points[path].tolist(), "zip": "runs"} for path in paths]
     data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
     frame = stages.rerun(read_config(data), "causes", name.replace(" ", "_"))
-    labels, asked = (pd.MultiIndex.from_frame(runs[[*paths, "seed"]]) for runs in (frame, rows))
-    places = labels.get_indexer(asked)
-    assert (places >= 0).all(), "every run was asked for"
-    return frame.iloc[places]
+    labels, wanted_labels = (pd.MultiIndex.from_frame(runs[[*paths, "seed"]]) for runs in (frame, rows))
+    positions = labels.get_indexer(wanted_labels)
+    assert (positions >= 0).all(), "a run was not repeated"
+    return frame.iloc[positions]

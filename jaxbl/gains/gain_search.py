@@ -81,7 +81,7 @@ class GainSearch:
         self.windows = [dict.fromkeys(self.sides, self.limits)]
         self.candidates: dict[str, pd.DataFrame] = {}
         seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
-        stages.total = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.list_named_gains({})))
+        stages.total_lanes = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.list_named_gains({})))
 
     def run(self) -> None:
         """Run the coarse map and the zooms. Raises `NoResult` if no candidate meets all constraints."""

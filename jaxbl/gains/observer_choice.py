@@ -22,7 +22,7 @@ from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points
 
-from .pilot import Scenarios, pilot, scenarios_of
+from .pilot import Scenarios, list_scenarios, run_pilot
 from .stages import Stages
 
 TIME_CONSTANT = "equivalent_control.time_constant"
@@ -139,11 +139,11 @@ class _Search:
         self.seeds = config.sweep.seeds
         self.held_out_seeds = max(self.seeds, _FEWEST)
         self.groups = _groups(config, table, stages)
-        self.found: dict[str, list[list[dict[str, Side]]]] = {}
+        self.searches: dict[str, list[list[dict[str, Side]]]] = {}
         """By kind: for each group and point, the sides' searches."""
         rows = sum(len(place.scenarios.names) for group in self.groups for place in group.places)
         runs = len(table.observers) * rows * len(self._shares())
-        stages.total = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
+        stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
 
     def _shares(self) -> list[tuple[str, ...]]:
         """Sides that are searched in the same runs: they share no gain but the low-pass on the equivalent control."""
@@ -155,9 +155,9 @@ class _Search:
 
     def tune(self, kind: str) -> None:
         """Find the gains of a kind on both sides, at all points."""
-        self.found[kind] = [[self._begun(kind, place, group.config) for place in group.places] for group in self.groups]
+        self.searches[kind] = [[self._begun(kind, place, group.config) for place in group.places] for group in self.groups]
         for number, group in enumerate(self.groups):
-            searches = self.found[kind][number]
+            searches = self.searches[kind][number]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
                 unit = _quasi_random(free, self.table.trials, stage)
@@ -182,7 +182,7 @@ class _Search:
             places: list[dict[str, np.ndarray]] = [{} for _ in group.places]
             for share in self._shares():
                 rows = []
-                for i, sides in enumerate(self.found[kind][number]):
+                for i, sides in enumerate(self.searches[kind][number]):
                     best = {side: sides[side].best for side in self.sides}
                     rows += [(i, self._joined(best, share))] if all(best.values()) else []
                 if not rows:
@@ -290,7 +290,7 @@ def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
     """Points of the map, with pilot runs where the plant differs."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
-    known: dict[str, Any] = dict(stages.found.get("pilots", {}))
+    known: dict[str, Any] = dict(stages.manifest.get("pilots", {}))
     groups, pilots = [], {}
     for group in points.groups:
         columns = points.columns(np.arange(points.group_size))
@@ -298,17 +298,17 @@ def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
         for i in range(points.group_size):
             lane = {path: to_jsonable(column[i]) for path, column in columns.items()}
             at = with_values(group.config, lane)
-            scenarios = scenarios_of(at, table)
+            scenarios = list_scenarios(at, table)
             # encoders change nothing of the plant
             key = repr({path: v for path, v in (group.structural | lane).items() if not path.startswith("encoders.")})
             if key not in pilots:
-                pilots[key] = known.get(key) or pilot(scenarios, table)
+                pilots[key] = known.get(key) or run_pilot(scenarios, table)
             values = group.structural | lane
             places.append(Place({axis.path: values[axis.path] for axis in table.axes}, scenarios, pilots[key]))
             lanes.append(lane)
         groups.append(Group(group.config, places, lanes))
     if known != pilots:
-        stages.keep(pilots=pilots)
+        stages.write_manifest(pilots=pilots)
     return groups
 
 
@@ -367,7 +367,7 @@ def _summary(search: _Search, held_out: Mapping[str, list[list[dict[str, np.ndar
             for side in search.sides:
                 found = ranked({kind: held_out[kind][number][i].get(side, none) for kind in table.observers})
                 for kind, one in found.items():
-                    one |= _searched(search.found[kind][number][i][side], side)
+                    one |= _searched(search.searches[kind][number][i][side], side)
                 best = next(iter(found))
                 sides[side] = {
                     "best": best if found[best]["ratio"] is not None else None,

@@ -27,27 +27,36 @@ from jaxbl.workers import Progress
 
 
 @contextmanager
-def stages_in(
-    config: Config, command: str, out: str | Path | None, scheduler: Scheduler, **given: Any
+def open_stages(
+    config: Config, command: str, out: str | Path | None, scheduler: Scheduler, **options: Any
 ) -> "Iterator[Stages]":
-    """Stages in a folder that no other process writes into, with a cluster if there is one; `given` as of :class:`Stages`.
+    """Open stages in a folder, lock it against other processes, and connect to the cluster if there is one.
+
+    `options` are arguments of :class:`Stages`.
 
     Raises:
-        InputError: as of :class:`Stages`; another process writes into the folder, or there is no such cluster.
+        InputError: as of :class:`Stages`; or another process writes into the folder, or there is no such cluster.
     """
-    with ExitStack() as held:
+    with ExitStack() as stack:
         if out is not None:
-            held.enter_context(remove_if_empty_on_error(to_path(out)))
-            held.enter_context(lock_folder(to_path(out)))
-        held.enter_context(share_programs())
-        yield Stages(config, command, out, cluster=held.enter_context(connect(scheduler)), **given)
+            stack.enter_context(remove_if_empty_on_error(to_path(out)))
+            stack.enter_context(lock_folder(to_path(out)))
+        stack.enter_context(share_programs())
+        yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
 
 
 class Stages:
-    """The studies of `tune` or `verify`, kept in the folder `out`/`command`; without `out` nothing is kept.
+    """The studies that `tune` or `verify` runs, stored in the folder `out`/`command`; nothing is stored without `out`.
+
+    Attributes:
+        folder: `out`/`command`, or None.
+        manifest: manifest of an earlier call in the same folder.
+        total_lanes: lanes of all stages, for the progress.
+        fallback_reasons: why runs were scanned although the fused backend was asked for.
+        cost: seconds of compilation and of computing, and lanes computed.
 
     Raises:
-        InputError: the folder holds something else, or was begun with another backend: all of it is by one.
+        InputError: the folder holds something else, or was begun with another backend.
     """
 
     def __init__(
@@ -64,93 +73,92 @@ class Stages:
         self.folder: Path | None = None
         self._cluster = cluster
         self.devices = devices
-        self.found: dict[str, Any] = {}
-        """The manifest that an earlier call left."""
-        self.total = 0
-        """Lanes of all stages."""
+        self.manifest: dict[str, Any] = {}
+        self.total_lanes = 0
         self.fallback_reasons: dict[str, None] = {}
-        """What the fused loop did not know of runs that were scanned in its place."""
         self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
         self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
         self._backend: Backend | None = check_backend(backend)
-        self._done = 0
-        self._unsure = False
-        """The manifest is damaged: written anew once a stage has not been refused, as the folder is this study's then."""
-        self._kept: dict[str, Any] = {}
+        self._finished_lanes = 0
+        self._manifest_is_damaged = False
+        """A damaged manifest is written anew only after a stage has run: the folder is this study's then."""
+        self._early_results: dict[str, Any] = {}
         if out is None:
             return
         claim_folder(to_path(out), config, command, overwrite=overwrite)
         self.folder = to_path(out) / command
         if (self.folder / "manifest.json").exists():
             try:
-                self.found = read_json(self.folder / "manifest.json")
+                self.manifest = read_json(self.folder / "manifest.json")
             except InputError:
-                self._unsure = True
+                self._manifest_is_damaged = True
                 return
-            begun = self.found.get("backend")
-            if backend not in (None, begun):
-                how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
-                raise InputError(f"{out}: was begun {how}, or choose another folder with --out")
-            self._backend = check_backend(begun)
+            earlier_backend = self.manifest.get("backend")
+            if backend not in (None, earlier_backend):
+                before = f"with --backend {earlier_backend}; go on with that"
+                if not earlier_backend:
+                    before = "without --backend; go on without it"
+                raise InputError(f"{out}: was begun {before}, or choose another folder with --out")
+            self._backend = check_backend(earlier_backend)
 
-    def keep(self, **found: Any) -> None:
-        """Write the manifest, which makes the folder this study's, with something that was found before the stages."""
+    def write_manifest(self, **early_results: Any) -> None:
+        """Write the manifest, which claims the folder for this study, with results found before the stages."""
         if self.folder is not None:
-            self._kept = found
-            if self._unsure:
+            self._early_results = early_results
+            if self._manifest_is_damaged:
                 return
             make_folder(self.folder)
-            manifest = manifest_head(self._config, self._command) | found | {"backend": self._backend}
+            manifest = manifest_head(self._config, self._command) | early_results | {"backend": self._backend}
             write_atomic(self.folder / "manifest.json", json_with_checksum(manifest))
 
-    def place(self, *names: str) -> Path | None:
-        """A path in the folder, if there is one."""
+    def path_of(self, *names: str) -> Path | None:
+        """Return a path in the folder, None without a folder."""
         return None if self.folder is None else self.folder.joinpath(*names)
 
-    def table(self, name: str, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
-        """A table from its file, or computed and kept there; one that is damaged is computed anew.
+    def read_or_compute(self, name: str, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+        """Read a table from its file, or compute it and store it there. A damaged table is computed anew.
 
         Raises:
             InputError: the file is of another study.
         """
-        path, head = self.place(name), manifest_head(self._config, self._command)
+        path, manifest = self.path_of(name), manifest_head(self._config, self._command)
         if path is None:
             return compute()
         with suppress(FileNotFoundError, parts.Damaged):
-            mark, frame = parts.read_part(path)
-            if mark.study.get("identity") != head["identity"]:
-                raise InputError(f"{path}: is of another study; choose another folder with --out, or --overwrite")
+            header, frame = parts.read_part(path)
+            if header.study.get("identity") != manifest["identity"]:
+                raise InputError(f"{path}: belongs to another study; choose another folder with --out, or --overwrite")
             return frame
         frame = compute()
-        if not self._unsure:
-            parts.write_part(path, frame, parts.PartHeader(head, {}, "", 0, 0, {}))
+        if not self._manifest_is_damaged:
+            parts.write_part(path, frame, parts.PartHeader(manifest, {}, "", 0, 0, {}))
         return frame
 
     def run(self, study: Config | dict[str, Any], name: str) -> StudyResult:
-        """Run a stage, or go on with it."""
-        before = self._done
+        """Run a stage, or continue one that was interrupted."""
+        lanes_before = self._finished_lanes
 
         def update(finished: int, _: int) -> None:
-            self._done = before + finished
+            self._finished_lanes = lanes_before + finished
             if self._progress:
-                self._progress(self._done, max(self.total, self._done))
+                self._progress(self._finished_lanes, max(self.total_lanes, self._finished_lanes))
 
         result = sweep(
             study,
-            self.place(name),
+            self.path_of(name),
             progress=update,
             devices=self.devices,
             overwrite=self._overwrite,
             backend=self._backend,
             scheduler=self._cluster,
         )
-        if self._unsure:
-            self._unsure = False
-            self.keep(**self._kept)
+        if self._manifest_is_damaged:
+            self._manifest_is_damaged = False
+            self.write_manifest(**self._early_results)
         self.fallback_reasons |= dict.fromkeys(result.fallback_reasons)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result
 
     def rerun(self, study: Config | dict[str, Any], *names: str) -> pd.DataFrame:
-        """Runs besides the stages, by the backend that is faster for them; other ones in their place are removed."""
-        return sweep(study, self.place(*names), devices=self.devices, overwrite=True).frame
+        """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place."""
+        return sweep(study, self.path_of(*names), devices=self.devices, overwrite=True).frame

@@ -1,8 +1,8 @@
-"""Gains chosen for a drive: the function behind `jaxbl tune`.
+"""The function behind `jaxbl tune`: it chooses gains for a drive.
 
-A pilot run finds the bound f⁺ of each side. Gains are then searched on a map over alpha / f⁺ and lambda / √f⁺, both
-observers in the same runs (they do not influence each other), and on zooms around each side's best point. Every stage is a
-study of its own, kept in the folder's `tune/`: an interrupted search goes on where it stopped, a finished one is only read.
+A pilot run finds the bound f⁺ of each side. Gains are then searched on a map over alpha / f⁺ and lambda / √f⁺, and on zooms
+around each side's best point. Both observers are searched in the same runs, as they do not influence each other. Every stage
+is a study of its own, stored in the folder's `tune/`: an interrupted search continues there, a finished one is only read.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -22,17 +22,17 @@ from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
-from .certificate import certificates, choose_certified
+from .certificate import certify_best_gains, choose_certified_gains
 from .gain_search import GainSearch
 from .observer_choice import ObserverChoice, choose_observer
-from .pilot import Scenarios, pilot, scenarios_of
-from .stages import Stages, stages_in
+from .pilot import Scenarios, list_scenarios, run_pilot
+from .stages import Stages, open_stages
 from .tune_summary import Summary
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """Chosen gains, and how they were found.
+    """Tuned gains, and the candidates of their search.
 
     Attributes:
         config: the study.
@@ -42,7 +42,7 @@ class Tuning:
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
             `margin_exact`, `error` (the objective), `chatter` of the run that has it, and `feasible`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
-        scanned: what the fused loop did not know of runs that this call scanned in its place.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
 
     config: Config
@@ -64,15 +64,19 @@ def tune(
 ) -> Tuning | ObserverChoice:
     """Choose lambda and alpha of both observers for a study, or with `tune.observers` a kind of observer and its gains.
 
-    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`, over all runs of the
-    search.
+    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`. They apply to all
+    runs of the search.
 
     Args:
-        study: TOML file, mapping or config; its `[tune]` table says what is asked of the gains, its axes are not used.
+        study: TOML file, mapping or config. Its `[tune]` table holds the objective and the constraints; its axes are unused.
 
     Raises:
-        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
+        InputError: the config is wrong, the folder holds something else, or the backend cannot run the study.
         NoResult: no gains in the range meet the constraints, or the drive diverges.
+
+    Example:
+        >>> tuning = jaxbl.tune("sweeps/tune_paper_drive.toml", "results/paper_drive")
+        >>> tuning.summary["gains"]["motor"]
     """
     config = read_config(study)
     table = config.tune or TuneTable()
@@ -82,24 +86,24 @@ def tune(
             f"'{config.observer.kind}', put observers = [\"{config.observer.kind}\"] into [tune]"
         )
     config = config.model_copy(update={"tune": table})
-    given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
+    options = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
     if table.observers:
-        with stages_in(config, "tune", out, scheduler, **given) as stages:
+        with open_stages(config, "tune", out, scheduler, **options) as stages:
             return choose_observer(config, table, stages)
-    scenarios = scenarios_of(config, table)
-    with stages_in(config, "tune", out, scheduler, **given) as stages:
-        return _tuned(config, table, scenarios, stages)
+    scenarios = list_scenarios(config, table)
+    with open_stages(config, "tune", out, scheduler, **options) as stages:
+        return _search_gains(config, table, scenarios, stages)
 
 
-def _tuned(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stages) -> Tuning:
-    found = stages.found.get("pilot")
-    search = GainSearch(scenarios, table, found or pilot(scenarios, table), stages)
-    if found is None:
-        stages.keep(pilot=search.pilot)
+def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stages) -> Tuning:
+    pilot_before = stages.manifest.get("pilot")
+    search = GainSearch(scenarios, table, pilot_before or run_pilot(scenarios, table), stages)
+    if pilot_before is None:
+        stages.write_manifest(pilot=search.pilot)
     search.run()
-    passed_over = {} if table.certificate is None else choose_certified(search)
-    summary = Summary(search, search.compare_gains(held_out=False), search.compare_gains(held_out=True)).data()
+    passed_over = {} if table.certificate is None else choose_certified_gains(search)
+    summary = Summary(search, search.compare_gains(held_out=False), search.compare_gains(held_out=True)).to_dict()
     if table.certificate is not None:
-        summary["certificates"] = certificates(search, stages.place("certificate.json"))
+        summary["certificates"] = certify_best_gains(search, stages.path_of("certificate.json"))
         summary["passed_over"] = passed_over
     return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.fallback_reasons))

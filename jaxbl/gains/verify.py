@@ -1,8 +1,9 @@
-"""Gain conditions against what observers do: the function behind `jaxbl verify`.
+"""The function behind `jaxbl verify`: it compares gain conditions with simulated observers on three levels.
 
-Three levels. "normalised": the error system (34) with f_plus = 1 under its worst disturbance, over a plane of alpha / f_plus
-and lambda / sqrt(f_plus). "drive": the study's points with ideal encoders and the implicit observer, each judged at the
-true f_plus along its run. "sampled": the study as it stands, with its period, quantisation and noise.
+- "normalised": the error system (34) with f_plus = 1 under its worst disturbance, over a plane of alpha / f_plus and
+  lambda / sqrt(f_plus);
+- "drive": the study's points with ideal encoders and the implicit observer, each judged at the true f_plus of its run;
+- "sampled": the study as it is, with its period, quantisation and noise.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -26,41 +27,41 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
-from .below_bound import converged_below
-from .counterexamples import explained, keys_of
+from .below_bound import summarise_converged_below
+from .counterexamples import add_causes, run_columns
 from .error_system import (
     SWITCHING_LIMIT,
-    Normalised,
-    counted,
+    ErrorSystemMap,
+    count_judgements,
     demanded_lambda,
     judge_error_system,
     simulate_error_system,
 )
 from .marks import judge_marks
 from .rules import judge_rules
-from .stages import Stages, stages_in
+from .stages import Stages, open_stages
 
 _MOST_LISTED = 200
-"""Counterexamples in `verdict.json`: what a reader may look through; the Parquet file has all."""
+"""Counterexamples in `verdict.json`, as many as can be looked through; the Parquet file has all."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What a verification found.
+    """The result of a verification.
 
     Attributes:
         config: the study.
-        summary: as in `verdict.json`.
-        normalised: the error system's map and boundaries.
+        summary: content of `verdict.json`.
+        error_map: the error system's map and boundaries.
         levels: frames of "drive" and "sampled": the points of a sweep with their metrics.
-        counterexamples: runs in which a condition held and the observer failed: level, side, condition, bound ("true" or
-            "claimed"), cause, then all axis values, seed and metrics.
-        scanned: what the fused loop did not know of runs that this call scanned in its place.
+        counterexamples: runs in which a condition held and the observer failed. Columns are level, side, condition, bound
+            ("true" or "claimed") and cause, then all axis values, seed and metrics.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
 
     config: Config
     summary: dict[str, Any]
-    normalised: Normalised
+    error_map: ErrorSystemMap
     levels: dict[str, pd.DataFrame]
     counterexamples: pd.DataFrame
     fallback_reasons: tuple[str, ...] = ()
@@ -76,30 +77,30 @@ def verify(
     backend: Backend | None = None,
     scheduler: Scheduler = None,
 ) -> Verdict:
-    """Check every gain condition on three levels, and list where it held and the observer failed all the same.
+    """Check every gain condition on three levels, and list the runs in which it held although the observer failed.
 
-    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`, over the runs of the
-    study's levels; the folder gets `verdict.json` and `counterexamples.parquet` as well.
+    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`. They apply to the
+    runs of all levels. The folder gets `verdict.json` and `counterexamples.parquet` as well.
 
     Args:
-        study: TOML file, mapping or config, with axes over alpha and lambda of an observer or both.
+        study: TOML file, mapping or config, with axes over alpha and lambda of one observer or of both.
 
     Raises:
-        InputError: wrong config, no axes over the gains, a folder that holds something else, or a backend that cannot run
-            the study.
+        InputError: the config is wrong, it has no axes over the gains, the folder holds something else, or the backend
+            cannot run the study.
     """
     config = read_config(study)
-    sides = judged_sides(config)
-    given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
-    with stages_in(config, "verify", out, scheduler, **given) as stages:
-        return _verified(config, sides, stages)
+    sides = sides_with_gain_axes(config)
+    options = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
+    with open_stages(config, "verify", out, scheduler, **options) as stages:
+        return _verify_levels(config, sides, stages)
 
 
-def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
-    stages.keep()
-    studies = {"drive": _ideal(config), "sampled": _only(config)}
-    stages.total = sum(len(Points(study)) * study.sweep.seeds for study in studies.values())
-    normalised = simulate_error_system(config, stages)
+def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
+    stages.write_manifest()
+    studies = {"drive": _idealise_study(config), "sampled": _strip_study(config)}
+    stages.total_lanes = sum(len(Points(study)) * study.sweep.seeds for study in studies.values())
+    error_map = simulate_error_system(config, stages)
     levels = {}
     for level, study in studies.items():
         levels[level] = frame = stages.run(study, level).frame
@@ -107,48 +108,52 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
             size = frame[f"{side}.f_plus_acceleration"].max()
             if frame[f"{side}.f_plus"].max() <= ROUNDING[config.run.precision] * size:
                 raise no_disturbance_error(side)
-    summaries, found = [judge_error_system(config, normalised)], []
+    summaries, all_counterexamples = [judge_error_system(config, error_map)], []
     for level, frame in levels.items():
         for side in sides:
-            summary, counterexamples = _judge(config, level, side, frame)
+            summary, counterexamples = _judge_level(config, level, side, frame)
             if len(counterexamples):
-                counterexamples = explained(counterexamples, studies[level], level, side, stages)
-                runs = counterexamples.drop_duplicates(["bound", *keys_of(studies[level])])
+                counterexamples = add_causes(counterexamples, studies[level], level, side, stages)
+                runs = counterexamples.drop_duplicates(["bound", *run_columns(studies[level])])
                 summary["causes"] = {bound: part.cause.value_counts().to_dict() for bound, part in runs.groupby("bound")}
             if level == "drive":
-                summary["below_f_plus"] = converged_below(studies[level], side, frame)
+                summary["below_f_plus"] = summarise_converged_below(studies[level], side, frame)
             summaries.append(summary)
-            found.append(counterexamples)
-    every = pd.concat(found, ignore_index=True)
-    true = every[every["bound"] == "true"]
+            all_counterexamples.append(counterexamples)
+    counterexamples = pd.concat(all_counterexamples, ignore_index=True)
+    at_true_bound = counterexamples[counterexamples["bound"] == "true"]
     summary = to_jsonable(
         {
             "title": config.title,
             "q": config.verify.q,
             "levels": summaries,
             "closed_form": {
-                "cells": normalised.ratio.size,
-                "largest_difference": normalised.difference,
+                "cells": error_map.ratio.size,
+                "largest_difference": error_map.difference,
                 "switching_limit": SWITCHING_LIMIT,
             },
             "damping": [
-                {"damping": damping, "alpha_ratio": normalised.alpha, "least_lambda_ratio": boundary}
-                for damping, boundary in normalised.damped.items()
+                {"damping": damping, "alpha_ratio": error_map.alpha, "least_lambda_ratio": boundary}
+                for damping, boundary in error_map.boundary_by_damping.items()
             ],
-            "rules": judge_rules(normalised.alpha, normalised.lambda_, normalised.ratio),
+            "rules": judge_rules(error_map.alpha, error_map.lambda_, error_map.ratio),
             "marks": judge_marks(config, studies["drive"], stages),
-            "counterexamples": true.head(_MOST_LISTED).to_dict("records"),
-            "counterexamples_in_all": len(true),
+            "counterexamples": at_true_bound.head(_MOST_LISTED).to_dict("records"),
+            "counterexamples_in_all": len(at_true_bound),
         }
     )
     if stages.folder is not None:
-        write_table(stages.folder.parent / "counterexamples.parquet", every)
+        write_table(stages.folder.parent / "counterexamples.parquet", counterexamples)
         write_atomic(stages.folder.parent / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
-    return Verdict(config, summary, normalised, levels, every, tuple(stages.fallback_reasons))
+    return Verdict(config, summary, error_map, levels, counterexamples, tuple(stages.fallback_reasons))
 
 
-def judged_sides(config: Config) -> list[str]:
-    """The sides whose gains are both on axes. Raises `InputError` where there is none."""
+def sides_with_gain_axes(config: Config) -> list[str]:
+    """Return the sides whose gains are both on axes.
+
+    Raises:
+        InputError: there is none, or the axes are no grid that `verify` can search.
+    """
     paths = {axis.path for axis in config.axes}
     sides = [side for side in ("motor", "load") if {f"observer.{side}.alpha", f"observer.{side}.lambda"} <= paths]
     if not sides:
@@ -167,42 +172,45 @@ def judged_sides(config: Config) -> list[str]:
     return sides
 
 
-def _only(config: Config, **updates: Any) -> Config:
-    """The study without what its runs do not depend on, and with other tables."""
+def _strip_study(config: Config, **updates: Any) -> Config:
+    """Return the study with tables replaced, and without those on which its runs do not depend."""
     data = config.to_dict()
     for key in ("figures", "verify"):
         data.pop(key, None)
     data |= updates
-    # what is judged needs metrics of its own
+    # the verdict needs metrics of its own
     data["sweep"].pop("metrics", None)
     return read_config(data)
 
 
-def _ideal(config: Config) -> Config:
-    """The study with ideal encoders and the implicit observer, at one seed."""
+def _idealise_study(config: Config) -> Config:
+    """Return the study with ideal encoders and the implicit observer, at one seed."""
     observer = config.to_dict()["observer"] | {"discretisation": "implicit"}
-    dropped = ("encoders.", "observer.discretisation", "run.sample_period", "run.substeps")
-    axes = [axis.model_dump(exclude_none=True) for axis in config.axes if not axis.path.startswith(dropped)]
+    ignored_paths = ("encoders.", "observer.discretisation", "run.sample_period", "run.substeps")
+    axes = [axis.model_dump(exclude_none=True) for axis in config.axes if not axis.path.startswith(ignored_paths)]
     labels = [axis.get("zip") for axis in axes]
     for axis in axes:
         if "zip" in axis and labels.count(axis["zip"]) == 1:
             del axis["zip"]
             if "values" in axis:
                 axis["values"] = list(dict.fromkeys(axis["values"]))
-    swept = config.to_dict()["sweep"] | {"seeds": 1}
-    return _only(config, encoders={}, observer=observer, axes=axes, sweep=swept)
+    sweep_table = config.to_dict()["sweep"] | {"seeds": 1}
+    return _strip_study(config, encoders={}, observer=observer, axes=axes, sweep=sweep_table)
 
 
-def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Count a level's runs by condition, at the true bound and at the claimed one; and the counterexamples."""
+def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Count a level's runs by condition, at the true bound and at the claimed one.
+
+    Returns the summary of the level, and its counterexamples.
+    """
     path = f"observer.{side}.lambda"
     lambda_, alpha = (frame[f"observer.{side}.{gain}"].to_numpy(float) for gain in ("lambda", "alpha"))
     converged = frame[f"{side}.converged"].to_numpy(bool)
     bounds = {"true": f"{side}.f_plus", "claimed": f"{side}.f_plus_acceleration"}
-    # the least lambda that worked, everything else being equal
-    others = [key for key in keys_of(config) if key != path and key in frame]
-    first = frame[converged].groupby(others, sort=False)[path].idxmin().to_numpy()
-    position = frame.index.get_indexer(first)
+    # the least lambda that converged, everything else being equal
+    other_columns = [key for key in run_columns(config) if key != path and key in frame]
+    least_rows = frame[converged].groupby(other_columns, sort=False)[path].idxmin().to_numpy()
+    position = frame.index.get_indexer(least_rows)
     smallest = lambda_.min()
     summaries: dict[str, list[dict[str, Any]]] = {}
     counterexamples = []
@@ -210,30 +218,31 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
         summaries[bound] = []
         for name, demanded in demanded_lambda(config, alpha, frame[column].to_numpy(float)).items():
             holds = lambda_ > demanded
-            failed = holds & ~converged
+            is_counterexample = holds & ~converged
             with np.errstate(divide="ignore"):
                 ratios = demanded[position] / lambda_[position]
-            strict = np.isfinite(ratios) & (ratios > 1.0)
-            entry = counted(config, name, holds, converged)
+            demands_more = np.isfinite(ratios) & (ratios > 1.0)
+            judgement = count_judgements(config, name, holds, converged)
             if bound == "true":
-                columns = pd.Series(ratios[strict])
-                # the least lambda of the grid worked: the true ratio is larger
-                at_least = int((strict & (lambda_[position] <= smallest)).sum())
-                entry["conservatism"] = {"median": columns.median(), "max": columns.max(), "columns": len(columns)}
-                entry["conservatism"]["at_least"] = at_least
-            summaries[bound].append(entry)
-            if failed.any():
+                columns = pd.Series(ratios[demands_more])
+                # where the least lambda of the grid converged, the true ratio is larger
+                at_least = int((demands_more & (lambda_[position] <= smallest)).sum())
+                judgement["conservatism"] = {"median": columns.median(), "max": columns.max(), "columns": len(columns)}
+                judgement["conservatism"]["at_least"] = at_least
+            summaries[bound].append(judgement)
+            if is_counterexample.any():
                 extra = {"level": level, "side": side, "condition": name, "bound": bound}
-                counterexamples.append(frame[failed].assign(row=np.flatnonzero(failed), **extra))
-    worked = frame[converged]
-    too_small = worked[bounds["true"]] > worked[bounds["claimed"]]
-    ratio = pd.Series(worked[bounds["true"]] / worked[bounds["claimed"]]).replace([np.inf, -np.inf], np.nan).dropna()
+                counterexamples.append(frame[is_counterexample].assign(row=np.flatnonzero(is_counterexample), **extra))
+    converged_runs = frame[converged]
+    true_bound, claimed_bound = (converged_runs[column] for column in bounds.values())
+    too_small = true_bound > claimed_bound
+    ratio = pd.Series(true_bound / claimed_bound).replace([np.inf, -np.inf], np.nan).dropna()
     claimed = {
         "definition": "twice the largest acceleration",
-        "converged_runs": len(worked),
-        "too_small": float(too_small.mean()) if len(worked) else None,
+        "converged_runs": len(converged_runs),
+        "too_small": float(too_small.mean()) if len(converged_runs) else None,
         "true_over_claimed": {"median": ratio.median(), "max": ratio.max()},
-        "by_input": _by_input(config, worked.assign(too_small=too_small), bounds),
+        "by_input": _summarise_by_input(config, converged_runs.assign(too_small=too_small), bounds),
         "conditions": summaries["claimed"],
     }
     summary = {
@@ -245,20 +254,21 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
         "conditions": summaries["true"],
         "claimed_bound": claimed,
     }
-    found = pd.concat(counterexamples, ignore_index=True) if counterexamples else pd.DataFrame({"bound": [], "row": []})
-    return summary, found
+    if not counterexamples:
+        return summary, pd.DataFrame({"bound": [], "row": []})
+    return summary, pd.concat(counterexamples, ignore_index=True)
 
 
-def _by_input(config: Config, worked: pd.DataFrame, bounds: dict[str, str]) -> list[dict[str, Any]]:
-    """True and claimed bound (medians, rad/s^2) for each combination of what excites the drive, over runs that converged."""
+def _summarise_by_input(config: Config, converged_runs: pd.DataFrame, bounds: dict[str, str]) -> list[dict[str, Any]]:
+    """Summarise the true and the claimed bound (medians, rad/s^2) of converged runs by input, transmission and drive."""
     kinds = ("excitation.", "transmission.", "drive.")
-    keys = [axis.path for axis in config.axes if axis.path.startswith(kinds) and axis.path in worked]
+    keys = [axis.path for axis in config.axes if axis.path.startswith(kinds) and axis.path in converged_runs]
     return [
         {
             "input": dict(zip(keys, values, strict=True)),
-            "converged_runs": len(part),
-            **{bound: part[column].median() for bound, column in bounds.items()},
-            "too_small": float(part["too_small"].mean()),
+            "converged_runs": len(group),
+            **{bound: group[column].median() for bound, column in bounds.items()},
+            "too_small": float(group["too_small"].mean()),
         }
-        for values, part in (worked.groupby(keys, sort=True) if keys else [])
+        for values, group in (converged_runs.groupby(keys, sort=True) if keys else [])
     ]

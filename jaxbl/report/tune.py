@@ -14,9 +14,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jaxbl.files import write_atomic
-from jaxbl.gains.limits import PLACES
+from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
-from jaxbl.gains.tune_summary import called_gains
+from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
@@ -55,7 +55,10 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     coarse = tuning.candidates[side].query("stage == 0")
     constraints, binding = (summary["limits"][side][key] for key in ("constraints", "binding"))
     tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
-        index="lambda", columns="alpha", values=["error", "feasible", *(PLACES[name] for name in binding)], dropna=False
+        index="lambda",
+        columns="alpha",
+        values=["error", "feasible", *(CONSTRAINT_COLUMNS[name] for name in binding)],
+        dropna=False,
     )
     grid, feasible = tables["error"].to_numpy(float), tables["feasible"].to_numpy(float)
     xs, ys = tables["error"].columns.to_numpy(float), tables.index.to_numpy(float)
@@ -101,7 +104,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
 
 def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: JsonObject) -> list[Line2D]:
     """The line on the coarse map along which a constraint that binds is just met. Returns the legend's handles."""
-    values = tables[PLACES[name]]
+    values = tables[CONSTRAINT_COLUMNS[name]]
     xs, ys, level = values.columns.to_numpy(float), values.index.to_numpy(float), found.get("limit", 0.5)
     shown = values.to_numpy(float)
     if not np.nanmin(shown) < level < np.nanmax(shown):
@@ -393,7 +396,7 @@ def tune_headline(summary: JsonObject) -> list[str]:
     for side, others in summary["holdout"]["factors"].items():
         parts = []
         for name, factors in others.items():
-            called, row = called_gains(name), rows[name, side]
+            called, row = describe_gains(name), rows[name, side]
             if "why_none" in factors:
                 parts.append(f"{called} converge in {100 * row['converged']:.3g} % of the runs")
             else:

@@ -16,8 +16,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
 
 from jaxbl.files import to_jsonable
-from jaxbl.gains.error_system import conditions_of
-from jaxbl.gains.verify import Verdict, judged_sides
+from jaxbl.gains.error_system import list_conditions
+from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 
@@ -36,8 +36,8 @@ _ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 @style()
 def draw_verdict(verdict: Verdict) -> list[Drawn]:
     """All figures of a verification."""
-    damping = [_damping(verdict)] if verdict.normalised.damped else []
-    levels = [_levels(verdict, side) for side in judged_sides(verdict.config)]
+    damping = [_damping(verdict)] if verdict.error_map.boundary_by_damping else []
+    levels = [_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)]
     planes = draw_worst_planes(verdict.summary["marks"])
     return [
         _atlas(verdict),
@@ -68,14 +68,14 @@ def _axes_of_plane(ax: Axes, xs: np.ndarray, ys: np.ndarray) -> None:
 
 
 def _atlas(verdict: Verdict) -> Drawn:
-    found = verdict.normalised
+    found = verdict.error_map
     figure, (ax,) = subplots(7.6, 6.6, beside=True)
     ax.grid(False)
     norm = LogNorm(0.05, 20.0)
     shown = np.clip(found.ratio, 1e-6, 1e6)
     ax.pcolormesh(found.alpha, found.lambda_, shown, cmap="PuOr_r", norm=norm, rasterized=True, shading="nearest")
     _axes_of_plane(ax, found.alpha, found.lambda_)
-    handles: list[Any] = condition_curves(ax, conditions_of(verdict.config), 1.0, (found.alpha[0], found.alpha[-1]))
+    handles: list[Any] = condition_curves(ax, list_conditions(verdict.config), 1.0, (found.alpha[0], found.alpha[-1]))
     step = max(len(found.alpha) // 24, 1)
     look = {"marker": "o", "ms": 5, "mfc": "white", "mec": "black", "ls": ""}
     ax.plot(found.alpha[::step], found.boundary[::step], **look, zorder=5)
@@ -93,9 +93,9 @@ def _atlas(verdict: Verdict) -> Drawn:
 
 
 def _damping(verdict: Verdict) -> Drawn:
-    found = verdict.normalised
+    found = verdict.error_map
     figure, (ax,) = subplots(7.0, 4.8, beside=True)
-    for i, (damping, boundary) in enumerate(sorted({0.0: found.boundary, **found.damped}.items())):
+    for i, (damping, boundary) in enumerate(sorted({0.0: found.boundary, **found.boundary_by_damping}.items())):
         label = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
         least = np.where(boundary > 0.0, boundary, np.nan)
         ax.plot(found.alpha, least, color=COLOURS[i % len(COLOURS)], lw=2.0, label=label)
@@ -139,7 +139,7 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
         with np.errstate(invalid="ignore"):
             ax.pcolormesh(*bins, (share / runs).T, cmap=MAP, vmin=0.0, vmax=1.0, rasterized=True)
         ax.set(xscale="log", yscale="log", xlim=bins[0][[0, -1]], ylim=bins[1][[0, -1]], xlabel=_ALPHA)
-        handles = condition_curves(ax, conditions_of(verdict.config), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
+        handles = condition_curves(ax, list_conditions(verdict.config), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
         wrong = verdict.counterexamples
         if len(wrong):
             about = {"level": level, "side": side, "bound": "true", "condition": "exact"}
@@ -177,7 +177,7 @@ def _conservatism(verdict: Verdict) -> Drawn:
             ax.plot(largest, k + shift, ">" if censored else "|", color=colour, ms=6 if censored else 9)
     ax.axvline(1.0, color="black", lw=0.8)
     ax.set(xscale="log", xlabel="λ demanded over the least λ that works")
-    ax.set_yticks(range(len(CONDITIONS)), [condition.title for condition in conditions_of(verdict.config).values()])
+    ax.set_yticks(range(len(CONDITIONS)), [condition.title for condition in list_conditions(verdict.config).values()])
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     figure.legend(loc="outside lower center", ncols=3)
@@ -191,7 +191,7 @@ def _conservatism(verdict: Verdict) -> Drawn:
 def _claimed(verdict: Verdict) -> Drawn:
     figure, (ax,) = subplots(7.0, 3.4)
     ratios = {}
-    for side in judged_sides(verdict.config):
+    for side in sides_with_gain_axes(verdict.config):
         for level, frame in verdict.levels.items():
             part = frame[frame[f"{side}.converged"].astype(bool)]
             ratio = part[f"{side}.f_plus"] / part[f"{side}.f_plus_acceleration"]

@@ -5,7 +5,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid
 
 from jaxbl.config import read_config, with_values
-from jaxbl.gains.below_bound import converged_below, disturbance
+from jaxbl.gains.below_bound import missing_acceleration, summarise_converged_below
 from jaxbl.sweeps.sweep import sweep
 from jaxbl.sweeps.trial import run
 
@@ -29,7 +29,7 @@ def frame():
 def test_runs_below_their_bound_are_counted_and_explained(frame):
     below = frame[frame["motor.converged"] & (frame["motor.margin_alpha"] <= 1.0)]
     assert 2 <= len(below) < len(frame)
-    found = converged_below(STUDY, "motor", frame)
+    found = summarise_converged_below(STUDY, "motor", frame)
     assert found["converged_runs"] == found["runs"] == len(below)
     shares, areas = [], []
     for _, row in below.iterrows():
@@ -49,13 +49,13 @@ def test_runs_below_their_bound_are_counted_and_explained(frame):
 
 
 def test_none_below(frame):
-    assert converged_below(STUDY, "motor", frame[frame[ALPHA] == 4.0]) is None
+    assert summarise_converged_below(STUDY, "motor", frame[frame[ALPHA] == 4.0]) is None
 
 
 def test_the_disturbance_is_what_the_model_lacks():
     study = with_values(STUDY, {AMPLITUDE: 0.3})
     trace = run(study).trace
-    found, velocity = disturbance(study.build().drive, "motor", trace), trace["motor.velocity"].to_numpy()
+    found, velocity = missing_acceleration(study.build().drive, "motor", trace), trace["motor.velocity"].to_numpy()
     slips = np.abs(velocity) > 0.05
     assert 0.2 < slips.mean() < 1.0
     # dry friction of 0.1 N m at 0.05 kg m^2; velocity and acceleration are half a period apart

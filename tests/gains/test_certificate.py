@@ -150,7 +150,7 @@ def test_gains_of_which_nothing_can_be_proven(gains, message):
         ({"f_plus": 0.0}, "f_plus: a certificate needs a finite number > 0, not 0.0"),
         ({"period": 0.0}, "period: .* > 0"),
         ({"accuracy": math.nan}, "accuracy: a certificate needs a finite number > 0, not nan"),
-        ({"discretisation": "exact"}, "discretisation: 'exact' is none; it should be one of implicit, explicit"),
+        ({"discretisation": "exact"}, "discretisation: 'exact' is unknown; it should be one of implicit, explicit"),
     ],
 )
 def test_bad_numbers_are_told(changes, message):

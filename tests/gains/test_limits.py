@@ -8,7 +8,7 @@ import pytest
 
 from jaxbl.config import TuneTable
 from jaxbl.gains.gain_search import GainSearch
-from jaxbl.gains.limits import limits_of
+from jaxbl.gains.limits import find_limits
 
 RANGE = (1.0, 100.0)
 NUM = 9
@@ -48,7 +48,7 @@ def test_of_an_optimum_inside_it_is_said_which_parts_of_the_error_balance():
     search = searched(
         lambda x, a: np.sqrt(a / 10.0 + 10.0 / a + np.log(x / 10.0) ** 2), chatter=lambda x, a: np.sqrt(a / 10.0)
     )
-    found = limits_of(search, "motor")
+    found = find_limits(search, "motor")
     assert (found["binding"], found["range_ends"]) == ([], [])
     ways = found["towards"]["alpha"]
     assert [ways[way]["by"] for way in ("smaller", "larger")] == ["slow", "chatter"]
@@ -62,7 +62,7 @@ def test_of_an_optimum_inside_it_is_said_which_parts_of_the_error_balance():
 def test_the_parts_of_another_error_are_not_known():
     search = searched(bowl, chatter=lambda x, a: 0.5 * bowl(x, a))
     search.table = search.table.model_copy(update={"objective": "torque"})
-    ways = limits_of(search, "motor")["towards"]["alpha"]
+    ways = find_limits(search, "motor")["towards"]["alpha"]
     assert [(way["limit"], way["by"]) for way in ways.values()] == [("error", None)] * 2
 
 
@@ -78,7 +78,7 @@ CONSTRAINTS = {
 @pytest.mark.parametrize("name", CONSTRAINTS)
 def test_a_constraint_that_forbids_less_error_binds(name):
     how, (gain, way) = CONSTRAINTS[name]
-    found = limits_of(searched(bowl, **how), "motor")
+    found = find_limits(searched(bowl, **how), "motor")
     assert found["binding"] == [name]
     assert [key for key, one in found["constraints"].items() if one["binds"]] == [name]
     towards = found["towards"][gain][way]
@@ -92,7 +92,7 @@ def test_a_constraint_that_forbids_less_error_binds(name):
 
 
 def test_a_constraint_whose_gains_are_no_better_does_not_bind():
-    found = limits_of(searched(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
+    found = find_limits(searched(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
     assert found["binding"] == []
     smaller = found["towards"]["lambda"]["smaller"]
     # both are said
@@ -100,12 +100,12 @@ def test_a_constraint_whose_gains_are_no_better_does_not_bind():
 
 
 def test_a_time_of_zero_has_room_without_end():
-    found = limits_of(searched(bowl, longest_convergence=1.0), "motor")
+    found = find_limits(searched(bowl, longest_convergence=1.0), "motor")
     assert found["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
 
 
 def test_ends_of_the_range_and_runs_that_diverge():
-    found = limits_of(searched(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
+    found = find_limits(searched(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
     assert found["towards"]["lambda"]["smaller"]["limit"] == "range"
     assert found["towards"]["alpha"]["smaller"]["limit"] == "range"
     assert found["range_ends"] == ["smaller lambda", "smaller alpha"]
@@ -114,7 +114,7 @@ def test_ends_of_the_range_and_runs_that_diverge():
 
 
 def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
-    found = limits_of(searched(lambda x, a: 1.0 + np.log(a) + np.log(x / 10.0) ** 2, margin_alpha=1.02), "motor")
+    found = find_limits(searched(lambda x, a: 1.0 + np.log(a) + np.log(x / 10.0) ** 2, margin_alpha=1.02), "motor")
     assert found["binding"] == ["margin_alpha"]
     assert found["range_ends"] == []
     assert found["towards"]["alpha"]["smaller"]["at"] is None
@@ -122,7 +122,7 @@ def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
 
 def test_between_two_rows_of_the_coarse_map_errors_are_interpolated():
     search = searched(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
-    line = pd.DataFrame(limits_of(search, "motor")["profiles"]["alpha"])
+    line = pd.DataFrame(find_limits(search, "motor")["profiles"]["alpha"])
     best = search.best_candidate("motor")["lambda"]
     exact = np.sqrt(np.log(best / 13.0) ** 2 + np.log(line["alpha"] / 10.0) ** 2 + 1.0)
     assert best not in search.candidates["motor"].query("stage == 0")["lambda"].to_numpy()

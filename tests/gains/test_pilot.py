@@ -6,14 +6,14 @@ from small_study import rigid, small
 
 from jaxbl.config import TuneTable, numeric_paths, read_config
 from jaxbl.drive.parameters import leaf_paths
-from jaxbl.gains.pilot import pilot, scenarios_of
+from jaxbl.gains.pilot import list_scenarios, run_pilot
 from jaxbl.sweeps.trial import run
 
 WORST = TuneTable(worst_over_uncertainty=True)
 
 
 def corners(study, table=WORST):
-    return scenarios_of(read_config(study), table)
+    return list_scenarios(read_config(study), table)
 
 
 def test_nominal_alone_unless_asked():
@@ -59,7 +59,7 @@ def test_effects_that_the_study_has_are_varied_about_their_values(count):
 
 def test_pilot_agrees_with_the_trace_of_a_run():
     study = small({"observer.motor.velocity_error": 0.0, "observer.load.velocity_error": 0.3, "excitation.amplitude": 0.5})
-    found = pilot(corners(study, TuneTable()), TuneTable())
+    found = run_pilot(corners(study, TuneTable()), TuneTable())
     trace, drive = run(study).trace, {"motor": (0.05, 0.15), "load": (7.0, 16.0)}
     for side, (inertia, viscous) in drive.items():
         driving = trace["u"] if side == "motor" else 0.0
@@ -77,6 +77,6 @@ def test_pilot_agrees_with_the_trace_of_a_run():
 
 def test_pilot_takes_the_worst_drive():
     study = small({"uncertainty.relative": 0.3, "excitation.amplitude": 0.5})
-    nominal, worst = (pilot(corners(study, table), table) for table in (TuneTable(), WORST))
+    nominal, worst = (run_pilot(corners(study, table), table) for table in (TuneTable(), WORST))
     for side in ("motor", "load"):
         assert worst[side]["f_plus"] > nominal[side]["f_plus"]

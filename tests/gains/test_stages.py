@@ -6,7 +6,7 @@ from small_study import ALPHA, LAMBDA, listed, parts, rigid, thirty
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.gains.stages import stages_in
+from jaxbl.gains.stages import open_stages
 from jaxbl.sweeps import programs
 from jaxbl.sweeps.sweep import sweep
 
@@ -14,10 +14,10 @@ from jaxbl.sweeps.sweep import sweep
 def stage(folder, changes=None, **given):
     """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
     study = read_config(thirty(**(changes or {})))
-    with stages_in(study, "tune", folder, None, **given) as stages:
-        found = dict(stages.found)
-        stages.keep(pilot=1.5)
-        table = stages.table("table.parquet", lambda: pd.DataFrame({"x": [1.0, 2.0]}))
+    with open_stages(study, "tune", folder, None, **given) as stages:
+        found = dict(stages.manifest)
+        stages.write_manifest(pilot=1.5)
+        table = stages.read_or_compute("table.parquet", lambda: pd.DataFrame({"x": [1.0, 2.0]}))
         stages.run(study, "coarse")
         return stages.cost["lanes"], found, table
 
@@ -40,7 +40,7 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
     path = tmp_path / "tune" / "manifest.json"
     path.write_text(path.read_text().replace("1.5", "1.6"))
     before = path.read_bytes(), parts(tmp_path / "tune" / "coarse")
-    with pytest.raises(InputError, match=r"is of another study|holds another study"):
+    with pytest.raises(InputError, match=r"(belongs to|holds) another study"):
         stage(tmp_path, {"encoders": {"noise": 1e-3}})
     (tmp_path / "tune" / "table.parquet").unlink()
     with pytest.raises(InputError, match="holds another study"):
@@ -48,7 +48,7 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
     assert (path.read_bytes(), parts(tmp_path / "tune" / "coarse")) == before
     assert sorted(one.name for one in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
     # of a command that is not there nobody can say whose it is
-    with pytest.raises(InputError, match="is damaged"), stages_in(read_config(thirty()), "verify", tmp_path, None):
+    with pytest.raises(InputError, match="is damaged"), open_stages(read_config(thirty()), "verify", tmp_path, None):
         pass
 
 
@@ -70,7 +70,7 @@ def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
     axes = [[listed(ALPHA, *alphas), listed(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
     inertias = 0.05, 0.05, 0.06
     studies = [rigid({"drive.motor_inertia": one}, axes=each) for one, each in zip(inertias, axes, strict=True)]
-    with stages_in(read_config(studies[0]), "tune", None, None, backend="fused") as stages:
+    with open_stages(read_config(studies[0]), "tune", None, None, backend="fused") as stages:
         found = [stages.run(study, str(i)).frame for i, study in enumerate(studies)]
     assert len(compiled) == 2
     for frame, study in zip(found, studies, strict=True):

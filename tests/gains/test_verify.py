@@ -14,7 +14,7 @@ from small_study import ALPHA, LAMBDA, listed, rigid
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.gains import error_system as module
-from jaxbl.gains.counterexamples import repeated
+from jaxbl.gains.counterexamples import repeat_runs
 from jaxbl.gains.stages import Stages
 from jaxbl.gains.verify import verify
 from jaxbl.sweeps.engine import Engine
@@ -68,7 +68,7 @@ def entries(summary, level):
 @pytest.mark.slow
 def test_normalised_level_counted_again(verified):
     verdict, _ = verified
-    found, plane = entries(verdict.summary, "normalised"), verdict.normalised
+    found, plane = entries(verdict.summary, "normalised"), verdict.error_map
     np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
     np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
     assert plane.ratio.shape == (9, 7)
@@ -228,7 +228,7 @@ def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
     results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
-    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
     again = verify(VERIFIED, folder)
     assert again.summary == verdict.summary
     for level, frame in verdict.levels.items():
@@ -249,7 +249,7 @@ def test_another_studys_folder_is_left_as_it_is(verified):
 def test_another_q_and_other_marks_go_on_with_what_is_there(verified, monkeypatch, tmp_path):
     verdict, folder = verified
     shutil.copytree(folder, tmp_path / "copy")
-    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
     twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
     again = verify(VERIFIED | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
     titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
@@ -345,7 +345,7 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verif
 def test_runs_repeated_for_their_cause_keep_their_noise():
     study = read_config(rigid(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
     frame = sweep(study).frame
-    rows = repeated(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2}, Stages(study, "verify"), "again")
+    rows = repeat_runs(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2}, Stages(study, "verify"), "again")
     keys = [LAMBDA, ALPHA, "seed"]
     pd.testing.assert_frame_equal(rows[keys].reset_index(drop=True), frame.iloc[[1, 5]][keys].reset_index(drop=True))
     assert set(rows["seed"]) <= {5, 6}

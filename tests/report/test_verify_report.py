@@ -34,7 +34,7 @@ def test_figures(checked):
         assert any(text.startswith(label) for text in legend), label
     # the boundary's points are those of the bisection
     (points,) = [line for line in atlas.axes[0].lines if line.get_marker() == "o"]
-    np.testing.assert_array_equal(points.get_ydata(), verdict.normalised.boundary)
+    np.testing.assert_array_equal(points.get_ydata(), verdict.error_map.boundary)
 
 
 def test_crosses_are_the_counterexamples_to_the_exact_condition(checked):

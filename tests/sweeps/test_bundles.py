@@ -16,7 +16,7 @@ from jaxbl.cluster import Cluster, connect
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.files import FolderInUse, lock_folder
-from jaxbl.gains.stages import stages_in
+from jaxbl.gains.stages import open_stages
 from jaxbl.sweeps.bundles import Bundle, _bundle_size, compute_bundle
 from jaxbl.sweeps.programs import Layout
 from jaxbl.sweeps.status import status
@@ -86,8 +86,8 @@ def test_a_refined_study_on_a_cluster(tmp_path, client):
 def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monkeypatch):
     submitted = []
     monkeypatch.setattr(Cluster, "_submit", lambda self, *given: submitted.append(given) or _submit(self, *given))
-    with stages_in(read_config(thirty()), "verify", tmp_path, client) as stages:
-        stages.keep()
+    with open_stages(read_config(thirty()), "verify", tmp_path, client) as stages:
+        stages.write_manifest()
         assert len(stages.run(thirty(), "drive").frame) == 30
         assert stages.cost["lanes"] == 30 and len(computed) == 8
     # the first chunk a worker, then the rest
