@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.gains.differentiation_bound import best_samples, least_exact_error, least_worst_error, worst_signal
-from jaxbl.gains.reachable import explore, step_of
+from jaxbl.gains.reachable import build_error_step, explore
 from jaxbl.observer import (
     COEFFICIENTS,
     DIFFERENTIATORS,
@@ -196,7 +196,7 @@ def searched(kind, gains, noise, most=1_200_000):
 
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
     further = len(observer.start(zero, zero, free, jnp.ones(())).further)
-    return explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * further]), most).worst
+    return explore(build_error_step(observer), noises, np.array([[0.5, 1.0] + [0.0] * further]), most).worst
 
 
 @functools.cache

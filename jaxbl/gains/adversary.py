@@ -1,8 +1,8 @@
-"""Noise and disturbance that make a super-twisting observer's velocity error large: a search, for what proofs allow.
+"""A search for noise and disturbances that make a super-twisting observer's velocity error large: it tests proven bounds.
 
-The error system is that of :mod:`.invariant_set`, in its units; every error found here is one that bounded noise and a
-bounded missing acceleration do cause. The best adversaries come from an exploration (:mod:`.reachable`). Runs then try what
-it found with parts flipped, steady and random switching, and feedback by regions of the phase plane.
+The error system and its units are those of :mod:`.invariant_set`. Bounded noise and a bounded missing acceleration can cause
+every error that is found here. The best adversaries come from an exploration of states (:mod:`.reachable`). Further runs try
+its sequence with parts flipped, steady and random switching, and feedback by regions of the phase plane.
 """
 
 import functools
@@ -20,24 +20,22 @@ from . import reachable
 from .invariant_set import ErrorSystem, Proof
 from .reachable import Reached
 
-_SIDE = 1e-6
-"""Innovation, over 1 + N, from which on its sign is sure."""
+_SIGN_MARGIN = 1e-6
+"""Least innovation, over 1 + N, whose sign does not depend on rounding."""
 _LANES = 1 << 14
-_LEAST, _MOST = 100, 2_000
-"""Samples of a run from rest: by the length of the way that the exploration found."""
-_FROM_START = 0.1
-"""Part of the runs that begin with starting errors, and last until the errors have settled."""
-_RATES = (1e-3, 0.5)
+_LEAST_SAMPLES, _MOST_SAMPLES = 100, 2_000
+"""Limits of the samples of a run from rest; it is a little longer than the explored sequence."""
+_SHARE_FROM_START = 0.1
+"""Share of the runs that begin with starting errors and last until the errors have settled."""
+_RATE_RANGE = (1e-3, 0.5)
 """Least and largest rate of switching, or of flips, in a sample."""
-
-
 _ROUNDING = 1e-9
-"""Relative: by so much an error is above a bound at least."""
+"""Least relative excess over a bound that counts as a violation."""
 
 
 class Sequence(NamedTuple):
-    """Choices of an adversary, sample by sample, arrays of one shape: noise, mean and moment (m and q) of the missing
-    acceleration, and the sign of the nominal one."""
+    """Choices of an adversary by sample: noise, mean and moment (m and q) of the missing acceleration, and the sign of the
+    nominal one. All arrays have one shape."""
 
     noise: Any
     mean: Any
@@ -45,14 +43,14 @@ class Sequence(NamedTuple):
     nominal: Any
 
 
-class Search(NamedTuple):
-    """What an adversary found.
+class SearchResult(NamedTuple):
+    """The result of a search for violations.
 
     Attributes:
-        runs: simulated, each of many samples.
-        explored: states of the exploration, each at the end of a run of its own.
+        runs: number of simulated runs.
+        explored: number of explored states, each at the end of a run of its own.
         worst: largest error of the velocity estimate from rest, f⁺ T.
-        latest: last sample at which a run from the starting errors was above the settled bound; -1 if none was.
+        latest: last sample at which a run from the starting errors was above the settled bound; -1 without one.
         violations: runs with an error above the bound of its sample; the exploration counts as one.
         sequence: choices that lead from rest to the worst error of the exploration.
     """
@@ -65,27 +63,31 @@ class Search(NamedTuple):
     sequence: Sequence
 
 
-def explore(observer: AbstractSuperTwisting, system: ErrorSystem) -> tuple[Reached, Sequence]:
-    """Errors of this observer that can be reached from rest, and the way to the worst one; for use with x64 enabled."""
-    n, a = system.noise, system.alpha
-    # the ends of the sliding set; a switch of which rounding would decide is left out
-    ends = np.array([a, -a, 0.0] if system.implicit else [_SIDE * (1.0 + n), -_SIDE * (1.0 + n)])
-    # of one sign, and with a switch in the middle of the period; the nominal acceleration with it or against it
+def explore_errors(observer: AbstractSuperTwisting, system: ErrorSystem) -> tuple[Reached, Sequence]:
+    """Explore the errors of an observer that can be reached from rest; x64 must be enabled.
+
+    Returns the result, and the sequence that leads to the worst error.
+    """
+    noise_bound, alpha = system.noise, system.alpha
+    # the ends of the sliding set; innovations whose sign would depend on rounding are avoided
+    margin = _SIGN_MARGIN * (1.0 + noise_bound)
+    ends = np.array([alpha, -alpha, 0.0] if system.implicit else [margin, -margin])
+    # constant, and with a switch in the middle of the period; the nominal acceleration adds to it or opposes it
     signs = (1.0, -1.0) if system.push else (1.0,)
-    mean, moment, nominal = np.array([(*one, sign) for one in ((1.0, 0.5), (0.0, 0.25)) for sign in signs]).T
+    mean, moment, nominal = np.array([(*push, sign) for push in ((1.0, 0.5), (0.0, 0.25)) for sign in signs]).T
 
     def noises(states: np.ndarray) -> np.ndarray:
-        extreme = np.clip(ends[:, None] - states[:, 0], -n, n)
-        return np.concatenate([extreme, np.full((1, len(states)), n), np.full((1, len(states)), -n)])
+        extreme = np.clip(ends[:, None] - states[:, 0], -noise_bound, noise_bound)
+        return np.concatenate([extreme, np.full((1, len(states)), noise_bound), np.full((1, len(states)), -noise_bound)])
 
-    found = reachable.explore(
-        reachable.step_of(observer), noises, np.column_stack([moment + 0.5 * system.push * nominal, mean])
+    reached = reachable.explore(
+        reachable.build_error_step(observer), noises, np.column_stack([moment + 0.5 * system.push * nominal, mean])
     )
-    return found, Sequence(found.noise, *(found.sign * x[found.push] for x in (mean, moment, nominal)))
+    return reached, Sequence(reached.noise, *(reached.sign * x[reached.push] for x in (mean, moment, nominal)))
 
 
-class _Lanes(NamedTuple):
-    """Adversaries of a batch, one each lane."""
+class _Adversaries(NamedTuple):
+    """Adversaries of a batch, one per lane."""
 
     kind: Any
     """0: a sequence with flips, 1: random switching, 2: steady switching, 3: feedback."""
@@ -107,10 +109,10 @@ class _Lanes(NamedTuple):
     """State of the random numbers."""
 
 
-def _drawn(rng: np.random.Generator, system: ErrorSystem, start: tuple[float, float]) -> _Lanes:
+def _draw_adversaries(rng: np.random.Generator, system: ErrorSystem, start: tuple[float, float]) -> _Adversaries:
     """A batch of adversaries, all kinds in turn; `start`: largest errors, of position and velocity."""
     shape, root = (_LANES,), math.sqrt(1.0 + system.noise)
-    low, high = np.log(_RATES)
+    low, high = np.log(_RATE_RANGE)
     rates = np.exp(rng.uniform(low, high, (2, _LANES)))
     lines = np.concatenate([rng.uniform(-1.0, 2.0, (2, _LANES)), 0.5 * root * rng.normal(size=(2, _LANES))])
     # lines through the origin, and the sign of the velocity error
@@ -119,7 +121,7 @@ def _drawn(rng: np.random.Generator, system: ErrorSystem, start: tuple[float, fl
     corner = np.where(
         rng.random((2, _LANES)) < 0.7, np.sign(rng.normal(size=(2, _LANES))), rng.uniform(-1.0, 1.0, (2, _LANES))
     )
-    return _Lanes(
+    return _Adversaries(
         kind=np.arange(_LANES) % 4,
         rate=rates,
         back=np.where(rng.random(_LANES) < 0.7, 0.4, rates[0]),
@@ -133,45 +135,50 @@ def _drawn(rng: np.random.Generator, system: ErrorSystem, start: tuple[float, fl
     )
 
 
-def _uniform(bits: Array) -> tuple[Array, Array]:
+def _draw_uniform(bits: Array) -> tuple[Array, Array]:
     """The next state of xorshift (G. Marsaglia, 2003), and a number in 0 ... 1."""
-    for left, right in ((13, 0), (0, 17), (5, 0)):
-        bits = bits ^ ((bits << left) if left else (bits >> right))
+    for left_shift, right_shift in ((13, 0), (0, 17), (5, 0)):
+        bits = bits ^ ((bits << left_shift) if left_shift else (bits >> right_shift))
     return bits, bits.astype(float) / 2.0**32
 
 
-@functools.partial(jax.jit, static_argnames="keep")
-def _run(
+@functools.partial(jax.jit, static_argnames="record")
+def _run_adversaries(
     observer: AbstractSuperTwisting,
     noise_bound: Array,
     push: Array,
-    lanes: _Lanes,
+    lanes: _Adversaries,
     sequence: Sequence,
     bounds: Array,
     settled: Array,
-    keep: bool = False,
+    record: bool = False,
 ) -> tuple[Array, Array, Array, Any]:
-    """Each lane's largest error, whether it went above a bound, and the last sample above `settled`; by the observer's own
-    step on a double integrator. With `keep` the choices, too."""
+    """Simulate the observer's own step on a double integrator, with an adversary in each lane.
 
-    def one(carry: tuple[Any, ...], given: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
+    Returns each lane's largest error, whether it exceeded a bound, the last sample above `settled`, and if `record` the
+    choices.
+    """
+
+    def step_lane(carry: tuple[Any, ...], sample_inputs: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
         state, position, velocity, bits, signs, worst, above, latest = carry
-        k, taken, bound = given
-        e, g = position - state.position, velocity - state.velocity
-        replay, root = lanes.kind == 0, jnp.sign(e) * jnp.sqrt(jnp.abs(e))
-        own, new_signs = [], []
+        k, choices, bound = sample_inputs
+        position_error, velocity_error = position - state.position, velocity - state.velocity
+        replay, root = lanes.kind == 0, jnp.sign(position_error) * jnp.sqrt(jnp.abs(position_error))
+        directions, new_signs = [], []
         for i in range(2):
-            bits, drawn = _uniform(bits)
+            bits, uniform = _draw_uniform(bits)
             rate = jnp.where(replay & (signs[i] < 0.0), lanes.back, lanes.rate[i])
-            new_signs.append(jnp.where(drawn < rate, -signs[i], signs[i]))
+            new_signs.append(jnp.where(uniform < rate, -signs[i], signs[i]))
             steady = jnp.where((k * lanes.rate[i] + lanes.phase[i]) % 1.0 < 0.5, 1.0, -1.0)
-            led = jnp.where(g - lanes.line[i] * observer.lambda_ * root - lanes.line[2 + i] >= 0.0, 1.0, -1.0)
-            own.append(jnp.where(lanes.kind == 1, new_signs[i], jnp.where(lanes.kind == 2, steady, led)))
-        noise = jnp.where(replay, taken.noise * new_signs[0], -noise_bound * own[0])
-        mean = jnp.where(replay, taken.mean * new_signs[1], own[1] * lanes.mean)
-        moment = 0.5 * own[1] * lanes.mean + 0.25 * lanes.side * (1.0 - lanes.mean**2)
-        moment = jnp.where(replay, taken.moment * new_signs[1], moment)
-        nominal = jnp.where(replay, taken.nominal * new_signs[1], lanes.side)
+            feedback = jnp.where(
+                velocity_error - lanes.line[i] * observer.lambda_ * root - lanes.line[2 + i] >= 0.0, 1.0, -1.0
+            )
+            directions.append(jnp.where(lanes.kind == 1, new_signs[i], jnp.where(lanes.kind == 2, steady, feedback)))
+        noise = jnp.where(replay, choices.noise * new_signs[0], -noise_bound * directions[0])
+        mean = jnp.where(replay, choices.mean * new_signs[1], directions[1] * lanes.mean)
+        moment = 0.5 * directions[1] * lanes.mean + 0.25 * lanes.side * (1.0 - lanes.mean**2)
+        moment = jnp.where(replay, choices.moment * new_signs[1], moment)
+        nominal = jnp.where(replay, choices.nominal * new_signs[1], lanes.side)
         state, estimate = observer.step(state, position + noise, lambda _: push * nominal, jnp.ones(()))
         error = jnp.abs(estimate.velocity - velocity)
         new = (
@@ -184,17 +191,17 @@ def _run(
             above | (error > bound * (1.0 + _ROUNDING)),
             jnp.where(error > settled * (1.0 + _ROUNDING), k, latest),
         )
-        return new, Sequence(noise, mean, moment, nominal) if keep else None
+        return new, Sequence(noise, mean, moment, nominal) if record else None
 
     flat = jnp.zeros_like(lanes.position)
     start = observer.start(flat, flat, lambda _: flat, jnp.ones(()))
-    ones, k = flat + 1.0, jnp.arange(bounds.shape[0])
+    ones, index = flat + 1.0, jnp.arange(bounds.shape[0])
     carry = start, lanes.position, lanes.velocity, lanes.bits, (ones, ones), flat, flat > 0.0, jnp.full(flat.shape, -1)
-    (*_, worst, above, latest), kept = jax.lax.scan(one, carry, (k, sequence, bounds))
-    return worst, above, latest, kept
+    (*_, worst, above, latest), recorded = jax.lax.scan(step_lane, carry, (index, sequence, bounds))
+    return worst, above, latest, recorded
 
 
-def search(
+def search_violations(
     system: ErrorSystem,
     position: float,
     velocity: float,
@@ -202,50 +209,52 @@ def search(
     settled: float,
     runs: int,
     seed: int = 0,
-) -> Search:
-    """Look for errors above what is proven, in so many runs.
+) -> SearchResult:
+    """Search for errors above the proven bounds.
 
     Args:
         system: the error system.
         position, velocity: largest errors at the start, f⁺ T² and f⁺ T.
-        proof: what is proven for this system and start.
-        settled: the bound that counts after the reaching time, f⁺ T.
-        runs: at least so many are simulated; rounded up to whole batches.
-        seed: of what is drawn at random.
+        proof: proven bounds for this system and start.
+        settled: the bound after the reaching time, f⁺ T.
+        runs: least number of simulated runs; it is rounded up to whole batches.
+        seed: random seed.
     """
     name = "implicit" if system.implicit else "explicit"
     rng, batches = np.random.default_rng(seed), max(1, math.ceil(runs / _LANES))
     with jax.enable_x64(True):
         observer = DISCRETISATIONS[name](jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
-        explored, best = explore(observer, system)
-        rest = np.full(min(max(_LEAST, math.ceil(1.2 * len(best.noise))), _MOST), proof.bounds[-1])
-        after = np.concatenate([proof.bounds, rest])
-        worst, latest, violations = explored.worst, -1, int(explored.worst > rest[0] * (1.0 + _ROUNDING))
+        explored, best = explore_errors(observer, system)
+        final_bounds = np.full(min(max(_LEAST_SAMPLES, math.ceil(1.2 * len(best.noise))), _MOST_SAMPLES), proof.bounds[-1])
+        all_bounds = np.concatenate([proof.bounds, final_bounds])
+        worst, latest, violations = explored.worst, -1, int(explored.worst > final_bounds[0] * (1.0 + _ROUNDING))
         bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)
 
-        def run(lanes: _Lanes, limits: np.ndarray, keep: bool = False) -> tuple[Any, ...]:
-            given = _extended(best, len(limits))
-            return jax.tree.map(np.asarray, _run(observer, bound, push, lanes, given, limits, np.asarray(settled), keep))
+        def run(lanes: _Adversaries, limits: np.ndarray, record: bool = False) -> tuple[Any, ...]:
+            sequence = _repeat_sequence(best, len(limits))
+            return jax.tree.map(
+                np.asarray, _run_adversaries(observer, bound, push, lanes, sequence, limits, np.asarray(settled), record)
+            )
 
         for batch in range(batches):
-            from_start = batch % round(1.0 / _FROM_START) == 0
-            lanes = _drawn(rng, system, (position, velocity) if from_start else (0.0, 0.0))
-            limits = after if from_start else rest
-            most, above, late, _ = run(lanes, limits)
-            violations += int(above.sum())
+            from_start = batch % round(1.0 / _SHARE_FROM_START) == 0
+            lanes = _draw_adversaries(rng, system, (position, velocity) if from_start else (0.0, 0.0))
+            limits = all_bounds if from_start else final_bounds
+            largest, went_above, latest_samples, _ = run(lanes, limits)
+            violations += int(went_above.sum())
             if from_start:
-                latest = max(latest, int(late.max()))
+                latest = max(latest, int(latest_samples.max()))
                 continue
-            k = int(np.where(lanes.kind == 0, most, 0.0).argmax())
-            if most[k] > worst:
-                # what it chose is the sequence of the batches that follow
-                alone = _Lanes(*(x[..., k : k + 1] for x in lanes))
-                kept = run(alone, limits, keep=True)[3]
-                best = Sequence(*(x[:, 0] for x in kept))
-            worst = max(worst, float(most.max()))
-    return Search(batches * _LANES, explored.kept, worst, latest, violations, best)
+            index = int(np.where(lanes.kind == 0, largest, 0.0).argmax())
+            if largest[index] > worst:
+                # later batches vary this lane's choices
+                worst_lane = _Adversaries(*(x[..., index : index + 1] for x in lanes))
+                recorded = run(worst_lane, limits, record=True)[3]
+                best = Sequence(*(x[:, 0] for x in recorded))
+            worst = max(worst, float(largest.max()))
+    return SearchResult(batches * _LANES, explored.state_count, worst, latest, violations, best)
 
 
-def _extended(sequence: Sequence, samples: int) -> Sequence:
-    """The sequence again and again, for so many samples."""
+def _repeat_sequence(sequence: Sequence, samples: int) -> Sequence:
+    """Repeat a sequence until it has this number of samples."""
     return Sequence(*(np.resize(x, samples) for x in sequence))

@@ -19,7 +19,7 @@ from jaxbl.files import json_with_checksum, read_json, to_jsonable, write_atomic
 from jaxbl.observer.conditions import convergence_time_worst, peak_ratio
 from jaxbl.observer.super_twisting import DISCRETISATIONS
 
-from .adversary import search
+from .adversary import search_violations
 from .gain_search import GainSearch
 from .invariant_set import ErrorSystem, Proof, prove
 
@@ -92,7 +92,7 @@ def certify(
     proven = _prove(lambda_, alpha, assumptions, accuracy)
     system, start, proof, bounds, proven_accuracy, reaching_sample = proven
     speed, final_accuracy = f_plus * period, float(bounds[-1])
-    adversary = search(system, *start, proof, proven_accuracy / speed, runs, seed)
+    adversary = search_violations(system, *start, proof, proven_accuracy / speed, runs, seed)
     with jax.enable_x64(True):
         numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
         continuous = float(convergence_time_worst(*(jnp.asarray(float(x)) for x in numbers)))

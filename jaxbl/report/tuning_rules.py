@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxbl.gains.rules import RULES, Spans, holds
+from jaxbl.gains.rules import RULES, Intervals, allows_gains
 from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import least_lambda_exact
@@ -73,8 +73,8 @@ def _plane(ax: Axes) -> list[Any]:
     return [Line2D([], [], **border), Line2D([], [], **sine), Patch(**below, label="does not converge")]
 
 
-def _spans(name: str, alpha: np.ndarray) -> Spans:
-    spans = RULES[name].spans
+def _spans(name: str, alpha: np.ndarray) -> Intervals:
+    spans = RULES[name].intervals
     assert spans is not None
     return spans(alpha, np.ones_like(alpha))
 
@@ -91,7 +91,7 @@ def _region(ax: Axes, one: JsonObject, colour: str, dashes: Any) -> Line2D:
         lambda_ = np.geomspace(*_LAMBDA, 401)
         with jax.enable_x64(True):
             exact = apply_elementwise(least_lambda_exact, [alpha, np.ones_like(alpha)])
-        fails = holds(RULES[one["name"]], lambda_[:, None], alpha[None, :], 1.0) & (lambda_[:, None] <= exact)
+        fails = allows_gains(RULES[one["name"]], lambda_[:, None], alpha[None, :], 1.0) & (lambda_[:, None] <= exact)
         ax.contourf(alpha, lambda_, fails, levels=[0.5, 1.5], colors=[colour], alpha=0.25)
         place = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])
         ax.plot(*place, "x", color=colour, ms=9, mew=2.5, zorder=7)

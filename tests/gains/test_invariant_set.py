@@ -10,7 +10,7 @@ import pytest
 from error_steps import stepped
 
 from jaxbl.errors import NoResult
-from jaxbl.gains.adversary import explore
+from jaxbl.gains.adversary import explore_errors
 from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
 from jaxbl.observer import ExplicitSuperTwisting
@@ -143,7 +143,7 @@ def test_forward_euler_with_a_large_lambda_has_a_set():
     system = ErrorSystem(False, 20.0, 1.5, 0.0)
     bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
     with jax.enable_x64(True):
-        found, _ = explore(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+        found, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
     assert 50.0 < found.worst <= bound <= 1.1 * found.worst
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.gains.reachable import explore, step_of
+from jaxbl.gains.reachable import build_error_step, explore
 from jaxbl.observer import DIFFERENTIATORS, ExplicitSuperTwisting, ImplicitSuperTwisting, Luenberger, ObserverState
 
 KINDS = [(ImplicitSuperTwisting, (1.5, 1.1)), (ExplicitSuperTwisting, (1.5, 1.1)), (DIFFERENTIATORS[2], (1.0,)),
@@ -32,7 +32,11 @@ def noises(states):
 def searched(kind, gains, most=50_000):
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
     rest = observer.start(zero, zero, lambda v: v, jnp.ones(()))
-    return observer, rest, explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.further)]), most)
+    return (
+        observer,
+        rest,
+        explore(build_error_step(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.further)]), most),
+    )
 
 
 def errors_of(observer, rest, noise, push):
@@ -55,7 +59,7 @@ def test_the_way_leads_to_the_error_that_is_found(kind, gains):
     assert set(found.sign) <= {-1.0, 1.0} and not found.push.any()
     errors = errors_of(observer, rest, found.noise, found.sign)
     assert abs(errors[-1]) == pytest.approx(found.worst, rel=1e-9)
-    assert len(errors) <= found.kept <= 50_000
+    assert len(errors) <= found.state_count <= 50_000
 
 
 @pytest.mark.parametrize(("kind", "gains"), KINDS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from jaxbl.gains.rules import RULES, holds, judge_rules
+from jaxbl.gains.rules import RULES, allows_gains, judge_rules
 from jaxbl.gains.worst_case import half_cycle
 from jaxbl.observer.conditions import least_lambda_exact, peak_ratio
 
@@ -52,7 +52,8 @@ def test_region_is_the_one_that_is_stated(name):
     unit = np.where(np.arange(600) % 2, f_plus, 1.0)
     alpha, lambda_ = unit * 10.0 ** draw.uniform(-1.0, 1.5, 600), np.sqrt(unit) * 10.0 ** draw.uniform(-1.0, 1.5, 600)
     found = [
-        bool(holds(RULES[name], *np.array([[one], [two]]), f)[0]) for one, two, f in zip(lambda_, alpha, f_plus, strict=True)
+        bool(allows_gains(RULES[name], *np.array([[one], [two]]), f)[0])
+        for one, two, f in zip(lambda_, alpha, f_plus, strict=True)
     ]
     expected = [bool(STATED[name](*given)) for given in zip(lambda_, alpha, f_plus, strict=True)]
     assert 10 < sum(expected) < 590
@@ -78,12 +79,12 @@ def test_no_gains_of_a_sufficient_rule_fail(name):
         alpha = bound * (1.0 + 10.0 ** draw.uniform(-3.0, 2.5, 1000))
         # from the exact border on: most of what a rule could have wrong
         lambda_ = np.asarray(least_lambda_exact(alpha, np.full(1000, bound))) * 10.0 ** draw.uniform(-0.3, 1.0, 1000)
-        allowed = holds(RULES[name], lambda_, alpha, bound)
+        allowed = allows_gains(RULES[name], lambda_, alpha, bound)
         ratios = np.asarray(peak_ratio(lambda_, alpha, np.full(1000, bound)))
         assert (ratios[allowed] < 1.0).all()
         assert (ratios >= 1.0).any()
         below = bound * 10.0 ** draw.uniform(-2.0, 0.0, 1000)
-        assert not holds(RULES[name], lambda_, below, bound).any()
+        assert not allows_gains(RULES[name], lambda_, below, bound).any()
 
 
 @pytest.mark.parametrize("name", sorted(set(RULES) - SUFFICIENT))
@@ -126,10 +127,10 @@ def test_coverage_is_the_share_of_cells(name, judged):
     works = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha))) < 1.0
     for entry in judged[name]["covers"]:
         bound = entry["f_plus"]
-        allowed = holds(RULES[name], np.sqrt(bound) * lambda_, bound * alpha, bound)
+        allowed = allows_gains(RULES[name], np.sqrt(bound) * lambda_, bound * alpha, bound)
         assert entry["share"] == pytest.approx((allowed & works).sum() / works.sum(), abs=0.02)
     cells = judged[name]["cells"]
-    grid = holds(RULES[name], LAMBDA[:, None], ALPHA[None, :], 1.0)
+    grid = allows_gains(RULES[name], LAMBDA[:, None], ALPHA[None, :], 1.0)
     fails = np.asarray(peak_ratio(*np.broadcast_arrays(LAMBDA[:, None], ALPHA[None, :]), np.ones((96, 96)))) >= 1.0
     assert (cells["holds"], cells["counterexamples"]) == (grid.sum(), (grid & fails).sum())
 
