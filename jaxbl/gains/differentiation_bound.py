@@ -34,7 +34,7 @@ class WorstSignal(NamedTuple):
     acceleration: np.ndarray
 
 
-def _checked(noise: float, slope: float, period: float) -> None:
+def _check_bounds(noise: float, slope: float, period: float) -> None:
     for name, value, least in (("noise", noise, 0.0), ("slope", slope, 0.0), ("period", period, 0.0)):
         if not (math.isfinite(value) and value >= least):
             raise InputError(f"{name}: the bound of a differentiation error needs a finite {name} >= 0, not {value}")
@@ -49,7 +49,7 @@ def difference_error(noise: float, slope: float, period: float, samples: int) ->
         period: sampling period T > 0, s.
         samples: periods i >= 1 that the quotient spans.
     """
-    _checked(noise, slope, period)
+    _check_bounds(noise, slope, period)
     if period <= 0.0 or samples < 1:
         raise InputError(f"samples: a difference quotient needs a period > 0 and samples >= 1, not {period} and {samples}")
     return 2.0 * noise / (samples * period) + 0.5 * slope * samples * period
@@ -57,18 +57,18 @@ def difference_error(noise: float, slope: float, period: float, samples: int) ->
 
 def best_samples(noise: float, slope: float, period: float, most: int | None = None) -> int:
     """Periods that the best difference quotient spans: the least i with i (i + 1) >= 4 N / (L T^2), at most `most`."""
-    _checked(noise, slope, period)
+    _check_bounds(noise, slope, period)
     if period <= 0.0:
         raise InputError(f"period: a difference quotient needs a period > 0, not {period}")
-    wanted = 4.0 * noise
-    reach = slope * period * period
-    if reach == 0.0 and wanted > 0.0:
+    four_noise = 4.0 * noise
+    step_reach = slope * period * period
+    if step_reach == 0.0 and four_noise > 0.0:
         if most is None:
             raise InputError("slope: without a slope > 0 the best quotient spans all samples; give `most`")
         return most
-    ratio = 0.0 if wanted == 0.0 else wanted / reach
-    found = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 4.0 * ratio) - 1.0) - 1e-12))
-    return found if most is None else min(found, most)
+    ratio = 0.0 if four_noise == 0.0 else four_noise / step_reach
+    samples = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 4.0 * ratio) - 1.0) - 1e-12))
+    return samples if most is None else min(samples, most)
 
 
 def least_worst_error(noise: float, slope: float, period: float = 0.0, most: int | None = None) -> float:
@@ -82,7 +82,7 @@ def least_worst_error(noise: float, slope: float, period: float = 0.0, most: int
         period: sampling period T, s.
         most: past samples that the differentiator has seen; None for all.
     """
-    _checked(noise, slope, period)
+    _check_bounds(noise, slope, period)
     if period == 0.0:
         return 2.0 * math.sqrt(noise * slope)
     return difference_error(noise, slope, period, best_samples(noise, slope, period, most))
@@ -120,7 +120,7 @@ def adaptive_quotient(readings: np.ndarray, slope: float, period: float) -> np.n
     Returns:
         Derivative at the newest reading, shape (...), rad/s.
     """
-    _checked(0.0, slope, period)
+    _check_bounds(0.0, slope, period)
     last = readings.shape[-1] - 1
     unit = slope * period * period
     if unit == 0.0 or last < 1:
@@ -132,17 +132,17 @@ def adaptive_quotient(readings: np.ndarray, slope: float, period: float) -> np.n
     twice_noise = np.zeros(readings.shape[:-1])
     for i in range(2, last + 1):
         s = np.arange(1, i)
-        off = np.abs(s / i * rise[..., i, None] - rise[..., 1:i]) / unit - 0.5 * s * (i - s)
-        twice_noise = np.maximum(twice_noise, off.max(axis=-1))
+        line_distance = np.abs(s / i * rise[..., i, None] - rise[..., 1:i]) / unit - 0.5 * s * (i - s)
+        twice_noise = np.maximum(twice_noise, line_distance.max(axis=-1))
     periods = np.arange(1, last + 1)
     level = 0.5 * periods - twice_noise[..., None] / periods
     quotients = rise[..., 1:] / (periods * period)
     # level rises by more than 1/2 per period: a share for each quotient beside where it passes 1/2
     below = np.clip((level <= 0.5).sum(axis=-1) - 1, 0, last - 1)[..., None]
     above = np.minimum(below + 1, last - 1)
-    low, high = (np.take_along_axis(level, at, -1)[..., 0] for at in (below, above))
+    low, high = (np.take_along_axis(level, index, -1)[..., 0] for index in (below, above))
     share = np.clip((0.5 - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
-    first, second = (np.take_along_axis(quotients, at, -1)[..., 0] for at in (below, above))
+    first, second = (np.take_along_axis(quotients, index, -1)[..., 0] for index in (below, above))
     return first + share * (second - first)
 
 
@@ -154,7 +154,7 @@ def worst_signal(noise: float, slope: float, period: float, samples: int) -> Wor
     is convex and symmetric, for which no method errs more than that (docs/theory.md). The unknowns are f(0), f'(0) and
     f'' in each period, constant there: the largest f'(0) is reached by such a signal.
     """
-    _checked(noise, slope, period)
+    _check_bounds(noise, slope, period)
     if period <= 0.0 or samples < 1:
         raise InputError(f"samples: the linear program needs a period > 0 and samples >= 1, not {period} and {samples}")
     # times in periods, lengths in L T^2 or N: what the solver sees is of order one
@@ -170,8 +170,8 @@ def worst_signal(noise: float, slope: float, period: float, samples: int) -> Wor
     objective = np.zeros(samples + 2)
     objective[1] = -1.0
     limits = np.full(2 * (samples + 1), level)
-    found = linprog(objective, np.vstack([rows, -rows]), limits, bounds=bounds, method="highs")
-    if not found.success:
-        raise InputError(f"noise, slope, period: the linear program of the bound was not solved: {found.message}")
+    solution = linprog(objective, np.vstack([rows, -rows]), limits, bounds=bounds, method="highs")
+    if not solution.success:
+        raise InputError(f"noise, slope, period: the linear program of the bound was not solved: {solution.message}")
     unit = scale / period
-    return WorstSignal(float(found.x[1]) * unit, rows @ found.x * scale, found.x[2:] * unit / period)
+    return WorstSignal(float(solution.x[1]) * unit, rows @ solution.x * scale, solution.x[2:] * unit / period)

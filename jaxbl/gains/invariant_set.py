@@ -24,22 +24,22 @@ from jaxtyping import Float
 
 from jaxbl.errors import NoResult
 
-_COARSE = 1_000
+_COARSE_ROWS = 1_000
 """Rows that the reach of the start is divided into at first; lower ones follow as the set shrinks."""
-_FINEST = 0.01
+_FINEST_HEIGHT = 0.01
 """Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
-_FINER = 0.02
+_FINER_ROWS_COST = 0.02
 """What rows of half the height may be worth of alpha - f⁺."""
 _LATTICE = 0.25
 """Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
 _SLACK, _ULPS = 1e-9, 16.0 * np.finfo(float).eps
 """For rounding errors of the arithmetic: parts of that lattice, and of the numbers that are added up."""
-_STEPS = 100_000
-_TAIL, _RESTS = 2_000, 1.001
+_MOST_SAMPLES = 100_000
+_TAIL_SAMPLES, _TAIL_RATIO = 2_000, 1.001
 """A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
-_SWING = 1e5
+_MOST_SWING = 1e5
 """Most that is added to the reach of the start for the chatter of forward Euler, f⁺ T: what memory allows."""
-_GROUP = 0.02
+_GROUP_HEIGHT = 0.02
 """Change of u over sqrt(1 + N) that counts as one within the sliding set."""
 
 
@@ -73,11 +73,11 @@ class Proof(NamedTuple):
     row: float
 
 
-class _Left(Exception):
+class _OutOfRows(Exception):
     """A set is larger than the rows there are."""
 
 
-def left_over(system: ErrorSystem, beyond: np.ndarray) -> np.ndarray:
+def root_beyond_sliding(system: ErrorSystem, beyond: np.ndarray) -> np.ndarray:
     """sqrt(r) with r + l sqrt(r) = beyond >= 0: what is left of an innovation outside of the sliding set."""
     return 2.0 * beyond / np.maximum(system.lambda_ + np.sqrt(system.lambda_**2 + 4.0 * beyond), np.finfo(float).tiny)
 
@@ -88,71 +88,76 @@ class _Rows:
     def __init__(self, system: ErrorSystem, height: float, reach: float):
         self.system, self.height = system, height
         # alpha is a whole number of rows, and f⁺ rounded up to one: by little of what alpha exceeds it
-        least = max(2, math.ceil(system.alpha / height))
+        least_rows = max(2, math.ceil(system.alpha / height))
         margin = max(system.alpha - 1.0, 1e-9)
-        cost = {
-            i: (math.ceil(i / system.alpha) * system.alpha / i - 1.0) / margin + _FINER * i / least
-            for i in range(least, 16 * least)
+        costs = {
+            i: (math.ceil(i / system.alpha) * system.alpha / i - 1.0) / margin + _FINER_ROWS_COST * i / least_rows
+            for i in range(least_rows, 16 * least_rows)
         }
-        self.alpha = min(cost, key=cost.__getitem__)
+        self.alpha = min(costs, key=costs.__getitem__)
         self.dg = system.alpha / self.alpha
         self.push = math.ceil(1.0 / self.dg)
-        self.half = math.ceil(reach / self.dg) + self.alpha + self.push
+        self.half_count = math.ceil(reach / self.dg) + self.alpha + self.push
         self.lattice = _LATTICE * self.dg
-        f = self.push * self.dg
-        mean = np.minimum(f, (np.arange(-self.push, self.push + 1) + 1) * self.dg)
-        self.moments = 0.5 * mean + 0.25 * (f - mean * mean / f) + 0.5 * system.push
+        push_height = self.push * self.dg
+        mean = np.minimum(push_height, (np.arange(-self.push, self.push + 1) + 1) * self.dg)
+        self.largest_moments = 0.5 * mean + 0.25 * (push_height - mean * mean / push_height) + 0.5 * system.push
         """Largest q of the m that lead so many rows up."""
-        self.group = max(1, int(_GROUP * math.sqrt(1.0 + system.noise) / self.dg))
+        self.group = max(1, int(_GROUP_HEIGHT * math.sqrt(1.0 + system.noise) / self.dg))
 
-    def box(self, position: float, velocity: float) -> np.ndarray:
-        upper, rows = np.full(2 * self.half, -np.inf), max(1, math.ceil(velocity / self.dg))
-        if rows > self.half:
-            raise _Left
-        upper[self.half - rows : self.half + rows] = position
-        return self._rounded(upper)
+    def fill_box(self, position: float, velocity: float) -> np.ndarray:
+        upper, rows = np.full(2 * self.half_count, -np.inf), max(1, math.ceil(velocity / self.dg))
+        if rows > self.half_count:
+            raise _OutOfRows
+        upper[self.half_count - rows : self.half_count + rows] = position
+        return self._round_up(upper)
 
-    def cover(self, other: "_Rows", upper: np.ndarray) -> np.ndarray:
+    def cover_set(self, other: "_Rows", upper: np.ndarray) -> np.ndarray:
         """A set of other rows in these."""
-        below = np.arange(-self.half, self.half) * self.dg / other.dg
+        below = np.arange(-self.half_count, self.half_count) * self.dg / other.dg
         # a row touches the other ones from that of its lower end to that of its upper end
         ends = [np.floor(below - _SLACK), np.ceil(below + self.dg / other.dg + _SLACK) - 1.0]
-        found = np.full(2 * self.half, -np.inf)
+        covered = np.full(2 * self.half_count, -np.inf)
         for k in range(math.ceil(self.dg / other.dg) + 2):
-            row = np.minimum(ends[0] + k, ends[1]).astype(int) + other.half
+            row = np.minimum(ends[0] + k, ends[1]).astype(int) + other.half_count
             inside = (row >= 0) & (row < len(upper))
-            np.maximum(found, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=found)
-        return self._rounded(found)
+            np.maximum(covered, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=covered)
+        return self._round_up(covered)
 
-    def _rounded(self, upper: np.ndarray, size: float = 0.0) -> np.ndarray:
+    def _round_up(self, upper: np.ndarray, size: float = 0.0) -> np.ndarray:
         """Bounds on the lattice; `size` of the terms that they are sums of, where these are larger."""
         size = max(size, float(np.abs(upper[upper > -np.inf]).max(initial=0.0)))
         return np.ceil(upper / self.lattice + _SLACK + _ULPS * size / self.lattice) * self.lattice
 
     @np.errstate(invalid="ignore")  # empty rows
-    def image(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
+    def map_set(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
         """The set one sample later, and the bound of the estimate's error at this sample."""
-        filled = np.flatnonzero(upper > -np.inf)
-        first, last = filled[0], filled[-1] + 1
+        filled_rows = np.flatnonzero(upper > -np.inf)
+        first, last = filled_rows[0], filled_rows[-1] + 1
         margin = self.alpha + self.push
         if first < margin or last + margin > len(upper):
-            raise _Left
-        rows = np.arange(first, last) - self.half
-        corrected = self._corrected(upper[first:last], rows)
-        reached = np.flatnonzero(corrected > -np.inf)
-        top = rows[0] - self.alpha + reached[-1] + 1 if self.system.implicit else rows[-1] + 1
-        moved = np.full(len(corrected) + 2 * self.push, -np.inf)
-        for shift, moment in enumerate(self.moments):
-            part = moved[shift : shift + len(corrected)]
-            np.maximum(part, corrected + moment, out=part)
-        far = float(np.abs(upper[filled]).max()) + self.system.noise
-        size = far + self.system.lambda_ * math.sqrt(far) + 2.0 * self.system.alpha + (last - self.half) * self.dg
-        size += float(self.moments[-1])
+            raise _OutOfRows
+        rows = np.arange(first, last) - self.half_count
+        corrected = self._correct_errors(upper[first:last], rows)
+        reached_rows = np.flatnonzero(corrected > -np.inf)
+        top = rows[0] - self.alpha + reached_rows[-1] + 1 if self.system.implicit else rows[-1] + 1
+        pushed = np.full(len(corrected) + 2 * self.push, -np.inf)
+        for shift, moment in enumerate(self.largest_moments):
+            target = pushed[shift : shift + len(corrected)]
+            np.maximum(target, corrected + moment, out=target)
+        largest_innovation = float(np.abs(upper[filled_rows]).max()) + self.system.noise
+        size = (
+            largest_innovation
+            + self.system.lambda_ * math.sqrt(largest_innovation)
+            + 2.0 * self.system.alpha
+            + (last - self.half_count) * self.dg
+        )
+        size += float(self.largest_moments[-1])
         new = np.full(len(upper), -np.inf)
-        new[first - margin : last + margin] = self._rounded(moved, size)
+        new[first - margin : last + margin] = self._round_up(pushed, size)
         return new, float(top * self.dg)
 
-    def _corrected(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def _correct_errors(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Largest e + phi(b) + g in the rows of z, `alpha` more on both sides; `high` mirrored is minus the lower bounds."""
         system, low, n, i = self.system, -high[::-1], len(high), self.alpha
         a, noise, top = system.alpha, system.noise, (rows + 1) * self.dg
@@ -160,56 +165,64 @@ class _Rows:
         # b of this row: from the least e and noise to the largest
         least, most = low - noise, high + noise
 
-        def take(above: int, there: np.ndarray, value: np.ndarray) -> None:
+        def raise_bound(above: int, there: np.ndarray, value: np.ndarray) -> None:
             part = new[above : above + n]
             np.maximum(part, np.where(there, value, -np.inf), out=part)
 
-        def at(b: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        def corrected_bound(b: np.ndarray, phi: np.ndarray) -> np.ndarray:
             return np.minimum(high, b + noise) + phi + top
 
         if system.implicit:
             # e + phi(b) grows with b while e is b + N, and falls where e is the bound itself
             b = np.clip(high - noise, np.maximum(least, a), np.maximum(most, a))
-            take(0, most >= a, at(b, -system.lambda_ * left_over(system, np.maximum(b - a, 0.0)) - 2.0 * a))
+            raise_bound(
+                0,
+                most >= a,
+                corrected_bound(b, -system.lambda_ * root_beyond_sliding(system, np.maximum(b - a, 0.0)) - 2.0 * a),
+            )
             b = np.clip(high - noise, np.minimum(least, -a), np.minimum(most, -a))
-            take(2 * i, least <= -a, at(b, system.lambda_ * left_over(system, np.maximum(-b - a, 0.0)) + 2.0 * a))
-            self._slide(new, high, rows)
+            raise_bound(
+                2 * i,
+                least <= -a,
+                corrected_bound(b, system.lambda_ * root_beyond_sliding(system, np.maximum(-b - a, 0.0)) + 2.0 * a),
+            )
+            self._add_sliding_set(new, high, rows)
             return new
         # convex in b > 0 while e is b + N: largest at an end
         for b in (np.maximum(least, 0.0), np.clip(high - noise, np.maximum(least, 0.0), np.maximum(most, 0.0))):
-            take(0, most >= 0.0, at(b, -system.lambda_ * np.sqrt(b)))
+            raise_bound(0, most >= 0.0, corrected_bound(b, -system.lambda_ * np.sqrt(b)))
         # concave in b < 0, largest at -lambda² / 4
         b = np.clip(np.minimum(high - noise, -0.25 * system.lambda_**2), np.minimum(least, 0.0), np.minimum(most, 0.0))
-        take(2 * i, least <= 0.0, at(b, system.lambda_ * np.sqrt(-b)))
-        take(i, (least <= 0.0) & (most >= 0.0), at(np.zeros(n), np.zeros(n)))
+        raise_bound(2 * i, least <= 0.0, corrected_bound(b, system.lambda_ * np.sqrt(-b)))
+        raise_bound(i, (least <= 0.0) & (most >= 0.0), corrected_bound(np.zeros(n), np.zeros(n)))
         return new
 
-    def _slide(self, new: np.ndarray, high: np.ndarray, rows: np.ndarray) -> None:
+    def _add_sliding_set(self, new: np.ndarray, high: np.ndarray, rows: np.ndarray) -> None:
         """The sliding set: b = g - z, e + phi(b) + g = e - b + z, and e - b is N or the bound less b, whichever is less."""
         a, noise, n, i, c = self.system.alpha, self.system.noise, len(high), self.alpha, self.group
         least, most, base = -high[::-1] - noise, high + noise, high - rows * self.dg
         z = (rows[0] - i + 1 + np.arange(n + 2 * i)) * self.dg
         # so many rows down at once: none, and groups that mirror each other, as rows do
         starts = range(1, i + 1, c)
-        down = [
+        groups = [
             (0, 1),
-            *((d, min(c, i - d + 1)) for d in starts),
-            *((-min(d + c - 1, i), min(c, i - d + 1)) for d in starts),
+            *((rows_down, min(c, i - rows_down + 1)) for rows_down in starts),
+            *((-min(rows_down + c - 1, i), min(c, i - rows_down + 1)) for rows_down in starts),
         ]
-        for d, wide in down:
-            low, up = max((d - 1) * self.dg, -a), min((d + wide) * self.dg, a)
-            spread = np.full(n + wide - 1, -np.inf)
-            spread[wide - 1 :] = np.where((most >= low) & (least <= up), base, -np.inf)
+        for rows_down, group_size in groups:
+            low, up = max((rows_down - 1) * self.dg, -a), min((rows_down + group_size) * self.dg, a)
+            spread = np.full(n + group_size - 1, -np.inf)
+            spread[group_size - 1 :] = np.where((most >= low) & (least <= up), base, -np.inf)
             width = 1
-            while width < wide:
-                step = min(width, wide - width)
+            while width < group_size:
+                step = min(width, group_size - width)
                 spread[:-step] = np.maximum(spread[:-step], spread[step:])
                 width += step
-            part = slice(i - d - wide + 1, i - d + n)
-            np.maximum(new[part], np.minimum(noise, spread + z[part]) + z[part], out=new[part])
+            target = slice(i - rows_down - group_size + 1, i - rows_down + n)
+            np.maximum(new[target], np.minimum(noise, spread + z[target]) + z[target], out=new[target])
 
 
-def prove(system: ErrorSystem, position: float, velocity: float, *, finest: float = _FINEST) -> Proof:
+def prove(system: ErrorSystem, position: float, velocity: float, *, finest: float = _FINEST_HEIGHT) -> Proof:
     """Bounds of the velocity error at all samples, from all starting errors |e| <= position and |g| <= velocity.
 
     The set of the start is mapped until it maps into itself. All in units of f⁺ T² and f⁺ T.
@@ -227,36 +240,46 @@ def prove(system: ErrorSystem, position: float, velocity: float, *, finest: floa
     reach += 10.0 * math.sqrt((system.alpha + 1.0) * (1.0 + system.noise + system.push)) + 4.0 * system.alpha
     height = finest * math.sqrt(1.0 + system.noise)
     # forward Euler with a large lambda swings to and fro by lambda² / 2
-    swing = 0.0 if system.implicit else min(system.lambda_**2, _SWING)
-    for more, wider in ((1.0, 0.0), (4.0, swing)):
+    swing = 0.0 if system.implicit else min(system.lambda_**2, _MOST_SWING)
+    for reach_factor, extra_reach in ((1.0, 0.0), (4.0, swing)):
         try:
-            return _settled(system, height, (position, velocity), more * reach + wider, _COARSE * more**2)
-        except _Left:
+            return _shrink_to_invariant(
+                system, height, (position, velocity), reach_factor * reach + extra_reach, _COARSE_ROWS * reach_factor**2
+            )
+        except _OutOfRows:
             continue
     raise NoResult("no set of errors was found that noise and disturbance cannot leave: the sets grow without end")
 
 
-def _settled(system: ErrorSystem, height: float, start: tuple[float, float], reach: float, coarsest: float) -> Proof:
+def _shrink_to_invariant(
+    system: ErrorSystem, height: float, start: tuple[float, float], reach: float, coarsest: float
+) -> Proof:
     rows = _Rows(system, max(height, reach / coarsest), reach)
-    upper, bounds, inside = rows.box(*start), [], 0
-    earlier, at = upper, 0
-    for k in range(1, _STEPS + 1):
-        new, bound = rows.image(upper)
+    upper, bounds, inside_count = rows.fill_box(*start), [], 0
+    earlier, earlier_sample = upper, 0
+    for k in range(1, _MOST_SAMPLES + 1):
+        new, bound = rows.map_set(upper)
         bounds.append(bound)
         # an image within its set: all later ones are, too, and bounds only fall; a set of before: bounds recur
-        inside = inside + 1 if (new <= upper).all() else 0
-        rests = inside > _TAIL and bounds[-_TAIL] <= _RESTS * bound
-        period = 1 if inside and (rests or (new == upper).all()) else k - at if (new == earlier).all() else 0
-        coarse = rows.height > height
-        if period and not coarse:
+        inside_count = inside_count + 1 if (new <= upper).all() else 0
+        is_at_rest = inside_count > _TAIL_SAMPLES and bounds[-_TAIL_SAMPLES] <= _TAIL_RATIO * bound
+        period = (
+            1
+            if inside_count and (is_at_rest or (new == upper).all())
+            else k - earlier_sample
+            if (new == earlier).all()
+            else 0
+        )
+        is_coarse = rows.height > height
+        if period and not is_coarse:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
             return Proof(least[: k - period + 1], rows.dg)
         upper = new
-        if coarse and (period or bound < 0.25 * coarsest * rows.height):
+        if is_coarse and (period or bound < 0.25 * coarsest * rows.height):
             # what is left is small: lower rows, down to those asked for
             finer = _Rows(system, max(height, 0.25 * rows.height), reach)
-            upper, rows, inside = finer.cover(rows, upper), finer, 0
-            earlier, at = upper, k
-        elif k >= 2 * at:
-            earlier, at = upper, k
-    raise NoResult(f"no set of errors came to rest within {_STEPS} samples")
+            upper, rows, inside_count = finer.cover_set(rows, upper), finer, 0
+            earlier, earlier_sample = upper, k
+        elif k >= 2 * earlier_sample:
+            earlier, earlier_sample = upper, k
+    raise NoResult(f"no set of errors came to rest within {_MOST_SAMPLES} samples")

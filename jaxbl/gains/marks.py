@@ -112,7 +112,7 @@ def _explain_convergence(
         predicted_peaks = peak_law(lambda_, alpha, **error_inputs, peak=peak)
         path = simulate_error(lambda_, alpha, **error_inputs, position_error=position, velocity_error=velocity)
         # an error may end without another passage
-        simulated_peaks = np.r_[times[0], path.times, path.gone], np.r_[path.largest, path.peaks, 0.0]
+        simulated_peaks = np.r_[times[0], path.times, path.end_time], np.r_[path.largest, path.peaks, 0.0]
         for name, peak_times, peaks in (("predicted", times, predicted_peaks), ("simulated", *simulated_peaks)):
             explanation[f"largest_{name}"] = float(peaks.max())
             index = np.flatnonzero(peaks > _FALLEN_SHARE * peak)[-1] + 1

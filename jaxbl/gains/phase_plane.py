@@ -18,25 +18,25 @@ def error_slope(error: np.ndarray, rate: np.ndarray, lambda_: float) -> np.ndarr
     return rate - lambda_ * np.sqrt(np.abs(error)) * np.sign(error)
 
 
-def error_peaks(error: np.ndarray, rate: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def error_peaks(error: np.ndarray, rate: np.ndarray, most_peaks: int) -> tuple[np.ndarray, np.ndarray]:
     """Peaks of an observer's velocity error: its values where the position error changes sign.
 
     Args:
         error: position error (rad) at each sample.
         rate: velocity error without the square-root term (rad/s), which is the slope of `error` where that is zero.
-        most: peaks that are wanted.
+        most_peaks: peaks that are wanted.
 
     Returns:
         Indices of the samples before, and peaks (rad/s); those that stand out from the chatter of the last quarter (three
-        times its rms), the first `most` only.
+        times its rms), the first `most_peaks` only.
     """
-    at = np.flatnonzero((error[:-1] * error[1:] < 0.0) | ((error[:-1] == 0.0) & (error[1:] != 0.0)))
-    share = error[at] / (error[at] - error[at + 1])
-    peaks = rate[at] + share * (rate[at + 1] - rate[at])
+    crossings = np.flatnonzero((error[:-1] * error[1:] < 0.0) | ((error[:-1] == 0.0) & (error[1:] != 0.0)))
+    share = error[crossings] / (error[crossings] - error[crossings + 1])
+    peaks = rate[crossings] + share * (rate[crossings + 1] - rate[crossings])
     chatter = 3.0 * np.sqrt(np.mean(rate[-max(len(rate) // 4, 1) :] ** 2))
-    low = np.flatnonzero(~(np.abs(peaks) > chatter))
-    count = min(low[0] if len(low) else len(peaks), most)
-    return at[:count], peaks[:count]
+    below_chatter = np.flatnonzero(~(np.abs(peaks) > chatter))
+    count = min(below_chatter[0] if len(below_chatter) else len(peaks), most_peaks)
+    return crossings[:count], peaks[:count]
 
 
 def majorant(peak: float, lambda_: float, alpha: float, f_plus: float) -> tuple[np.ndarray, np.ndarray]:

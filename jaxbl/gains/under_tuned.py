@@ -16,12 +16,12 @@ from scipy.optimize import root
 
 _TOLERANCE = 1e-9
 """Relative, of the simulated half cycles."""
-_REST = 1e-4
+_ZERO_RATIO = 1e-4
 """Peak over the first one, below which the error counts as gone."""
 _MOST_HALF_CYCLES = 20_000
-_LONGEST = 1e5
+_LONGEST_HALF_CYCLE = 1e5
 """Of a half cycle in tau, over 1 / sqrt(alpha); without disturbance it takes 4.4."""
-_BEGUN = 1e-3
+_STARTING_SHARE = 1e-3
 """Part of the speed that a pulse makes, from which on an error that was zero is simulated."""
 
 
@@ -65,24 +65,24 @@ def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping:
     damping that is the integral of |d| - alpha over the pulse.
     """
     steps = np.diff(times)
-    kept = np.exp(-damping * steps)
-    lasting = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
+    remaining_share = np.exp(-damping * steps)
+    effective_steps = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
     above = np.abs(disturbance) > alpha
     begins = np.flatnonzero(above[:-1] | above[1:])
-    largest, speed, at = 0.0, 0.0, 0
-    while at < len(steps):
+    largest, speed, index = 0.0, 0.0, 0
+    while index < len(steps):
         if speed == 0.0:
             # on to the next pulse
-            begin = int(np.searchsorted(begins, at))
+            begin = int(np.searchsorted(begins, index))
             if begin == len(begins):
                 break
-            at = int(begins[begin])
-            sign = np.sign(disturbance[at + 1] if above[at + 1] else disturbance[at])
+            index = int(begins[begin])
+            sign = np.sign(disturbance[index + 1] if above[index + 1] else disturbance[index])
             push = sign * 0.5 * (disturbance[:-1] + disturbance[1:]) - alpha
         # the other sign of d pulls back
-        speed = max(speed * kept[at] + push[at] * lasting[at], 0.0)
+        speed = max(speed * remaining_share[index] + push[index] * effective_steps[index], 0.0)
         largest = max(largest, float(speed))
-        at += 1
+        index += 1
     return largest
 
 
@@ -99,7 +99,7 @@ class ErrorPath(NamedTuple):
     times: np.ndarray
     peaks: np.ndarray
     largest: float
-    gone: float
+    end_time: float
 
 
 def _half_cycle(
@@ -120,32 +120,32 @@ def _half_cycle(
         y, x2, time = state.tolist()
         return x2 - lambda_ * y, 2.0 * y * (disturbance(time) - alpha - damping * x2), 2.0 * y
 
-    def back(_: float, state: np.ndarray) -> float:
+    def returns(_: float, state: np.ndarray) -> float:
         return state[0]
 
-    def late(_: float, state: np.ndarray) -> float:
+    def run_ends(_: float, state: np.ndarray) -> float:
         return state[2] - end
 
     pace = 1.0 / np.sqrt(alpha)
     scale = max(abs(start[1]), start[0] / pace)
 
-    def near(_: float, state: np.ndarray) -> float:
+    def nears_origin(_: float, state: np.ndarray) -> float:
         # along a ray to the origin a half cycle does not end
-        return abs(state[1]) + state[0] / pace - 1e-3 * _REST * scale
+        return abs(state[1]) + state[0] / pace - 1e-3 * _ZERO_RATIO * scale
 
-    back.terminal, back.direction, late.terminal, near.terminal = True, -1, True, True  # type: ignore[attr-defined]
-    found = solve_ivp(
+    returns.terminal, returns.direction, run_ends.terminal, nears_origin.terminal = True, -1, True, True  # type: ignore[attr-defined]
+    solution = solve_ivp(
         slope,
-        (0.0, _LONGEST * pace),
+        (0.0, _LONGEST_HALF_CYCLE * pace),
         start,
         method="DOP853",
-        events=(back, late, near),
+        events=(returns, run_ends, nears_origin),
         rtol=_TOLERANCE,
         atol=1e-3 * _TOLERANCE * scale * np.array([pace, 1.0, pace**2]),
         max_step=pace,
     )
-    y, x2, time = found.y[:, -1]
-    return x2, time, float(np.abs(found.y[1]).max()), len(found.t_events[0]) > 0 or y <= 0.0
+    y, x2, time = solution.y[:, -1]
+    return x2, time, float(np.abs(solution.y[1]).max()), len(solution.t_events[0]) > 0 or y <= 0.0
 
 
 def simulate_error(
@@ -176,57 +176,59 @@ def simulate_error(
     sign = np.sign(position_error) or np.sign(velocity_error) or 1.0
     y, x2 = float(np.sqrt(abs(position_error))), float(sign * velocity_error)
     scale = max(abs(x2), y * np.sqrt(2.0 * alpha))
-    found, peaks, largest, gone = [], [], abs(x2), np.inf
-    between = _linear(times, disturbance)
+    passages, peaks, largest, end_time = [], [], abs(x2), np.inf
+    disturbance_at = _interpolator(times, disturbance)
     if y == 0.0 and x2 != 0.0:
-        found, peaks = [time], [x2]
+        passages, peaks = [time], [x2]
     for _ in range(_MOST_HALF_CYCLES):
-        if max(abs(x2), y) <= _REST * scale:
-            gone = min(gone, time)
+        if max(abs(x2), y) <= _ZERO_RATIO * scale:
+            end_time = min(end_time, time)
             later = np.flatnonzero((times >= time) & (np.abs(disturbance) > alpha))
             if not len(later):
                 break
             sign = float(np.sign(disturbance[later[0]]))
-            time, x2 = _off_zero(sign * disturbance[later[0] :] - alpha, times[later[0] :])
+            time, x2 = _start_of_pulse(sign * disturbance[later[0] :] - alpha, times[later[0] :])
             y = x2 / max(lambda_, np.sqrt(alpha))
-            scale, gone = max(scale, x2), np.inf
-        x2, time, most, came = _half_cycle(
-            lambda_, alpha, lambda at, sign=sign: sign * between(at), damping, (y, x2, time), end
+            scale, end_time = max(scale, x2), np.inf
+        x2, time, largest_speed, has_passed = _half_cycle(
+            lambda_, alpha, lambda t, sign=sign: sign * disturbance_at(t), damping, (y, x2, time), end
         )
-        largest = max(largest, most)
-        if came:
-            found.append(time)
+        largest = max(largest, largest_speed)
+        if has_passed:
+            passages.append(time)
             peaks.append(abs(x2))
         elif time >= end * (1.0 - 1e-12):
             break
         # without a passage it has ended at the origin
-        y, x2, sign = 0.0, -x2 if came else 0.0, -sign
-    return ErrorPath(np.array(found), np.array(peaks), float(largest), float(gone))
+        y, x2, sign = 0.0, -x2 if has_passed else 0.0, -sign
+    return ErrorPath(np.array(passages), np.array(peaks), float(largest), float(end_time))
 
 
-def _off_zero(excess: np.ndarray, times: np.ndarray) -> tuple[float, float]:
+def _start_of_pulse(excess: np.ndarray, times: np.ndarray) -> tuple[float, float]:
     """Time, and x2 (rad/s), at which a pulse of |d| - alpha has made an error that was zero just large enough to simulate.
 
     x2 is the integral of the pulse, whatever x1 is, and x1 is soon forgotten.
     """
     pulse = excess[: int(np.argmax(excess <= 0.0)) or len(excess)]
     speed = cumulative_trapezoid(pulse, times[: len(pulse)], initial=0.0)
-    at = int(np.argmax(speed >= _BEGUN * speed[-1]))
+    index = int(np.argmax(speed >= _STARTING_SHARE * speed[-1]))
     # a pulse of one sample has no area here
-    return float(times[at]), float(speed[at]) or 1e-12 * float(excess[0])
+    return float(times[index]), float(speed[index]) or 1e-12 * float(excess[0])
 
 
-def _linear(times: np.ndarray, values: np.ndarray) -> Callable[[float], float]:
+def _interpolator(times: np.ndarray, values: np.ndarray) -> Callable[[float], float]:
     """As `np.interp`, of one number at a time: NumPy takes ten times as long for one, and half of a simulation."""
-    at, of = times.tolist(), values.tolist()
+    time_list, value_list = times.tolist(), values.tolist()
 
-    def between(time: float) -> float:
-        i = bisect_right(at, time)
-        if i in (0, len(at)):
-            return of[min(i, len(at) - 1)]
-        return (of[i] - of[i - 1]) / (at[i] - at[i - 1]) * (time - at[i - 1]) + of[i - 1]
+    def interpolate(time: float) -> float:
+        i = bisect_right(time_list, time)
+        if i in (0, len(time_list)):
+            return value_list[min(i, len(time_list) - 1)]
+        return (value_list[i] - value_list[i - 1]) / (time_list[i] - time_list[i - 1]) * (
+            time - time_list[i - 1]
+        ) + value_list[i - 1]
 
-    return between
+    return interpolate
 
 
 class SineCycle(NamedTuple):
@@ -243,7 +245,7 @@ SINE_LIMIT = 16.0 * 2.0**0.5 / np.pi**3
 """lambda sqrt(alpha) / amplitude, up to which a sine upholds a limit cycle without damping: 0.730."""
 
 
-def _phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
+def _balance_phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
     """Sine of the phase in which the disturbance makes up for the losses of a half cycle."""
     friction = damping * alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
     return float((friction + lambda_ * np.sqrt(alpha) / SINE_LIMIT) / amplitude)
@@ -257,7 +259,7 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
     a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda sqrt(alpha) <
     `SINE_LIMIT` times the amplitude.
     """
-    sine = _phase_sine(lambda_, alpha, amplitude, frequency, damping)
+    sine = _balance_phase_sine(lambda_, alpha, amplitude, frequency, damping)
     if sine > 1.0:
         return None
     circular = 2.0 * np.pi * frequency
@@ -268,18 +270,18 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
 def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
     """Frequency (Hz) from which on a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`; 0 without
     damping, `inf` where lambda alone forbids one. It is too high where alpha is close to the amplitude."""
-    left = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
-    return float(damping * alpha * np.pi**2 / (48.0 * left)) if left > 0.0 else np.inf
+    driving_amplitude = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
+    return float(damping * alpha * np.pi**2 / (48.0 * driving_amplitude)) if driving_amplitude > 0.0 else np.inf
 
 
-def _cycle(
+def _find_cycle(
     lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float, start: tuple[float, float]
 ) -> tuple[float, float] | None:
     """Peak (rad/s) and phase that come back after a simulated half cycle, by Newton's method from `start`; None without."""
     circular = 2.0 * np.pi * frequency
     unit = alpha / circular
 
-    def closed(at: np.ndarray) -> np.ndarray:
+    def cycle_residual(at: np.ndarray) -> np.ndarray:
         peak, phase = at[0] * unit, at[1]
         if peak <= 0.0:
             return np.array([1.0, 1.0])
@@ -288,8 +290,12 @@ def _cycle(
         )
         return np.array([(-x2 - peak) / unit, time * circular / np.pi - 1.0])
 
-    found = root(closed, (start[0] / unit, start[1]), method="hybr")
-    return (float(found.x[0]) * unit, float(found.x[1])) if found.success and np.abs(found.fun).max() < 1e-6 else None
+    solution = root(cycle_residual, (start[0] / unit, start[1]), method="hybr")
+    return (
+        (float(solution.x[0]) * unit, float(solution.x[1]))
+        if solution.success and np.abs(solution.fun).max() < 1e-6
+        else None
+    )
 
 
 def sine_cycle_simulated(
@@ -299,16 +305,16 @@ def sine_cycle_simulated(
 
     None where that has no cycle, or the method finds none.
     """
-    known = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
-    if known is None:
+    predicted = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
+    if predicted is None:
         return None
-    phase = float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, frequency, damping)))
-    starts = (known.stable, np.pi - phase), (known.threshold, phase)
-    stable, threshold = (_cycle(lambda_, alpha, amplitude, frequency, damping, start) for start in starts)
+    phase = float(np.arcsin(_balance_phase_sine(lambda_, alpha, amplitude, frequency, damping)))
+    starts = (predicted.stable, np.pi - phase), (predicted.threshold, phase)
+    stable, threshold = (_find_cycle(lambda_, alpha, amplitude, frequency, damping, start) for start in starts)
     return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
 
 
-_FREQUENCIES = 10
+_HALVINGS = 10
 """Halvings of a factor of four, when a least frequency is sought: to 0.14 %."""
 
 
@@ -318,19 +324,19 @@ def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: flo
     high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
     if not 0.0 < high < np.inf:
         return None
-    known = sine_cycle(lambda_, alpha, amplitude, high, damping)
-    assert known is not None
-    phase = np.pi - float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, high, damping)))
-    last = _cycle(lambda_, alpha, amplitude, high, damping, (known.stable, phase))
-    if last is None:
+    predicted = sine_cycle(lambda_, alpha, amplitude, high, damping)
+    assert predicted is not None
+    phase = np.pi - float(np.arcsin(_balance_phase_sine(lambda_, alpha, amplitude, high, damping)))
+    last_cycle = _find_cycle(lambda_, alpha, amplitude, high, damping, (predicted.stable, phase))
+    if last_cycle is None:
         return None
     low = 0.25 * high
-    for _ in range(_FREQUENCIES):
+    for _ in range(_HALVINGS):
         middle = float(np.sqrt(low * high))
         # by homogeneity peaks go with the period
-        found = _cycle(lambda_, alpha, amplitude, middle, damping, (last[0] * high / middle, last[1]))
-        if found is None:
+        cycle = _find_cycle(lambda_, alpha, amplitude, middle, damping, (last_cycle[0] * high / middle, last_cycle[1]))
+        if cycle is None:
             low = middle
         else:
-            high, last = middle, found
+            high, last_cycle = middle, cycle
     return high

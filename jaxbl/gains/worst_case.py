@@ -14,11 +14,11 @@ import jax.numpy as jnp
 
 from jaxbl.observer.conditions import Values, bisect
 
-_STEP = 0.1
+_STEP_SHARE = 0.1
 """Part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7."""
 _MOST_STEPS = 20_000
 """Of a quarter cycle: two thousand time constants, after which it has ended, or nears the origin along a ray."""
-_GONE = 1e-6
+_ORIGIN_RATIO = 1e-6
 """Error, over that at the start, from which on the way to the origin is known: its time is added in closed form."""
 _HALVINGS = 28
 """The last interval is 4 / 2^28 = 1.5e-8 of sqrt(alpha + f)."""
@@ -67,11 +67,11 @@ def half_cycle(
         homeward: d / f_plus from there on. The defaults are the worst case, which makes the next peak the largest.
         ray: where d changes, rad^0.5/s; 0 is the turning point.
     """
-    given = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (lambda_, alpha, f_plus, damping, speed, ray)))
-    lambda_, alpha, f_plus, damping, speed, ray = given
+    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (lambda_, alpha, f_plus, damping, speed, ray)))
+    lambda_, alpha, f_plus, damping, speed, ray = arguments
     zero = jnp.zeros_like(lambda_)
 
-    def field(push: Values) -> Callable[[_State], _State]:
+    def field_under(push: Values) -> Callable[[_State], _State]:
         def slope(s: _State) -> _State:
             return _State(s.x2 - lambda_ * s.y, 2.0 * s.y * (push - damping * s.x2), 2.0 * s.y)
 
@@ -80,42 +80,46 @@ def half_cycle(
     def step_size(s: _State) -> Values:
         # y begins at zero: the root is what the damping will be one step on
         fastest = jnp.sqrt(2.0 * (alpha + f_plus)) + jnp.sqrt(2.0 * damping * jnp.abs(s.x2)) + 2.0 * damping * s.y
-        return _STEP / (lambda_ + fastest)
+        return _STEP_SHARE / (lambda_ + fastest)
 
-    def gone(s: _State) -> Values:
+    def nears_origin(s: _State) -> Values:
         """At the origin: nothing is left, or it is being neared along a ray, which no trajectory crosses."""
         c = 2.0 * (alpha - homeward * f_plus)
         turning = s.x2 * (s.x2 - lambda_ * s.y) + c * s.y**2  # Q(p) y^2 for p = x1' / y
-        along = (jnp.abs(turning) < _GONE**2 * (lambda_ * s.y) ** 2) & (s.x2 > 0.0)
+        along = (jnp.abs(turning) < _ORIGIN_RATIO**2 * (lambda_ * s.y) ** 2) & (s.x2 > 0.0)
         # with damping p' = -(p^2 + lambda p + c + 2 damping x2): the roots part as x2 falls, p stays above the lower
         above = (2.0 * s.x2 >= lambda_ * s.y) & (lambda_**2 >= 4.0 * (c + 2.0 * damping * s.x2))
         held = (damping > 0.0) & (c > 0.0) & (s.x2 > 0.0) & above
-        return (jnp.abs(s.x2) + jnp.sqrt(jnp.abs(c)) * s.y < _GONE * speed) | along | held
+        return (jnp.abs(s.x2) + jnp.sqrt(jnp.abs(c)) * s.y < _ORIGIN_RATIO * speed) | along | held
 
     start = _State(zero, speed, zero)
-    turn, turned = _march(
-        field(outward * f_plus - alpha), step_size, lambda s: s.x2 - (lambda_ + ray) * s.y, start, lambda s: zero > 0.0
+    turning_state, has_turned = _march(
+        field_under(outward * f_plus - alpha), step_size, lambda s: s.x2 - (lambda_ + ray) * s.y, start, lambda s: zero > 0.0
     )
-    end, back = _march(field(homeward * f_plus - alpha), step_size, lambda s: s.y, turn, gone, turned)
-    ends = gone(end) & ~back
+    last_state, is_back = _march(
+        field_under(homeward * f_plus - alpha), step_size, lambda s: s.y, turning_state, nears_origin, has_turned
+    )
+    ends = nears_origin(last_state) & ~is_back
     # what is left of x2 on the ray to the origin falls at the rate alpha - d + damping x2
     rate = alpha - homeward * f_plus
-    left = jnp.where(ends, jnp.abs(end.x2) / jnp.where(rate > 0.0, rate, 1.0), 0.0)
-    damped = damping * left
-    left = left * jnp.where(damped > 0.0, jnp.log1p(damped) / jnp.where(damped > 0.0, damped, 1.0), 1.0)
-    ratio = jnp.where(ends, 0.0, -end.x2 / speed)
-    there = turned & (back | ends)
-    return HalfCycle(jnp.where(there, ratio, jnp.inf), jnp.where(there, end.time + left, jnp.inf))
+    remaining_time = jnp.where(ends, jnp.abs(last_state.x2) / jnp.where(rate > 0.0, rate, 1.0), 0.0)
+    damped_time = damping * remaining_time
+    remaining_time = remaining_time * jnp.where(
+        damped_time > 0.0, jnp.log1p(damped_time) / jnp.where(damped_time > 0.0, damped_time, 1.0), 1.0
+    )
+    ratio = jnp.where(ends, 0.0, -last_state.x2 / speed)
+    returns = has_turned & (is_back | ends)
+    return HalfCycle(jnp.where(returns, ratio, jnp.inf), jnp.where(returns, last_state.time + remaining_time, jnp.inf))
 
 
 def _runge_kutta(slope: Callable[[_State], _State], s: _State, h: Values) -> _State:
-    def moved(by: Values, k: _State) -> _State:
+    def shift_state(by: Values, k: _State) -> _State:
         return jax.tree.map(lambda x, d: x + by * d, s, k)
 
     k1 = slope(s)
-    k2 = slope(moved(0.5 * h, k1))
-    k3 = slope(moved(0.5 * h, k2))
-    k4 = slope(moved(h, k3))
+    k2 = slope(shift_state(0.5 * h, k1))
+    k3 = slope(shift_state(0.5 * h, k2))
+    k4 = slope(shift_state(h, k3))
     return jax.tree.map(lambda x, a, b, c, d: x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d), s, k1, k2, k3, k4)
 
 
@@ -124,8 +128,8 @@ def _march(
     step_size: Callable[[_State], Values],
     event: Callable[[_State], Values],
     state: _State,
-    gone: Callable[[_State], Values],
-    goes: Values | bool = True,
+    nears_origin: Callable[[_State], Values],
+    starts_moving: Values | bool = True,
 ) -> tuple[_State, Values]:
     """March until `event` falls through zero. Returns the state there, and whether it came to that."""
     zero = jnp.zeros_like(state.y)
@@ -136,17 +140,17 @@ def _march(
         crosses = event(new) <= 0.0
         moves = going & ~crosses
         state = jax.tree.map(partial(jnp.where, moves), new, state)
-        return state, moves & ~gone(state), met | (going & crosses), count + 1
+        return state, moves & ~nears_origin(state), met | (going & crosses), count + 1
 
-    begin = state, jnp.asarray(goes) & (zero == 0.0), zero > 0.0, jnp.asarray(0)
-    state, _, met, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[1]) & (carry[3] < _MOST_STEPS), advance, begin)
+    begin = state, jnp.asarray(starts_moving) & (zero == 0.0), zero > 0.0, jnp.asarray(0)
+    state, _, has_event, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[1]) & (carry[3] < _MOST_STEPS), advance, begin)
     # the last step ends at the event
     h = 0.5 * step_size(state)
     for _ in range(6):
-        at, rate = jax.jvp(lambda h: event(_runge_kutta(slope, state, h)), (h,), (jnp.ones_like(h),))
-        h = jnp.clip(h - at / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
+        event_value, rate = jax.jvp(lambda h: event(_runge_kutta(slope, state, h)), (h,), (jnp.ones_like(h),))
+        h = jnp.clip(h - event_value / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
     last = _runge_kutta(slope, state, h)
-    return jax.tree.map(partial(jnp.where, met), last, state), met
+    return jax.tree.map(partial(jnp.where, has_event), last, state), has_event
 
 
 def least_lambda_simulated(
@@ -157,13 +161,13 @@ def least_lambda_simulated(
     By bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f); 0 where damping alone is enough, and `inf` where no
     lambda up to 4 sqrt(alpha + f) is.
     """
-    given = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
-    alpha, f_plus, damping, speed = given
+    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
+    alpha, f_plus, damping, speed = arguments
     high = 4.0 * jnp.sqrt(alpha + f_plus)
 
     def shrinks(lambda_: Values) -> Values:
         return half_cycle(lambda_, alpha, f_plus, damping=damping, speed=speed).ratio < 1.0
 
-    low, found = bisect(shrinks, high, _HALVINGS)
-    found = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(found)), 0.0, found), found)
-    return jnp.where(shrinks(high), found, jnp.inf)
+    low, least_lambda = bisect(shrinks, high, _HALVINGS)
+    least_lambda = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(least_lambda)), 0.0, least_lambda), least_lambda)
+    return jnp.where(shrinks(high), least_lambda, jnp.inf)

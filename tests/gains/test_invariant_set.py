@@ -44,22 +44,22 @@ def test_image_holds_whatever_the_adversary_does(system):
     rng = np.random.default_rng(7)
     rows = _Rows(system, 0.3, 60.0 + 6.0 * system.alpha)
     # any symmetric set: upper bounds that need not agree from row to row
-    upper = np.full(2 * rows.half, -np.inf)
+    upper = np.full(2 * rows.half_count, -np.inf)
     middle = rng.uniform(5.0, 80.0, 60)
-    upper[rows.half - 30 : rows.half + 30] = middle
+    upper[rows.half_count - 30 : rows.half_count + 30] = middle
     lower = -upper[::-1]
-    image, bound = rows.image(upper)
+    image, bound = rows.map_set(upper)
     n = 200_000
-    k = rng.integers(rows.half - 30, rows.half + 30, n)
+    k = rng.integers(rows.half_count - 30, rows.half_count + 30, n)
     share = np.where(rng.random(n) < 0.5, rng.integers(0, 2, n), rng.random(n))
     e = lower[k] + share * (upper[k] - lower[k])
-    g = (k - rows.half + np.where(rng.random(n) < 0.3, rng.integers(0, 2, n), rng.random(n))) * rows.dg
+    g = (k - rows.half_count + np.where(rng.random(n) < 0.3, rng.integers(0, 2, n), rng.random(n))) * rows.dg
     noise = system.noise * np.where(rng.random(n) < 0.5, np.sign(rng.normal(size=n)), rng.uniform(-1.0, 1.0, n))
     mean, moment = drawn_pushes(rng, n)
     e, g, error = stepped(system, e, g, noise, mean, moment, system.push * np.sign(rng.normal(size=n)))
     assert error.max() <= bound * (1.0 + 1e-12)
     # ends of rows belong to both
-    row = np.floor(g / rows.dg).astype(int) + rows.half
+    row = np.floor(g / rows.dg).astype(int) + rows.half_count
     on_end = np.abs(g / rows.dg - np.round(g / rows.dg)) < 1e-9
     inside = np.zeros(n, bool)
     for other in (row, row - 1, row + 1):
@@ -73,13 +73,13 @@ def test_rounding_errors_of_large_numbers_stay_inside():
     system, rng = ErrorSystem(False, 2.0, 4.0, 20.0), np.random.default_rng(5)
     rows = _Rows(system, 0.25, 400.0)
     assert rows.dg == 0.25
-    upper = np.full(2 * rows.half, -np.inf)
-    k = np.arange(rows.half - 1500, rows.half + 1500)
+    upper = np.full(2 * rows.half_count, -np.inf)
+    k = np.arange(rows.half_count - 1500, rows.half_count + 1500)
     upper[k] = rng.uniform(0.5e14, 1.5e14, len(k)).round() * rows.lattice
-    image = rows.image(upper)[0]
+    image = rows.map_set(upper)[0]
     for row in k:
         # from the upper end of the row, by the least noise and the largest acceleration: u = a
-        e, g = Decimal(upper[row]), Decimal(float(row - rows.half + 1) * rows.dg)
+        e, g = Decimal(upper[row]), Decimal(float(row - rows.half_count + 1) * rows.dg)
         exact = e - 2 * (e - 20).sqrt() + g + Decimal("0.5")
         assert Decimal(image[row - rows.alpha + rows.push]) >= exact
 
@@ -156,10 +156,10 @@ def test_gains_that_do_not_converge_have_no_set(implicit):
 def test_sets_of_one_height_cover_those_of_another():
     system, rng = SYSTEMS[1], np.random.default_rng(3)
     coarse, fine = _Rows(system, 0.5, 40.0), _Rows(system, 0.07, 40.0)
-    upper = np.full(2 * coarse.half, -np.inf)
-    upper[coarse.half - 20 : coarse.half + 20] = rng.uniform(1.0, 9.0, 40)
-    covered = fine.cover(coarse, upper)
+    upper = np.full(2 * coarse.half_count, -np.inf)
+    upper[coarse.half_count - 20 : coarse.half_count + 20] = rng.uniform(1.0, 9.0, 40)
+    covered = fine.cover_set(coarse, upper)
     g = rng.uniform(-19.9, 19.9, 10_000) * coarse.dg
-    at = [np.floor(g / rows.dg).astype(int) + rows.half for rows in (coarse, fine)]
+    at = [np.floor(g / rows.dg).astype(int) + rows.half_count for rows in (coarse, fine)]
     assert (covered[at[1]] >= upper[at[0]]).all()
     assert covered.max() <= upper.max() + fine.lattice * (1.0 + 1e-6)

@@ -10,7 +10,7 @@ from small_study import listed, rigid, small
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.gains.observer_choice import Side, not_told_apart, ranked, runs_are_equal
+from jaxbl.gains.observer_choice import SideSearch, list_ties, rank_kinds, runs_are_equal
 from jaxbl.gains.tune import tune
 from jaxbl.report.observer_choice import observer_toml
 from jaxbl.sweeps.sweep import sweep
@@ -36,7 +36,7 @@ def test_ratios_have_the_interval_of_a_paired_test():
     rng = np.random.default_rng(0)
     common = rng.uniform(1.0, 5.0, 10)
     errors = {"a": 2.0 * common * np.exp(0.1 * rng.standard_normal(10)), "b": common, "c": np.full(10, np.inf)}
-    found = ranked(errors)
+    found = rank_kinds(errors)
     assert list(found) == ["b", "a", "c"]
     expected = stats.ttest_rel(np.log(errors["a"]), np.log(errors["b"])).confidence_interval()
     np.testing.assert_allclose((found["a"]["low"], found["a"]["high"]), np.exp(expected))
@@ -44,16 +44,16 @@ def test_ratios_have_the_interval_of_a_paired_test():
     assert (found["b"]["error"], found["b"]["worst"]) == (pytest.approx(stats.gmean(common)), common.max())
     assert [found["b"][key] for key in ("ratio", "low", "high")] == [1.0] * 3
     assert set(found["c"].values()) == {None}
-    assert not_told_apart(found) == []
+    assert list_ties(found) == []
 
 
 def test_equal_runs_have_no_interval():
     errors = {kind: np.full(8, 0.1 + 1e-6 * i) for i, kind in enumerate("ab")}
-    found = ranked(errors)
-    assert not_told_apart(found) == []
+    found = rank_kinds(errors)
+    assert list_ties(found) == []
     assert all(map(runs_are_equal, found.values()))
     errors["b"][3] *= 1.01
-    assert not runs_are_equal(ranked(errors)["b"])
+    assert not runs_are_equal(rank_kinds(errors)["b"])
 
 
 def test_kinds_that_noise_alone_parts_are_not_told_apart():
@@ -63,7 +63,7 @@ def test_kinds_that_noise_alone_parts_are_not_told_apart():
     told = 0
     for _ in range(400):
         errors = {kind: np.exp(0.2 * rng.standard_normal(8)) for kind in "ab"}
-        told += not not_told_apart(ranked(errors))
+        told += not list_ties(rank_kinds(errors))
     assert told / 400 == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 400))
 
 
@@ -166,20 +166,20 @@ def test_what_is_too_slow_is_not_chosen():
 
 
 def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
-    side = Side({"a": (1.0, 100.0), "b": (2.0, 2.0)}, {"a": (1.0, 100.0), "b": (2.0, 2.0)}, {})
-    tried = side.trials(np.array([[0.0], [0.5], [1.0]]))
+    side = SideSearch({"a": (1.0, 100.0), "b": (2.0, 2.0)}, {"a": (1.0, 100.0), "b": (2.0, 2.0)}, {})
+    tried = side.trial_gains(np.array([[0.0], [0.5], [1.0]]))
     np.testing.assert_allclose(tried["a"], [1.0, 10.0, 100.0])
     assert set(tried["b"]) == {2.0}
-    side.take(tried, np.array([1.0, 2.0, 3.0]))
-    assert (side.best, side.error, side.ends()) == ({"a": 1.0, "b": 2.0}, 1.0, ["a"])
+    side.zoom_in(tried, np.array([1.0, 2.0, 3.0]))
+    assert (side.best, side.error, side.gains_at_ends()) == ({"a": 1.0, "b": 2.0}, 1.0, ["a"])
     low, high = side.window["a"]
     assert (low, high) == (1.0, pytest.approx(100.0 ** (1.0 / 3.0)))
     # trials that are worse change nothing but the window
-    side.take(side.trials(np.array([[0.5]])), np.array([5.0]))
-    assert (side.best["a"], side.before) == (1.0, 1.0)
+    side.zoom_in(side.trial_gains(np.array([[0.5]])), np.array([5.0]))
+    assert (side.best["a"], side.error_before) == (1.0, 1.0)
     # a kind that diverges everywhere has no best
-    lost = Side({"a": (1.0, 100.0)}, {"a": (1.0, 100.0)}, {})
-    lost.take(lost.trials(np.array([[0.5]])), np.array([np.inf]))
+    lost = SideSearch({"a": (1.0, 100.0)}, {"a": (1.0, 100.0)}, {})
+    lost.zoom_in(lost.trial_gains(np.array([[0.5]])), np.array([np.inf]))
     assert (lost.best, lost.window["a"]) == ({}, (1.0, 100.0))
 
 

@@ -91,7 +91,7 @@ def test_the_law_ends_after_a_finite_time():
     end = np.log1p(0.1 * 0.5 / rate) / 0.5
     assert TIMES[np.argmax(law == 0.0)] == pytest.approx(end, abs=0.01)
     found = simulate_error(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, velocity_error=0.1)
-    assert found.gone == pytest.approx(end, rel=0.01)
+    assert found.end_time == pytest.approx(end, rel=0.01)
 
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.3, 0.0), (0.05, 1.0), (2.5, 0.0)])
