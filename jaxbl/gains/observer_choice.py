@@ -1,8 +1,8 @@
-"""Which kind of observer suits a drive best, and by how much: `jaxbl tune` with `tune.observers`.
+"""The choice of the kind of observer for a drive: `jaxbl tune` with `tune.observers`.
 
-Each kind is tuned by the same search on the same runs: quasi-random gains over the range that its class gives, then over
-zooms about the best of them, each side by its own error. The tuned observers are then compared on held-out runs, pair by
-pair under the same noise. With `tune.axes` that is done at each point of a grid.
+Each kind is tuned by the same search on the same runs: quasi-random gains over the range of its class, then over zooms
+around the best ones. Each side is searched by its own error. The tuned observers are then compared on held-out runs under the
+same noise. With `tune.axes` this is done at each point of a grid.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -26,17 +26,17 @@ from .pilot import Scenarios, list_scenarios, run_pilot
 from .stages import Stages
 
 TIME_CONSTANT = "equivalent_control.time_constant"
-"""Searched with the gains where the torque is the objective: its estimate is behind this low-pass."""
+"""Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
 _LEAST_HELD_OUT_SEEDS = 8
-"""Held-out seeds: an interval from fewer is wide."""
+"""Least number of held-out seeds: fewer give a wide interval."""
 _CONFIDENCE = 0.95
 _UNFINISHED_SHARE = 0.02
-"""Relative gain of the last zoom beyond which a search had better go on."""
+"""Relative gain of the last zoom beyond which a search is reported as unfinished."""
 _ROUNDING_RMS = 1.0 / math.sqrt(12.0)
 """Rms error of rounding to a resolution of one."""
 
 GainValues = dict[str, float]
-"""Of gains by config path."""
+"""Values of gains by config path."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ObserverChoice:
         config: the study.
         summary: plain data, as in `tuning.json`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
-        scanned: what the fused loop did not know of runs that this call scanned in its place.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
 
     config: Config
@@ -57,7 +57,7 @@ class ObserverChoice:
 
 
 class MapPoint(NamedTuple):
-    """A point of the map: its values by path, the drives to serve there, and what the pilot run finds of each side."""
+    """A point of the map: its values by path, its scenarios, and the results of its pilot run by side."""
 
     values: dict[str, Any]
     scenarios: Scenarios
@@ -65,7 +65,7 @@ class MapPoint(NamedTuple):
 
 
 class PointGroup(NamedTuple):
-    """Points that share what is fixed at compile time, under a config that has it, and their values of other paths."""
+    """Points with the same structure: a config that has it, the points, and their other values by path."""
 
     config: Config
     points: list[MapPoint]
@@ -79,8 +79,9 @@ class SideSearch:
     Attributes:
         limits: ends of the range of each gain, by config path.
         window: the part of it that is searched next.
-        best: gains with the least error so far, and that error.
-        before: the error before the last zoom.
+        best: gains with the least error so far.
+        error: the least error so far.
+        error_before: the error before the last zoom.
     """
 
     limits: dict[str, tuple[float, float]]
@@ -90,7 +91,7 @@ class SideSearch:
     error_before: float = math.inf
 
     def trial_gains(self, unit: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of each gain at points `(trials, free gains)` of the unit cube."""
+        """Return the values of each gain at points of the unit cube, shape (trials, free gains)."""
         gains, column = {}, 0
         for path, (low, high) in self.window.items():
             if low == high:
@@ -101,7 +102,7 @@ class SideSearch:
         return gains
 
     def zoom_in(self, trials: dict[str, np.ndarray], errors: np.ndarray) -> None:
-        """Keep the best of some trials, and zoom in on it: two cells wide, if trials filled the window as a grid."""
+        """Store the best of the trials, and zoom in on it: to two cells of a grid with as many points."""
         self.error_before, best_trial = self.error, int(np.argmin(errors))
         if errors[best_trial] < self.error:
             self.error, self.best = (
@@ -117,7 +118,7 @@ class SideSearch:
             self.window[path] = max(self.best[path] / cell, least), min(self.best[path] * cell, largest)
 
     def gains_at_ends(self) -> list[str]:
-        """Gains whose best value is at an end of their range."""
+        """Return the gains whose best value is at an end of their range."""
         return [
             path for path, (low, high) in self.limits.items()
             if low < high and min(self.best[path] / low, high / self.best[path]) < (high / low) ** 0.01
@@ -149,11 +150,14 @@ class _KindSearch:
         stages.total_lanes = runs * (table.trial_gains * (1 + table.refine) * self.seeds + self.held_out_seeds)
 
     def _side_sets(self) -> list[tuple[str, ...]]:
-        """Sides that are searched in the same runs: they share no gain but the low-pass on the equivalent control."""
+        """Return the sets of sides that are searched in the same runs.
+
+        Sides share no gain except the time constant of the low-pass on the equivalent control.
+        """
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
     def _merge_gains(self, sides: Mapping[str, Mapping[str, Any]], side_set: tuple[str, ...]) -> dict[str, Any]:
-        """Gains of both sides in one run; what they share is as the sides say that the run is for."""
+        """Merge the gains of both sides for one run. A shared gain is taken from the sides that the run is for."""
         return {path: value for side in reversed((*side_set, *self.sides)) for path, value in sides[side].items()}
 
     def tune(self, kind: str) -> None:
@@ -180,8 +184,10 @@ class _KindSearch:
                             sides[side].zoom_in(trial[side], trial_errors)
 
     def held_out_errors(self, kind: str) -> list[list[dict[str, np.ndarray]]]:
-        """Errors of the tuned observers of a kind by side, for each group and point, shape (held-out seeds,); the worst over
-        scenarios."""
+        """Return the held-out errors of a tuned kind by side, for each group and point, shape (held-out seeds,).
+
+        They are the worst over the scenarios.
+        """
         errors_by_group = []
         for number, group in enumerate(self.groups):
             errors_by_point: list[dict[str, np.ndarray]] = [{} for _ in group.points]
@@ -200,7 +206,7 @@ class _KindSearch:
         return errors_by_group
 
     def _start_searches(self, kind: str, point: MapPoint, config: Config) -> dict[str, SideSearch]:
-        """Ranges of a kind's gains at a point."""
+        """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
         config_there, searches = with_values(config, point.values), {}
         for side in self.sides:
             bound = point.pilot[side]["f_plus"]
@@ -226,8 +232,10 @@ class _KindSearch:
         *,
         held_out: bool = False,
     ) -> dict[str, np.ndarray]:
-        """Errors of some sides of runs with some gains, each at a point of a group, shape (rows, seeds): the worst over
-        scenarios, infinite where a run diverged or took too long to converge."""
+        """Run trials (`rows`: index of the point in its group, gains), and return errors by side, shape (rows, seeds).
+
+        They are the worst over the scenarios, and infinite if a run diverged or took too long to converge.
+        """
         columns: dict[str, list[float]] = {}
         for i, gains in rows:
             point = group.points[i]
@@ -273,20 +281,20 @@ class _KindSearch:
 
 
 def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """Table of a kind of observer; the first trial's gains stand for those that the study's own lack."""
+    """Return the `[observer]` table of a kind, with the first trial's gains."""
     data: dict[str, Any] = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)} | {
         "kind": kind
     }
     for path, values in columns.items():
-        section, _, rest = path.partition(".")
+        section, _, side_key = path.partition(".")
         if section == "observer":
-            side, key = rest.split(".")
+            side, key = side_key.split(".")
             data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = values[0]
     return data
 
 
 def _draw_quasi_random(free: int, count: int, stage: int) -> np.ndarray:
-    """Points `(count, free)` of the unit cube; other ones in each stage."""
+    """Draw points of the unit cube, shape (count, free); each stage has different ones."""
     power = math.ceil(math.log2(count))
     from scipy.stats import qmc  # slow to load, as below
 
@@ -294,7 +302,7 @@ def _draw_quasi_random(free: int, count: int, stage: int) -> np.ndarray:
 
 
 def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[PointGroup]:
-    """Points of the map, with pilot runs where the plant differs."""
+    """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
     stored_pilots: dict[str, Any] = dict(stages.manifest.get("pilots", {}))
@@ -320,15 +328,15 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
 
 
 def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Kinds by their error, least first: how many times the best one's, with an interval.
+    """Rank kinds by their error, least first, with the ratio to the best kind's error.
 
     Args:
-        errors: by kind, shape (runs,), the same runs of all: positive, or infinite.
+        errors: errors by kind, shape (runs,), from the same runs; positive or infinite.
 
     Returns:
-        by kind: `error` (geometric mean over the runs), `worst`, and of the ratios to the best kind's error in the same
-        run the geometric mean `ratio` with its 95 % interval `low` ... `high` (Student's t on their logarithms); None where
-        a run is infinite.
+        By kind: `error` (geometric mean over the runs), `worst`, and `ratio`, the geometric mean of the ratios to the best
+        kind's error in the same run, with its 95 % interval `low` ... `high` (Student's t on the logarithms). All are None
+        for a kind with an infinite error.
     """
     logs = {
         kind: np.log(np.maximum(kind_errors, np.finfo(float).tiny))
@@ -359,17 +367,17 @@ def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
 
 
 def list_ties(ranking: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Kinds whose error may be as small as the best one's (:func:`ranked`), without the best."""
+    """List the kinds whose error may be as small as the best one's (:func:`rank_kinds`), without the best."""
     return [kind for kind, rank in list(ranking.items())[1:] if rank["low"] is not None and rank["low"] <= 1.0]
 
 
 def runs_are_equal(rank: Mapping[str, Any]) -> bool:
-    """Whether a kind's ratio (:func:`ranked`) is the same in all runs, but for rounding: no noise, and no interval."""
+    """True if a kind's ratio (:func:`rank_kinds`) is the same in all runs, but for rounding: there is no interval then."""
     return rank["high"] - rank["low"] < 1e-9 * rank["ratio"]
 
 
 def _summary(search: _KindSearch, held_out: Mapping[str, list[list[dict[str, np.ndarray]]]]) -> dict[str, Any]:
-    """What `tuning.json` holds."""
+    """Return the content of `tuning.json`."""
     config, table, points = search.config, search.table, []
     none = np.full(search.held_out_seeds, np.inf)
     for number, group in enumerate(search.groups):
@@ -410,7 +418,7 @@ def _summary(search: _KindSearch, held_out: Mapping[str, list[list[dict[str, np.
 
 
 def _describe_search(side: SideSearch, name: str) -> dict[str, Any]:
-    """Chosen gains of a kind by key, its error in the search, and what a reader should know of that."""
+    """Describe the search of a kind: its gains by key, its error, the gain by the last zoom, and gains at range ends."""
     gains = {path.removeprefix(f"observer.{name}."): value for path, value in side.best.items()}
     last = (
         (side.error_before - side.error) / side.error_before
@@ -426,7 +434,7 @@ def _describe_search(side: SideSearch, name: str) -> dict[str, Any]:
 
 
 def _for_both_sides(sides: Mapping[str, Any], observers: Sequence[str]) -> str | None:
-    """The kind with the least product of errors: a study has one kind for both sides."""
+    """Return the kind with the least product of errors, as a study has one kind for both sides."""
     total = {
         kind: sum(math.log(summary["kinds"][kind]["ratio"]) for summary in sides.values())
         for kind in observers
@@ -462,19 +470,16 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
                 if (rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
                     count, most = unfinished.get(kind, (0, 0.0))
                     unfinished[kind] = count + 1, max(most, rank["gained_by_last_zoom"])
-        of_points = f"of {len(points)} points" if len(points) > 1 else ""
+        share = f"of {len(points)} points" if len(points) > 1 else ""
         if ends:
-            gain_list = ", ".join(
-                f"{kind}.{key}{f' ({n} {of_points})' if of_points else ''}" for (kind, key), n in ends.items()
-            )
-            lines.append(f"{side}: best values at an end of the range searched: {gain_list}. Beyond it may be better ones.")
+            gains = ", ".join(f"{kind}.{key}{f' ({n} {share})' if share else ''}" for (kind, key), n in ends.items())
+            lines.append(f"{side}: best values at an end of the range searched: {gains}. Beyond it may be better ones.")
         if unfinished:
-            gain_list = ", ".join(
-                f"{kind} ({f'{n} {of_points}, ' if of_points else ''}{100 * most:.2g} %)"
-                for kind, (n, most) in unfinished.items()
+            kind_list = ", ".join(
+                f"{kind} ({f'{n} {share}, ' if share else ''}{100 * most:.2g} %)" for kind, (n, most) in unfinished.items()
             )
             lines.append(
-                f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED_SHARE:g} %: {gain_list}. More "
-                "tune.refine or tune.trials may help these kinds."
+                f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED_SHARE:g} %: {kind_list}. "
+                "More tune.refine or tune.trials may help these kinds."
             )
     return lines

@@ -114,7 +114,9 @@ def _update_extremes(
 _EXTREMES = Reducer(
     lambda experiment: {side: _Extremes(*[jnp.zeros_like(experiment.run.sample_period)] * 4) for side in experiment.sides},
     _update_extremes,
-    lambda experiment, totals, state: {f"{s}.{n}": v for s, seen in totals.items() for n, v in seen._asdict().items()},
+    lambda experiment, totals, state: {
+        f"{side}.{n}": v for side, extremes in totals.items() for n, v in extremes._asdict().items()
+    },
 )
 
 

@@ -62,7 +62,7 @@ class Summary:
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "gains": {side: {key: float(self.best_candidates[side][key]) for key in keys} for side in sides},
-            "achieved": {side: self._achieved(side) for side in sides},
+            "achieved": {side: self._achieved_metrics(side) for side in sides},
             "limits": self.limits,
             "conditions": self.conditions,
             "range": _ratio_ranges(search.limits) | {"num": table.num},
@@ -81,7 +81,7 @@ class Summary:
             "remarks": [*self.config.notes, *self._remarks()],
         }
 
-    def _achieved(self, side: str) -> dict[str, Any]:
+    def _achieved_metrics(self, side: str) -> dict[str, Any]:
         names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
         return to_jsonable({name: self.best_candidates[side][name] for name in names} | {"peak_ratio": rho})
 

@@ -281,8 +281,8 @@ def _find_cycle(
     circular = 2.0 * np.pi * frequency
     unit = alpha / circular
 
-    def cycle_residual(at: np.ndarray) -> np.ndarray:
-        peak, phase = at[0] * unit, at[1]
+    def cycle_residual(unknowns: np.ndarray) -> np.ndarray:
+        peak, phase = unknowns[0] * unit, unknowns[1]
         if peak <= 0.0:
             return np.array([1.0, 1.0])
         x2, time, _, _ = _half_cycle(

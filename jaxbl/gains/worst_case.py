@@ -113,8 +113,8 @@ def half_cycle(
 
 
 def _runge_kutta(slope: Callable[[_State], _State], s: _State, h: Values) -> _State:
-    def shift_state(by: Values, k: _State) -> _State:
-        return jax.tree.map(lambda x, d: x + by * d, s, k)
+    def shift_state(step: Values, k: _State) -> _State:
+        return jax.tree.map(lambda x, d: x + step * d, s, k)
 
     k1 = slope(s)
     k2 = slope(shift_state(0.5 * h, k1))

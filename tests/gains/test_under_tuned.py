@@ -186,7 +186,7 @@ def test_least_frequency_of_a_cycle():
 def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
     """Below it errors of any size and phase go to zero; above it not."""
     # a hundredth is small enough: the many half cycles of smaller errors would take long
-    monkeypatch.setattr("jaxbl.gains.under_tuned._REST", 0.01)
+    monkeypatch.setattr("jaxbl.gains.under_tuned._ZERO_RATIO", 0.01)
     least = least_cycle_frequency_simulated(0.005, alpha, 1.0, 3.0)
     assert least / least_cycle_frequency(0.005, alpha, 1.0, 3.0) == pytest.approx(ratio, rel=0.01)
     ends = []
