@@ -1,8 +1,8 @@
 """The choice of the kind of observer for a drive: `jaxbl tune` with `tune.observers`.
 
 Each kind is tuned by the same search on the same runs: quasi-random gains over the range of its class, then over zooms
-around the best ones. Each side is searched by its own error. The tuned observers are then compared on held-out runs under the
-same noise. With `tune.axes` this is done at each point of a grid.
+around the best ones. Each side is searched by its own error. The tuned observers are then compared on held-out runs under
+the same noise. With `tune.axes` this is done at each point of a grid.
 """
 
 # pandas' own annotations are wider than what its methods return
