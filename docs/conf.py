@@ -1,5 +1,7 @@
 """How Sphinx makes the site (`make docs`): from the tree's root, of the pages as they are read there."""
 
+import hashlib
+import os
 import re
 import sys
 from importlib.metadata import version as version_of
@@ -9,6 +11,9 @@ from sphinx.util import logging
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
+# cells of tutorials call `jaxbl`; what they compile is kept as for the tests
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(HERE.parent / ".cache" / "jax" / sys.implementation.cache_tag))
 
 project = "jaxbl"
 author = "the jaxbl authors"
@@ -21,11 +26,16 @@ include_patterns = [
     "CONTRIBUTING.md",
     "benchmarks/NOTES.md",
     "docs/*.md",
-    "docs/notebooks/*.ipynb",
 ]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
-# notebooks are kept without outputs, and run where their page is read
+# tutorials run where their page is read
+TUTORIALS = {"docs/tutorial": "axis.toml", "docs/log_tutorial": ""}
+nb_custom_formats = {
+    f"/{page}.md": ["page_notebook.read_page", {"name": Path(page).name, "study": study}]
+    for page, study in TUTORIALS.items()
+}
+nb_output_stderr = "remove"  # progress
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
@@ -50,23 +60,35 @@ html_show_copyright = False
 def read_docstring(app, what, name, it, options, lines):
     """Docstrings write sizes as |x|, which reStructuredText takes for a name, but in `code`."""
     for i, line in enumerate(lines):
-        lines[i] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+        lines[i] = re.sub(r"(`[^`]*`)|\|", lambda match: match[1] or r"\|", line)
     if what in ("attribute", "data", "property"):
         # napoleon takes what stands before a colon in the first line for a type: here, an empty comment
         lines[:0] = ["..", ""]
 
 
-def own_files(app, error):
+def list_outdated_tutorials(app, env, added, changed, removed):
+    """Run the tutorials anew once the package has changed."""
+    from study_directive import read_package
+
+    package = hashlib.sha256(read_package()).hexdigest()
+    outdated = getattr(env, "tutorials_package", None) != package
+    env.tutorials_package = package
+    return list(TUTORIALS) if outdated else []
+
+
+def warn_of_foreign_files(app, error):
     """Warn of pages that load something from another host."""
     loads = re.compile(
         r"""<(?:script|img|iframe|link)\b[^>]*?(?:src|href)=["']?(?:https?:)?//[^>]*>|@import|url\(["']?https?:"""
     )
-    for file in [] if error else (one for kind in ("html", "css") for one in Path(app.outdir).rglob(f"*.{kind}")):
-        if found := loads.search(file.read_text(encoding="utf-8")):
-            logging.getLogger(__name__).warning(f"{file}: loads from another host: {found[0]}")
+    pages = [] if error else [file for kind in ("html", "css") for file in Path(app.outdir).rglob(f"*.{kind}")]
+    for file in pages:
+        if match := loads.search(file.read_text(encoding="utf-8")):
+            logging.getLogger(__name__).warning(f"{file}: loads from another host: {match[0]}")
 
 
 def setup(app):
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", read_docstring, priority=400)  # before napoleon
-    app.connect("build-finished", own_files)
+    app.connect("env-get-outdated", list_outdated_tutorials)
+    app.connect("build-finished", warn_of_foreign_files)

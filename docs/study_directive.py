@@ -24,19 +24,19 @@ ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "gallery"
 
 
-def package() -> bytes:
-    """The source of the package."""
+def read_package() -> bytes:
+    """Return the source of the package."""
     return b"".join(file.read_bytes() for file in sorted((ROOT / "jaxbl").rglob("*.py")))
 
 
-def drawn(name: str, command: str, text: str) -> list[Path]:
-    """Figures of a study's report, drawn now if they are not there.
+def draw_study(name: str, command: str, text: str) -> list[Path]:
+    """Return figures of a study's report, and draw them if they are not there.
 
     Raises:
         RuntimeError: the command failed.
     """
     out, study, known = CACHE / name, CACHE / f"{name}.toml", CACHE / f"{name}.txt"
-    state = hashlib.sha256(package() + text.encode() + command.encode()).hexdigest()
+    state = hashlib.sha256(read_package() + text.encode() + command.encode()).hexdigest()
     if not known.exists() or known.read_text(encoding="utf-8") != state:
         CACHE.mkdir(parents=True, exist_ok=True)
         study.write_text(text, encoding="utf-8")
@@ -60,7 +60,7 @@ class Study(SphinxDirective):
         self.env.note_reread()  # figures follow from the package, too
         name, command, text = self.arguments[0], self.options["command"], "\n".join(self.content) + "\n"
         try:
-            files = drawn(name, command, text)
+            files = draw_study(name, command, text)
         except RuntimeError as error:
             return [self.state.document.reporter.warning(str(error), line=self.lineno)]
         wanted = self.options.get("figures", "").split() or [file.stem for file in files]

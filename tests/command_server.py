@@ -10,6 +10,7 @@ import functools
 import gc
 import importlib
 import json
+import multiprocessing.process
 import os
 import runpy
 import select
@@ -137,7 +138,8 @@ def _server():
         assert (ready, errors.read().decode()) == (_READY, "")
 
     def end():
-        own.close()
+        # forks of this process may hold the connection, too
+        own.shutdown(socket.SHUT_RDWR)
         process.wait()
 
     atexit.register(end)
@@ -202,6 +204,8 @@ def _load():
 def _execute(arguments, cwd, environment):
     """Become what `python` would be with these arguments."""
     os.chdir(cwd)
+    # a process that this one spawns searches modules there
+    multiprocessing.process.ORIGINAL_DIR = cwd
     os.environ.clear()
     os.environ.update(environment)
     sys.stdout.reconfigure(write_through=bool(environment.get("PYTHONUNBUFFERED")))

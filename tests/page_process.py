@@ -1,6 +1,7 @@
 """Blocks of a page, one after the other in this process: what a reader's commands import and compile is done once for all.
 
-Reads `[[language, text], ...]` as JSON, and writes what each printed, a list; of language "output", what the last one did.
+Reads a JSON file of `[[language, text], ...]`, and writes what each block printed, a list; of language "output", what the
+last one did.
 """
 
 import contextlib
@@ -13,7 +14,7 @@ import sys
 from pathlib import Path
 
 
-def command(words):
+def run_command(words):
     """A command line of `jaxbl`; an error ends the process as it ends the command."""
     from jaxbl.__main__ import program
 
@@ -25,30 +26,31 @@ def command(words):
             raise
 
 
-def block(language, text):
-    """What a block prints; one of a file's name is appended to it."""
+def run_block(language, text):
+    """Run a block and return what it prints; a block whose language is a file's name is appended to that file."""
     lines = [shlex.split(line, comments=True) for line in text.splitlines()]
-    with contextlib.redirect_stdout(io.StringIO()) as said:
+    with contextlib.redirect_stdout(io.StringIO()) as output:
         if language == "python":
             exec(compile(text, "page", "exec"), {"__name__": "__main__"})
         elif language == "sh" and all(words[:1] in ([], ["jaxbl"]) for words in lines):
             for words in filter(None, lines):
-                command(words)
+                run_command(words)
         elif language == "sh":
             print(subprocess.run(["sh", "-e", "-c", text], stdout=subprocess.PIPE, text=True, check=True).stdout)
         else:
             with Path(language).open("a", encoding="utf-8") as file:
                 file.write(text)
-    return said.getvalue()
+    return output.getvalue()
 
 
 if __name__ == "__main__":
     # what a process that this one starts prints is seen on stderr
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
+    blocks = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     # modules are found as by `python -c`
     sys.path[0] = ""
-    said = [""]
-    for language, text in json.load(sys.stdin):
-        said.append(said[-1] if language == "output" else block(language, text))
-    json.dump(said[1:], answer)
+    printed = [""]
+    for language, text in blocks:
+        printed.append(printed[-1] if language == "output" else run_block(language, text))
+    json.dump(printed[1:], answer)

@@ -6,14 +6,14 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
+from command_server import run_python
+from markdown_blocks import blocks_of, without_numbers
 from progress_lines import without_progress
 from test_public import FLOORS
 from typer.main import get_command
@@ -69,7 +69,7 @@ def test_api_has_every_public_name():
 def test_every_page_is_in_the_site():
     index = ROOT / "docs" / "index.md"
     listed = re.findall(r"^(?:\w+ <)?([\w./]+)>?$", index.read_text(encoding="utf-8"), re.M)
-    pages = {page.resolve().with_suffix("") for page in [*TEXTS, *ROOT.glob("docs/notebooks/*.ipynb")]}
+    pages = {page.resolve().with_suffix("") for page in TEXTS}
     assert {(index.parent / page).resolve() for page in listed} == pages - {index.with_suffix("")}
 
 
@@ -186,26 +186,18 @@ INSTEAD = {
 }
 
 
+SHORTER = (("gain_map.toml", 20.0, 4.0), ("geared_axis.toml", 10.0, 4.0))
+"""Studies that pages run, their duration and a shorter one (s)."""
+
 EXTRAS = {"cluster.md": "distributed", "fmu.md": "fmu", "mujoco.md": "mujoco"}
 """What pages say that it has to be installed."""
 
 
-class Block(NamedTuple):
-    """A fenced block of a page: its language and its text."""
-
-    language: str
-    text: str
-
-
-def blocks_of(page):
-    return [Block(*found) for found in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)]
-
-
-# CONTRIBUTING.md's commands run tests
+# CONTRIBUTING.md's commands run tests; the site runs the tutorials (tests/test_site.py)
 PAGES = [
     page
     for page in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))
-    if any(block.language in ("sh", "python") for block in blocks_of(page))
+    if not page.stem.endswith("tutorial") and any(block.language in ("sh", "python") for block in blocks_of(page))
 ]
 
 
@@ -217,9 +209,13 @@ def imports_of(requirement):
 HIDING = """import sys
 class Hiding:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {hidden!r}:
+        if name.partition(".")[0] in hidden:
             raise ModuleNotFoundError("No module named '" + name + "'", name=name)
+hidden = {hidden!r}
 sys.meta_path.insert(0, Hiding())
+# processes of the tests begin with modules loaded
+for name in [name for name in sys.modules if name.partition(".")[0] in hidden]:
+    del sys.modules[name]
 """
 
 
@@ -238,7 +234,7 @@ def environment(folder, extra=None):
     # as on the command line, compiled programs are kept; here nothing changes the package while it runs
     programs = str(ROOT / ".cache" / "programs")
     pip = {"TARGET": str(site), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1", "DISABLE_PIP_VERSION_CHECK": "1"}
-    return os.environ | {
+    return {
         "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "JAXBL_PROGRAMS": programs,
         **{f"PIP_{key}": value for key, value in pip.items()},
     }  # fmt: skip
@@ -253,39 +249,33 @@ def test_demo_is_this_command():
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that
-    file; others of TOML in the tutorial make `axis.toml`."""
+    file."""
     env = environment(tmp_path, EXTRAS.get(page.name))
     clone = tmp_path / "clone"
     clone.mkdir()
     shutil.copytree(ROOT / "sweeps", clone / "sweeps")
     shutil.copytree(ROOT / "docs" / "cluster", clone / "docs" / "cluster")
-    if page.name != "README.md":
-        # the demo runs the whole of it
-        demo = clone / "sweeps" / "gain_map.toml"
-        text, count = re.subn(r"^duration = 20.0$", "duration = 6.0", demo.read_text(encoding="utf-8"), flags=re.M)
+    for study, whole, shorter in SHORTER:
+        file = clone / "sweeps" / study
+        text, count = re.subn(
+            rf"^duration = {whole}$", f"duration = {shorter}", file.read_text(encoding="utf-8"), flags=re.M
+        )
         assert count == 1
-        demo.write_text(text, encoding="utf-8")
-    given = []
+        file.write_text(text, encoding="utf-8")
+    blocks = []
     for language, text in blocks_of(page):
         file = re.match(r"# (\w+\.(?:toml|py))\n", text)
         if file is not None:
             language = file[1]
-        elif language == "toml" and page.name == "tutorial.md":
-            language = "axis.toml"
         elif language == "sh":
             for command, other in INSTEAD.items():
                 text = re.sub(rf"^{command}", other, text, flags=re.M)
-        if file or language in ("python", "sh", "output", "axis.toml"):
-            given.append((language, text))
-    process = [sys.executable, str(ROOT / "tests" / "page_process.py")]
-    asked = json.dumps(given)
-    done = subprocess.run(process, cwd=clone, env=env, input=asked, capture_output=True, text=True, check=False)
+        if file or language in ("python", "sh", "output"):
+            blocks.append((language, text))
+    request = tmp_path / "blocks.json"
+    request.write_text(json.dumps(blocks), encoding="utf-8")
+    done = run_python(ROOT / "tests" / "page_process.py", request, cwd=clone, timeout=900.0, **env)
     assert (done.returncode, without_progress(done.stderr)) == (0, ""), done.stderr
-    for (language, text), said in zip(given, json.loads(done.stdout), strict=True):
+    for (language, text), printed in zip(blocks, json.loads(done.stdout), strict=True):
         if language == "output":
-            assert set(without_numbers(text)) <= set(without_numbers(said)), said
-
-
-def without_numbers(text):
-    """Lines of what a command prints; last digits differ from machine to machine."""
-    return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "0", text).splitlines()
+            assert set(without_numbers(text)) <= set(without_numbers(printed)), printed

@@ -76,7 +76,7 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, default_interrupt):
 def test_processes_end_with_the_one_they_work_for(tmp_path):
     code = "import sys, pathlib, test_workers as t; list(t.map_jobs(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
     with Process(["-c", code, str(tmp_path)], Path(__file__).parent, dict(os.environ)) as parent:
-        while not (files := list(tmp_path.iterdir())):
+        while not (files := list(tmp_path.iterdir())) and parent.poll() is None:
             time.sleep(0.05)
         parent.kill()
     child = int(files[0].name)

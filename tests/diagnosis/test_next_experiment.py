@@ -1,5 +1,6 @@
 """What is said of the next experiment, and where none can be written."""
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 from jaxbl.config import read_model
 from jaxbl.diagnosis.next_experiment import Input, _written, check_gap_sought, write_gap_experiment
 from jaxbl.errors import InputError
+from jaxbl.records.reader import Record
 
 DRIVE = {
     "kind": "two_inertia", "motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0,
@@ -39,7 +41,8 @@ def test_a_diagnosis_that_seeks_no_gap_writes_no_experiment(tmp_path):
 @pytest.mark.parametrize(("unit", "said"), [("rad", "N m"), ("m", "N")])
 def test_the_amplitude_said_is_about_the_mean_of_the_file_and_in_its_unit(tmp_path, unit, said):
     channels = {"theta_e": SimpleNamespace(unit=unit)}
-    record = SimpleNamespace(sample_period=1e-2, findings=SimpleNamespace(channels=channels))
+    record = SimpleNamespace(sample_period=1e-2, statistics=SimpleNamespace(channels=channels))
+    record.unit_of = partial(Record.unit_of, record)
     torque = 1.5 + 2.0 * np.sin(2.0 * np.pi * 1e-2 * np.arange(100))
     path = tmp_path / "next.csv"
     line = _written(Input("sine", 2.0, 1.0, torque, 20.0, 1.5), record, path)  # type: ignore[arg-type]

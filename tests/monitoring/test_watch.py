@@ -162,7 +162,7 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
             side: SimpleNamespace(numbers={"half_gap": Number(gap, 1e-3 + i * 1e-4), "stiffness": Number(60.0, 1.0)})
             for i, (side, gap) in enumerate((("motor", motor), ("load", load)))
         }
-        values = watcher._judged(found)
+        values = watcher._judge_gap(found)
         assert (values["alarm"], values["contradiction"], values["side"]) == (alarm, contrary, "motor")
         assert values["half_gap"] == motor
 
