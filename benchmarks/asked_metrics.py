@@ -1,4 +1,4 @@
-"""What a study gains that asks for `converged` alone: `sweeps/gain_map.toml`, time and bytes a point.
+"""Savings of a study that requests `converged` alone: `sweeps/gain_map.toml`, time and bytes a point.
 
     python benchmarks/asked_metrics.py [--study sweeps/gain_map.toml] [--metrics converged] [--lanes 12288] [--rounds 5]
 
@@ -33,14 +33,17 @@ def main() -> None:
     parser.add_argument("--metrics", nargs="+", default=["converged"])
     parser.add_argument("--lanes", type=int, default=12_288)
     parser.add_argument("--rounds", type=int, default=5)
-    given = parser.parse_args()
-    config = read_config(given.study)
-    names = tuple(sorted(given.metrics))
-    seconds(config, names, given.lanes, given.rounds)
+    args = parser.parse_args()
+    config = read_config(args.study)
+    names = tuple(sorted(args.metrics))
+    seconds(config, names, args.lanes, args.rounds)
     strict = config.run.model_copy(update={"position_tolerance": 1e-12})
-    seconds(config.model_copy(update={"run": strict}), names, given.lanes, given.rounds)
-    for one in (None, given.metrics):
-        print(f"{'all metrics' if one is None else ', '.join(one):36s} {size(config, one):8.1f} bytes a point")
+    seconds(config.model_copy(update={"run": strict}), names, args.lanes, args.rounds)
+    for metric_names in (None, args.metrics):
+        print(
+            f"{'all metrics' if metric_names is None else ', '.join(metric_names):36s} "
+            f"{size(config, metric_names):8.1f} bytes a point"
+        )
 
 
 def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> None:
@@ -55,19 +58,22 @@ def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> 
             f"{', '.join(names)}, none may leave": asked._replace(done=None),
         }
         simulators = {
-            name: HostSimulator(experiment, (one,), tuple(columns), len(chosen), threads) for name, one in reducers.items()
+            name: HostSimulator(experiment, (reducer,), tuple(columns), len(chosen), threads)
+            for name, reducer in reducers.items()
         }
-        found = {name: simulator(columns, 0) for name, simulator in simulators.items()}
-        whole = found["all metrics"]
-        for figures in found.values():
-            assert all(np.array_equal(whole[name], figures[name], equal_nan=True) for name in figures if name != "finite")
+        results = {name: simulator(columns, 0) for name, simulator in simulators.items()}
+        all_results = results["all metrics"]
+        for figures in results.values():
+            assert all(
+                np.array_equal(all_results[name], figures[name], equal_nan=True) for name in figures if name != "finite"
+            )
         best = dict.fromkeys(simulators, np.inf)
         for _ in range(rounds):
             for name, simulator in simulators.items():
                 begun = time.perf_counter()
                 simulator(columns, 0)
                 best[name] = min(best[name], time.perf_counter() - begun)
-    shares = ", ".join(f"{side} {whole[f'{side}.converged'].mean():.2f}" for side in experiment.sides)
+    shares = ", ".join(f"{side} {all_results[f'{side}.converged'].mean():.2f}" for side in experiment.sides)
     print(f"{len(chosen)} lanes of {config.run.steps} samples, {threads} threads; converged: {shares}")
     for name, took in best.items():
         print(
@@ -79,8 +85,8 @@ def size(config: Config, names: list[str] | None) -> float:
     """Bytes a point and seed of the parts that a sweep leaves."""
     swept = config.sweep.model_copy(update={"metrics": names})
     with tempfile.TemporaryDirectory() as folder:
-        found = sweep(config.model_copy(update={"sweep": swept}), Path(folder) / "study")
-        return sum(part.stat().st_size for part in (Path(folder) / "study" / "points").iterdir()) / found.runs
+        result = sweep(config.model_copy(update={"sweep": swept}), Path(folder) / "study")
+        return sum(part.stat().st_size for part in (Path(folder) / "study" / "points").iterdir()) / result.runs
 
 
 if __name__ == "__main__":

@@ -24,14 +24,14 @@ def main() -> None:
         for gains in GAINS:
             for noise in SIZES:
                 begin = time.perf_counter()
-                given = {"noise": noise, "f_plus": 1.0, "period": 1.0, "velocity_error": 100.0}
-                found = certify(*gains, **given, discretisation=form, runs=runs)
-                final, tried = found["final_accuracy"], found["search"]
+                inputs = {"noise": noise, "f_plus": 1.0, "period": 1.0, "velocity_error": 100.0}
+                certificate = certify(*gains, **inputs, discretisation=form, runs=runs)
+                final, search = certificate["final_accuracy"], certificate["search"]
                 cells = [
-                    form, f"{gains[0]:g}, {gains[1]:g}", f"{noise:g}", f"{final:.3g}", f"{tried['worst']:.3g}",
-                    f"{tried['ratio']:.3f}", f"{final / least_worst_error(noise, 1.0, 1.0):.2f}",
-                    f"{found['reaching_time']:.0f}", f"{tried['reaching_time']:.0f}",
-                    f"{found['reaching_time_continuous']:.0f}", str(tried["violations"]),
+                    form, f"{gains[0]:g}, {gains[1]:g}", f"{noise:g}", f"{final:.3g}", f"{search['worst']:.3g}",
+                    f"{search['ratio']:.3f}", f"{final / least_worst_error(noise, 1.0, 1.0):.2f}",
+                    f"{certificate['reaching_time']:.0f}", f"{search['reaching_time']:.0f}",
+                    f"{certificate['reaching_time_continuous']:.0f}", str(search["violations"]),
                     f"{time.perf_counter() - begin:.1f}",
                 ]  # fmt: skip
                 print(f"| {' | '.join(cells)} |", flush=True)

@@ -73,13 +73,13 @@ def each_implicit(n, lipschitz, h):
         z = taylor(n, h) @ z
         b = y - z[0]
 
-        def halved(_, bounds):
+        def halve(_, bounds):
             low, high = bounds
             middle = 0.5 * (low + high)
             above = middle + slope * middle ** (n / (n + 1)) > jnp.abs(b)
             return jnp.where(above, low, middle), jnp.where(above, middle, high)
 
-        low, high = jax.lax.fori_loop(0, 60, halved, (jnp.zeros(()), jnp.abs(b)))
+        low, high = jax.lax.fori_loop(0, 60, halve, (jnp.zeros(()), jnp.abs(b)))
         z = z + h * terms(n, lipschitz, 0.5 * (low + high), jnp.sign(b))
         return z, z
 
@@ -140,15 +140,15 @@ def without_noise(h=0.02):
             unit = h**n * lipschitz
             polynomial = np.polynomial.Polynomial([3.0 * 0.3**i / factorial(i) for i in range(n + 1)])
             first = [polynomial.deriv(i)(t[0]) if i else polynomial(t[0]) for i in range(n + 1)]
-            found = late_velocity(scheme, n, lipschitz, h, polynomial(t), first)
-            bias = np.abs(found - polynomial.deriv()(late)).max() / unit
+            derivative = late_velocity(scheme, n, lipschitz, h, polynomial(t), first)
+            bias = np.abs(derivative - polynomial.deriv()(late)).max() / unit
             first = [w**i * np.sin(w * t[0] + i * np.pi / 2) for i in range(n + 1)]
-            found = late_velocity(scheme, n, lipschitz, h, np.sin(w * t), first)
-            sine = np.abs(found - w * np.cos(w * late)).max() / unit
-            rest = late_velocity(scheme, n, lipschitz, h, 0.0 * t, [1e-3 * (i == 0) for i in range(n + 1)])
+            derivative = late_velocity(scheme, n, lipschitz, h, np.sin(w * t), first)
+            sine = np.abs(derivative - w * np.cos(w * late)).max() / unit
+            resting = late_velocity(scheme, n, lipschitz, h, 0.0 * t, [1e-3 * (i == 0) for i in range(n + 1)])
             # what rounding of readings of this size makes of a velocity
             rounding = 2**n * np.finfo(float).eps * np.abs(polynomial(t)).max() / h / unit
-            yield name, n, bias, sine, np.abs(np.diff(rest)).max() / unit, rounding
+            yield name, n, bias, sine, np.abs(np.diff(resting)).max() / unit, rounding
 
 
 # under noise
@@ -159,20 +159,20 @@ def error(observer, noise_bound, shares):
     d, eta = shares[0], noise_bound * shares[1]
     zero = jnp.zeros(())
 
-    def one(carry, given):
+    def advance(carry, disturbance):
         state, position, velocity = carry
-        push, noise = given
+        push, noise = disturbance
         state, estimate = observer.step(state, position + noise, free, jnp.ones(()))
         miss = estimate.velocity - velocity
         # the acceleration acts from this sample to the next
         return (state, position + velocity + 0.5 * push, velocity + push), miss
 
     start = observer.start(zero, zero, free, jnp.ones(()))
-    return jax.lax.scan(one, (start, zero, zero), (d, eta))[1][-1]
+    return jax.lax.scan(advance, (start, zero, zero), (d, eta))[1][-1]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def simulated(kind, gains, noise, shares):
+def simulate_errors(kind, gains, noise, shares):
     return jnp.abs(error(kind(*gains), noise, shares))
 
 
@@ -187,7 +187,7 @@ NEAR = np.array([-4.0, -1.0, 0.0, 1.0, 4.0])
 """Innovations (T² L) to try beside noises from -N to N: those near zero decide what a switching term does."""
 
 
-def searched(kind, gains, noise, most=1_200_000):
+def search_worst(kind, gains, noise, most=1_200_000):
     """The largest velocity error that the search finds."""
 
     def noises(states):
@@ -202,31 +202,33 @@ def searched(kind, gains, noise, most=1_200_000):
 @functools.cache
 def pairs(noise, samples):
     """Shares of the signals behind the bounds: read as zero throughout, and read as minus itself, a signal without noise."""
-    found = []
+    disturbances = []
     for slope, part in ((1.0, 1.0), (2.0, 0.5)):
-        made = worst_signal(noise, slope, 1.0, samples - 1)
-        d = part * np.append(made.acceleration[::-1], 0.0)
-        found.append(jnp.asarray(np.stack([d, -made.signal[::-1] / max(noise, 1e-300)])))
-    return found
+        signal = worst_signal(noise, slope, 1.0, samples - 1)
+        d = part * np.append(signal.acceleration[::-1], 0.0)
+        disturbances.append(jnp.asarray(np.stack([d, -signal.signal[::-1] / max(noise, 1e-300)])))
+    return disturbances
 
 
 def worst(kind, gains, noise, samples):
     """The largest velocity error found."""
     if kind in (Luenberger, ExtendedState):
         return float(worst_linear(kind, gains, noise, samples))
-    return max(searched(kind, gains, noise), *(float(simulated(kind, gains, noise, x)) for x in pairs(noise, samples)))
+    return max(
+        search_worst(kind, gains, noise), *(float(simulate_errors(kind, gains, noise, x)) for x in pairs(noise, samples))
+    )
 
 
 def chatter(observer):
     """Largest change of the velocity estimate from sample to sample at rest, late, in T L."""
     y = jnp.full(4000, 0.3)
 
-    def one(state, y):
+    def advance(state, y):
         state, estimate = observer.step(state, y, free, jnp.ones(()))
         return state, estimate.velocity
 
     start = observer.start(jnp.asarray(0.1), jnp.asarray(0.2), free, jnp.ones(()))
-    late = np.asarray(jax.lax.scan(one, start, y)[1])[-1000:]
+    late = np.asarray(jax.lax.scan(advance, start, y)[1])[-1000:]
     return float(np.abs(np.diff(late)).max())
 
 
@@ -250,8 +252,8 @@ def under_noise(sizes):
     for name, (kind, choices) in rows.items():
         ratios = []
         for noise in sizes:
-            found, best = min((worst(kind, gains, noise, horizon(noise)), gains) for gains in choices)
-            ratios.append(f"{found / least_worst_error(noise, 1.0, 1.0):.2f}")
+            least_error, best = min((worst(kind, gains, noise, horizon(noise)), gains) for gains in choices)
+            ratios.append(f"{least_error / least_worst_error(noise, 1.0, 1.0):.2f}")
             if len(choices) > 1:
                 ratios[-1] += f" ({', '.join(f'{x:.2g}' for x in best)})"
         yield name, ratios, chatter(kind(*choices[0]))
@@ -261,8 +263,8 @@ def main() -> None:
     print("Without noise, in h^n L: velocity error on a polynomial of degree n (what rounding makes), on a sinusoid with")
     print("the largest (n+1)-th derivative L, and the largest change from sample to sample at rest\n")
     print("| scheme | order | polynomial | sinusoid | at rest |\n|---|---|---|---|---|")
-    for name, n, bias, sine, rest, rounding in without_noise():
-        print(f"| {name} | {n} | {bias:.1e} ({rounding:.0e}) | {sine:.3g} | {rest:.1e} |", flush=True)
+    for name, n, bias, sine, resting, rounding in without_noise():
+        print(f"| {name} | {n} | {bias:.1e} ({rounding:.0e}) | {sine:.3g} | {resting:.1e} |", flush=True)
     sizes = (0.0, 1.0, 10.0, 100.0)
     least = ", ".join(f"{least_worst_error(n, 1.0, 1.0):.4g} T L at N = {n:g} T² L" for n in sizes)
     print(f"\nWorst velocity error found, over the least possible one ({least})\n")
@@ -270,8 +272,8 @@ def main() -> None:
     print("|" + "---|" * (len(sizes) + 2))
     exact = [least_exact_error(n, 1.0, 1.0) / least_worst_error(n, 1.0, 1.0) for n in sizes]
     print(f"| least with the least error without noise (adaptive quotient) | {' | '.join(f'{r:.2f}' for r in exact)} | 0 |")
-    for name, ratios, rest in under_noise(sizes):
-        print(f"| {name} | {' | '.join(ratios)} | {rest:.1e} |", flush=True)
+    for name, ratios, resting in under_noise(sizes):
+        print(f"| {name} | {' | '.join(ratios)} | {resting:.1e} |", flush=True)
 
 
 if __name__ == "__main__":

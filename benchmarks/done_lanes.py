@@ -27,7 +27,7 @@ from jaxbl.sweeps.metrics import ALL_METRICS
 
 PATH, SANE = "transmission.stiffness", 60.0
 SHARE, TIME = 0.9, 0.1
-"""Of lanes that diverge, and of the run after which they do."""
+"""Shares of lanes that diverge, and of the run after which they do."""
 
 
 def experiment(steps: int, dtype: np.dtype) -> Experiment:
@@ -61,13 +61,13 @@ LASTED = Reducer(
 """Samples until both sides have overflowed."""
 
 
-def limit(whole: Experiment, steps: int) -> float:
+def limit(base: Experiment, steps: int) -> float:
     """The least stiffness at which a lane is done before so many samples."""
-    simulator, low, high = HostSimulator(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
+    simulator, low, high = HostSimulator(base, (LASTED,), (PATH,), 256, 1), SANE, 1e9
     for _ in range(4):
-        tried = np.linspace(low, high, 256)
-        last = int(np.flatnonzero(simulator({PATH: tried}, 0)["samples"] >= steps)[-1])
-        low, high = tried[last], tried[last + 1]
+        candidates = np.linspace(low, high, 256)
+        last = int(np.flatnonzero(simulator({PATH: candidates}, 0)["samples"] >= steps)[-1])
+        low, high = candidates[last], candidates[last + 1]
     return float(high)
 
 
@@ -77,17 +77,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--precision", choices=("float32", "float64"), default="float64")
     parser.add_argument("--rounds", type=int, default=5)
-    given = parser.parse_args()
-    with jax.enable_x64(given.precision == "float64"):
-        measure(given.lanes, given.steps, np.dtype(given.precision), given.rounds)
+    args = parser.parse_args()
+    with jax.enable_x64(args.precision == "float64"):
+        measure(args.lanes, args.steps, np.dtype(args.precision), args.rounds)
 
 
 def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
-    whole = experiment(steps, dtype)
-    least = limit(whole, int(TIME * steps))
+    base = experiment(steps, dtype)
+    least = limit(base, int(TIME * steps))
     threads = len(jax.local_devices())
-    leaving = HostSimulator(whole, (ALL_METRICS,), (PATH,), lanes, threads)
-    staying = HostSimulator(whole, (ALL_METRICS._replace(done=None),), (PATH,), lanes, threads)
+    leaving = HostSimulator(base, (ALL_METRICS,), (PATH,), lanes, threads)
+    staying = HostSimulator(base, (ALL_METRICS._replace(done=None),), (PATH,), lanes, threads)
     sane, gone = SANE * np.linspace(1.0, 1.1, lanes), np.arange(lanes) < SHARE * lanes
     mixed = np.random.default_rng(0).permutation(gone)
     cases = {
@@ -99,8 +99,8 @@ def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
     }
     best = dict.fromkeys(cases, np.inf)
     for simulator, values in cases.values():
-        found, expected = simulator({PATH: values}, 0), staying({PATH: values}, 0)
-        assert all(np.array_equal(found[name], expected[name], equal_nan=True) for name in expected)
+        metrics, expected = simulator({PATH: values}, 0), staying({PATH: values}, 0)
+        assert all(np.array_equal(metrics[name], expected[name], equal_nan=True) for name in expected)
     for _ in range(rounds):
         for name, (simulator, values) in cases.items():
             start = time.perf_counter()

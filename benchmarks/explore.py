@@ -51,8 +51,8 @@ def clicks(page: Page) -> None:
             time.sleep(0.02)
         times.append(int(now.split(", ")[-1].removesuffix(" ms")))
         before = now
-    first, *others = times
-    print(f"click to run: first {first} ms, then {min(others)} to {max(others)} ms")
+    first, *later = times
+    print(f"click to run: first {first} ms, then {min(later)} to {max(later)} ms")
 
 
 def large(place: Path) -> None:
@@ -75,10 +75,13 @@ def large(place: Path) -> None:
                     page.locator("body[data-drawn=overview]").wait_for()
                     first = time.perf_counter() - began
                     page.locator("body[data-drawn*=motor]").wait_for()
-                    whole, loaded = time.perf_counter() - began, "performance.getEntriesByType('navigation')[0].loadEventEnd"
+                    load_seconds, loaded = (
+                        time.perf_counter() - began,
+                        "performance.getEntriesByType('navigation')[0].loadEventEnd",
+                    )
                     print(
                         f"{name}: loaded {page.evaluate(loaded) / 1e3:.2f} s, first picture {first:.2f} s, all points "
-                        f"{whole:.2f} s, values {page.evaluate(HOVER):.1f} ms"
+                        f"{load_seconds:.2f} s, values {page.evaluate(HOVER):.1f} ms"
                     )
                     browser.close()
         server.shutdown()
@@ -94,7 +97,7 @@ def further_runs() -> None:
             run(with_values(config, {LAMBDA: 4.0 + k}), backend=backend)  # type: ignore[arg-type]
             times.append(time.perf_counter() - began)
         medians[backend] = np.median(times[2:])
-    print("a further run of 20 000 samples: " + ", ".join(f"{name} {one:.3f} s" for name, one in medians.items()))
+    print("a further run of 20 000 samples: " + ", ".join(f"{name} {seconds:.3f} s" for name, seconds in medians.items()))
 
 
 def rounding(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""What exported code costs: lines, state, operations a step, instructions of a Cortex-M4, and time on this machine.
+"""Cost of exported code: lines, state, operations a step, instructions of a Cortex-M4, and time on this machine.
 
     python benchmarks/export.py
 
@@ -35,12 +35,12 @@ GAINS = {
 }  # fmt: skip
 
 
-def said(*command: Any, folder: Path) -> str:
+def run_command(*command: Any, folder: Path) -> str:
     return subprocess.run(list(map(str, command)), cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 def row(kind: str, precision: str) -> list[str]:
-    """Of both sides with the identifier, on the paper's drive."""
+    """A row of the table: both sides with the identifier, on the paper's drive."""
     study = read_config(Path(__file__).parent.parent / "sweeps" / "paper_table1.toml").to_dict()
     study["observer"] = {"kind": kind, "motor": GAINS, "load": GAINS}
     for table in ("axes", "figures", "verify", "tune", "notes"):
@@ -50,16 +50,16 @@ def row(kind: str, precision: str) -> list[str]:
         summary = jaxbl.export(study, folder, precision=precision, name="drive").summary
         lines = len((folder / "drive.c").read_text().splitlines())
         (folder / "timed.c").write_text(_TIMED.format(real=precision))
-        said("gcc", "-std=c99", "-O2", "drive.c", "timed.c", "-lm", "-o", "timed", folder=folder)
-        times = sorted(float(said("./timed", folder=folder)) for _ in range(5))
+        run_command("gcc", "-std=c99", "-O2", "drive.c", "timed.c", "-lm", "-o", "timed", folder=folder)
+        times = sorted(float(run_command("./timed", folder=folder)) for _ in range(5))
         count = size = "-"
         if shutil.which("arm-none-eabi-gcc"):
-            said("arm-none-eabi-gcc", *_ARM, "-c", "drive.c", "-o", "drive.o", folder=folder)
-            text = said("arm-none-eabi-objdump", "-d", "drive.o", folder=folder).split("<drive_init>:")
+            run_command("arm-none-eabi-gcc", *_ARM, "-c", "drive.c", "-o", "drive.o", folder=folder)
+            text = run_command("arm-none-eabi-objdump", "-d", "drive.o", folder=folder).split("<drive_init>:")
             init = text[1].partition("<drive_step>:")[0] if "<drive_step>:" in text[1] else ""
-            whole = sum(len(re.findall(r"^ +[0-9a-f]+:\t", part, re.MULTILINE)) for part in text)
-            count = str(whole - len(re.findall(r"^ +[0-9a-f]+:\t", init, re.MULTILINE)))
-            size = said("arm-none-eabi-size", "drive.o", folder=folder).splitlines()[1].split()[0]
+            instructions = sum(len(re.findall(r"^ +[0-9a-f]+:\t", part, re.MULTILINE)) for part in text)
+            count = str(instructions - len(re.findall(r"^ +[0-9a-f]+:\t", init, re.MULTILINE)))
+            size = run_command("arm-none-eabi-size", "drive.o", folder=folder).splitlines()[1].split()[0]
     return [kind, precision, str(lines), str(summary["state_bytes"]), str(summary["operations"]), count, size,
             f"{times[0]:.0f}"]  # fmt: skip
 

@@ -39,41 +39,43 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--real-time", action="store_true")
     parser.add_argument("--threads", type=int, default=count_cores())
-    given = parser.parse_args()
-    print(f"{given.steps} samples, {given.threads} threads; microseconds a run")
+    args = parser.parse_args()
+    print(f"{args.steps} samples, {args.threads} threads; microseconds a run")
     print("precision  lanes   C++ own  fused own  ratio   C++ given  fused kept  ratio")
     with TemporaryDirectory() as folder:
         for precision in ("float32", "float64"):
             for lanes in (64, 128, 256, 512, 1024):
                 with jax.enable_x64(precision == "float64"):
-                    own, ours, has, kept = measured(Workload(lanes, given.steps, precision), Path(folder), given)
+                    package_time, ours, has, kept_time = measure_chains(
+                        Workload(lanes, args.steps, precision), Path(folder), args
+                    )
                 print(
-                    f"{precision:9s} {lanes:6d} {own:9.0f} {ours:10.0f} {own / ours:6.2f} {has:11.0f} {kept:11.0f} "
-                    f"{has / kept:6.2f}",
+                    f"{precision:9s} {lanes:6d} {package_time:9.0f} {ours:10.0f} {package_time / ours:6.2f} "
+                    f"{has:11.0f} {kept_time:11.0f} {has / kept_time:6.2f}",
                     flush=True,
                 )
 
 
-def measured(work: Workload, folder: Path, given: argparse.Namespace) -> list[float]:
+def measure_chains(work: Workload, folder: Path, args: argparse.Namespace) -> list[float]:
     """Least time of each, us."""
     runners = [
-        CppChain(work, given.threads, folder, makes_inputs=True),
-        FusedChain(work, given.threads),
-        CppChain(work, given.threads, folder),
-        Kept(work, given.threads),
+        CppChain(work, args.threads, folder, makes_inputs=True),
+        FusedChain(work, args.threads),
+        CppChain(work, args.threads, folder),
+        Kept(work, args.threads),
     ]
     best = [float("inf")] * len(runners)
-    if given.real_time:
+    if args.real_time:
         # before the first run, which starts the threads: they inherit it
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    end = time.perf_counter() + given.seconds
+    end = time.perf_counter() + args.seconds
     while time.perf_counter() < end:
         for i, runner in enumerate(runners):
             for _ in range(20):
                 start = time.perf_counter()
                 runner()
                 best[i] = min(best[i], time.perf_counter() - start)
-    if given.real_time:
+    if args.real_time:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     return [1e6 * least for least in best]
 

@@ -7,7 +7,7 @@ from scipy import signal
 from jaxbl.identification.regression import Kinematics, kinematics_from
 
 
-def differentiated(time: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], cutoff: float) -> Kinematics:
+def differentiate(time: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], cutoff: float) -> Kinematics:
     """Kinematics of a log.
 
     Args:

@@ -37,34 +37,34 @@ IMPACTS = {
 SAMPLES = 200_000
 
 
-def written(study: Any, folder: str) -> tuple[str, float]:
+def write_fmu(study: Any, folder: str) -> tuple[str, float]:
     """Path of the FMU, and its sample period in s."""
-    made = jaxbl.export(study, folder, "fmu", name="drive")
-    return str(made.folder / "drive.fmu"), made.summary["sample_period"]
+    export = jaxbl.export(study, folder, "fmu", name="drive")
+    return str(export.folder / "drive.fmu"), export.summary["sample_period"]
 
 
 def free_run(study: Any, trace: pd.DataFrame) -> Any:
     """Outputs of the FMU under the input of a trace."""
     with tempfile.TemporaryDirectory() as folder:
-        path, period = written(study, folder)
-        given = np.zeros(len(trace), [("time", float), ("u", float)])
-        given["time"], given["u"] = np.arange(len(trace)) * period, trace.u
-        return fmpy.simulate_fmu(path, input=given, stop_time=given["time"][-1], step_size=period, output_interval=period)
+        path, period = write_fmu(study, folder)
+        inputs = np.zeros(len(trace), [("time", float), ("u", float)])
+        inputs["time"], inputs["u"] = np.arange(len(trace)) * period, trace.u
+        return fmpy.simulate_fmu(path, input=inputs, stop_time=inputs["time"][-1], step_size=period, output_interval=period)
 
 
-def difference(found: Any, trace: pd.DataFrame) -> float:
+def difference(outputs: Any, trace: pd.DataFrame) -> float:
     """Largest difference of positions, velocities and transmitted torque over all samples, over the range of each."""
     names = [name for name in ("motor.position", "motor.velocity", "load.position", "load.velocity") if name in trace]
     names += ["torque"] if "z" in trace else []
-    return max(float(np.max(np.abs(np.asarray(found[name]) - trace[name])) / np.ptp(trace[name])) for name in names)
+    return max(float(np.max(np.abs(np.asarray(outputs[name]) - trace[name])) / np.ptp(trace[name])) for name in names)
 
 
 def nanoseconds(study: Any) -> float:
     """For a sample, plant steps included: of one long step of the FMU."""
     with tempfile.TemporaryDirectory() as place:
-        path, period = written(study, f"{place}/made")
-        about = fmpy.read_model_description(path)
-        unit: Any = fmpy.instantiate_fmu(fmpy.extract(path, f"{place}/there"), about, "CoSimulation")
+        path, period = write_fmu(study, f"{place}/made")
+        description = fmpy.read_model_description(path)
+        unit: Any = fmpy.instantiate_fmu(fmpy.extract(path, f"{place}/there"), description, "CoSimulation")
         unit.enterInitializationMode()
         unit.exitInitializationMode()
         start = time.perf_counter()
@@ -84,7 +84,7 @@ def main() -> None:
     print("impacts: largest difference over range of the FMU, and of jaxbl's loop by XLA, to its fused loop")
     for duration in (2.0, 5.0, 10.0, 20.0):
         study = small({"run.duration": duration, "run.substeps": 10}, **IMPACTS)
-        fused, scanned = (jaxbl.run(study, backend=one).trace for one in ("fused", "scan"))
+        fused, scanned = (jaxbl.run(study, backend=backend).trace for backend in ("fused", "scan"))
         print(
             f"{duration:5g} s  {difference(free_run(study, fused), fused):.1e}  {difference(scanned, fused):.1e}", flush=True
         )

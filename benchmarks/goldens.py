@@ -130,13 +130,13 @@ def compute(name: str, side: Side, inputs: Mapping[str, Path], recordings: Path,
 
 
 def base_folder(name: str, commit: str, cache: Path) -> Path:
-    """Where the base's results of a golden are kept: they are the same as long as this name is."""
+    """Folder of the base's results of a golden; its name changes with everything that decides them."""
     golden = GOLDENS[name]
     scripts = [(SCRIPTS / script).read_text() for script in ("runner.py", "inputs.py")]
     return cache / commit[:12] / hash_of(repr(golden), *scripts, environment())
 
 
-def report(name: str, differences: Sequence[Difference], expected: Mapping[str, str], shown: int) -> bool:
+def report(name: str, differences: Sequence[Difference], expected: Mapping[str, str], limit: int) -> bool:
     """Print what moved; returns whether something did that is not expected."""
     sentences = [difference for difference in differences if difference.is_sentence]
     moves = [difference for difference in differences if not difference.is_sentence]
@@ -152,10 +152,10 @@ def report(name: str, differences: Sequence[Difference], expected: Mapping[str, 
     largest = max(move.relative for move in moved)
     amount = f", numbers by up to {largest:.1e}" if largest else ""
     print(f"{name}: MOVED: {len(moved)} places in {files} files{amount}{remark}")
-    for move in moved[:shown]:
+    for move in moved[:limit]:
         print(f"    {name}/{move}")
-    if len(moved) > shown:
-        print(f"    and {len(moved) - shown} more (--all)")
+    if len(moved) > limit:
+        print(f"    and {len(moved) - limit} more (--all)")
     return True
 
 
@@ -190,8 +190,8 @@ def main() -> None:
     kinds = {kind for name, _ in work for kind in GOLDENS[name].inputs}
     failed = []
     with ThreadPoolExecutor(options.jobs) as pool:
-        made = {kind: pool.submit(make_inputs, kind, base_tree, cache, recordings) for kind in kinds}
-        inputs = {kind: future.result() for kind, future in made.items()}
+        pending = {kind: pool.submit(make_inputs, kind, base_tree, cache, recordings) for kind in kinds}
+        inputs = {kind: future.result() for kind, future in pending.items()}
         futures = [(name, side, pool.submit(compute, name, side, inputs, recordings, cache)) for name, side in work]
         for name, side, future in futures:
             where = "tree" if side is tree else f"base, {side.results / name}"

@@ -50,14 +50,14 @@ def chain_by_hand(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 
     kernel = cuda(work.precision).get_function("chain")
     torque, noise = (cupy.asarray(column) for column in work.inputs())
-    given = cupy.asarray(np.stack(list(work.values().values())))
+    values = cupy.asarray(np.stack(list(work.values().values())))
     out = cupy.zeros((9, work.lanes), work.dtype)
     numbers = np.array(tuple(chain_constants().values()), np.dtype([(name, "f8") for name in chain_constants()]))
 
     def run() -> dict[str, np.ndarray]:
         sizes = np.int32(work.steps), np.int32(work.start), np.int32(work.window)
         grid = -(-work.lanes // _THREADS)
-        kernel((grid,), (_THREADS,), (numbers, *sizes, torque, noise, np.int32(work.lanes), given, out))
+        kernel((grid,), (_THREADS,), (numbers, *sizes, torque, noise, np.int32(work.lanes), values, out))
         return metrics_from_sums(work, list(cupy.asnumpy(out)))
 
     return run
@@ -84,9 +84,9 @@ def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
     simulator = DeviceSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes)
-    given = jax.device_put((simulator.pad_lanes(work.values()), simulator.join_spans(simulator.compute_inputs(SEED))))
+    inputs = jax.device_put((simulator.pad_lanes(work.values()), simulator.join_spans(simulator.compute_inputs(SEED))))
     names = sorted(METRIC_NAMES)
-    return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, simulator.kernel(*given), strict=True)}
+    return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, simulator.kernel(*inputs), strict=True)}
 
 
 def _lorenz_rates(x: Any, y: Any, z: Any, rho: Any) -> tuple[Any, Any, Any]:
@@ -163,7 +163,7 @@ def lorenz_by_hand(lanes: int, steps: int, step: float) -> Callable[[], np.ndarr
     return run
 
 
-def timed(runners: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+def time_runs(runners: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
     """Least seconds of each, in turns; every one has run before."""
     best = dict.fromkeys(runners, float("inf"))
     for _ in range(rounds):
@@ -196,7 +196,7 @@ def main() -> None:
                 makers |= {"scan": chain_scanned} if lanes <= 2**16 else {}
                 runners = {name: make(work) for name, make in makers.items()}
                 figures = {name: run() for name, run in runners.items()}
-                best = timed(runners, options.rounds)
+                best = time_runs(runners, options.rounds)
             for name, seconds in best.items():
                 apart = max(
                     float(np.median(np.abs(figures[name][key] / figures["cuda"][key] - 1.0))) for key in figures["cuda"]
@@ -211,9 +211,9 @@ def main() -> None:
     for lanes in options.trajectories:
         makers = {"cuda": lorenz_by_hand, "fused": lorenz_fused, "scan": lorenz_scanned}
         runners = {name: make(lanes, 1000, 1e-3) for name, make in makers.items()}
-        found = {name: np.asarray(run() if name != "cuda" else run().get()) for name, run in runners.items()}  # type: ignore[attr-defined]
-        apart = {name: float(np.max(np.abs(value - found["cuda"]))) for name, value in found.items()}
-        for name, seconds in timed(runners, options.rounds).items():
+        results = {name: np.asarray(run() if name != "cuda" else run().get()) for name, run in runners.items()}  # type: ignore[attr-defined]
+        apart = {name: float(np.max(np.abs(value - results["cuda"]))) for name, value in results.items()}
+        for name, seconds in time_runs(runners, options.rounds).items():
             rows.append({"name": f"lorenz {name}", "precision": "float32", "lanes": lanes, "steps": 1000})
             rows[-1] |= {"deviation": apart[name], "lane_steps_per_second": lanes * 1000 / seconds}
             print(f"lorenz  {name:6} float32 {lanes:8} {rows[-1]['lane_steps_per_second']:.3g}/s  off by {apart[name]:.1g}")

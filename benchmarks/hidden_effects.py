@@ -49,8 +49,8 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
     clear_programs_if_needed()
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files(logs, holdout, Path(folder))
-        found = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)
-    return {**found.summary, "model": found.model.to_dict()}
+        diagnosis = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)
+    return {**diagnosis.summary, "model": diagnosis.model.to_dict()}
 
 
 def oracle(case: Case) -> Mapping[str, float]:
@@ -71,18 +71,18 @@ def oracle(case: Case) -> Mapping[str, float]:
         return setup.holdout.compare(fitted.experiment).errors
 
 
-def left(found: Sequence[Case], folder: Path) -> list[Outcome]:
+def read_outcomes(hidden_cases: Sequence[Case], folder: Path) -> list[Outcome]:
     """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json, and model.toml beside it, for each case."""
     outcomes, models = [], []
-    for case in found:
+    for case in hidden_cases:
         path = folder / case.name / "diagnosis.json"
-        known = path.exists()
-        diagnosis = json.loads(path.read_text(encoding="utf-8")) if known else {}
-        if known and (path.parent / "model.toml").exists():
+        exists = path.exists()
+        diagnosis = json.loads(path.read_text(encoding="utf-8")) if exists else {}
+        if exists and (path.parent / "model.toml").exists():
             diagnosis["model"] = tomllib.loads((path.parent / "model.toml").read_text(encoding="utf-8"))
         models.append(diagnosis.get("model"))
-        outcomes.append(outcome(case, diagnosis, error="" if known else f"{path}: no such file"))
-    prove(found, outcomes, models)
+        outcomes.append(outcome(case, diagnosis, error="" if exists else f"{path}: no such file"))
+    prove(hidden_cases, outcomes, models)
     return outcomes
 
 
@@ -103,22 +103,22 @@ def main() -> None:
     asked = parser.parse_args()
 
     start = time.perf_counter()
-    found = cases(asked.seed, asked.count, asked.kind)
-    print(f"{len(found)} cases of seed {asked.seed} in {time.perf_counter() - start:.0f} s ({engine()[1]})")
+    hidden_cases = cases(asked.seed, asked.count, asked.kind)
+    print(f"{len(hidden_cases)} cases of seed {asked.seed} in {time.perf_counter() - start:.0f} s ({engine()[1]})")
     if asked.save is not None:
-        save(found, asked.save)
+        save(hidden_cases, asked.save)
         print(f"written to {asked.save}")
         return
     if asked.results is not None:
-        outcomes = left(found, asked.results)
+        outcomes = read_outcomes(hidden_cases, asked.results)
     else:
         diagnose: Diagnose = package
         best: Oracle | None = oracle
         if asked.diagnose:
             module, _, function = asked.diagnose.partition(":")
             diagnose, best = getattr(importlib.import_module(module), function), None
-        outcomes = run(found, diagnose, best, asked.jobs)
-    heading = f"Seed {asked.seed}, {len(found)} cases, {asked.kind}"
+        outcomes = run(hidden_cases, diagnose, best, asked.jobs)
+    heading = f"Seed {asked.seed}, {len(hidden_cases)} cases, {asked.kind}"
     print(markdown(outcomes, heading))
     if asked.out is not None:
         for path in write(outcomes, asked.out, heading):

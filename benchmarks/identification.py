@@ -1,4 +1,4 @@
-"""How well and how fast numbers are found from a log.
+"""Accuracy and time of methods that estimate a drive's numbers from a log.
 
 `table`: one comparison, on the same logs, of what is done with such logs: least squares on filtered derivatives, the paper's
 chain of observers and recursive identifier, and the trajectory fit. Simulated logs of a hard gap, whose truth is exact
@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
-from filtered_derivatives import differentiated  # noqa: E402
+from filtered_derivatives import differentiate  # noqa: E402
 from scipy.linalg import expm  # noqa: E402
 from scipy.optimize import brentq  # noqa: E402
 
@@ -94,33 +94,33 @@ def truth(torque, true, pieces=4):
         return 0 if abs(z) <= gap else int(np.sign(z))
 
     # the input enters linearly: two exponentials give all of them
-    known = {}
+    solutions = {}
     for contact in (-1, 0, 1):
-        at = [expm(system(contact, u) * step) for u in (0.0, 1.0)]
-        known[contact] = at[0], at[1] - at[0]
-    x, found = np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.zeros((len(torque), 4))
+        exponentials = [expm(system(contact, u) * step) for u in (0.0, 1.0)]
+        solutions[contact] = exponentials[0], exponentials[1] - exponentials[0]
+    x, states = np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.zeros((len(torque), 4))
     for i, u in enumerate(torque):
-        found[i] = x[:4]
+        states[i] = x[:4]
         for _ in range(pieces):
             contact, left = contact_of(x), step
-            fixed, by_input = known[contact]
+            fixed, by_input = solutions[contact]
             end = (fixed + u * by_input) @ x
             while contact_of(end) != contact:
                 edge = contact * gap if contact else contact_of(end) * gap
                 matrix, before = system(contact, u), x
 
                 def beyond(t, matrix=matrix, before=before, edge=edge):
-                    at = expm(matrix * t) @ before
-                    return at[0] - ratio * at[2] - edge
+                    exponentials = expm(matrix * t) @ before
+                    return exponentials[0] - ratio * exponentials[2] - edge
 
                 if beyond(0.0) * beyond(left) > 0.0:
                     break
-                at = brentq(beyond, 0.0, left, xtol=1e-12)
-                x, left = expm(matrix * at) @ before, left - at
+                exponentials = brentq(beyond, 0.0, left, xtol=1e-12)
+                x, left = expm(matrix * exponentials) @ before, left - exponentials
                 contact = 0 if contact else int(np.sign(edge))
                 end = expm(system(contact, u) * left) @ x
             x = end
-    return {"motor": found[:, 0], "load": found[:, 2]}
+    return {"motor": states[:, 0], "load": states[:, 2]}
 
 
 def six(discretisation="implicit"):
@@ -146,28 +146,31 @@ def six(discretisation="implicit"):
 def by_derivatives(experiment, paths, record):
     """Value, half-width of the 95 % interval, and theta, by filtered derivatives and least squares."""
     free = make_free_parameters(experiment, paths, float(np.std(record.torque)))
-    kinematics = differentiated(record.time, record.torque, record.positions, 100.0)
+    kinematics = differentiate(record.time, record.torque, record.positions, 100.0)
     fit = regress(experiment, free, [kinematics], 10)
     reach = 1.96 * np.sqrt(np.diag(np.asarray(spread(fit).covariance)))
     return {
-        one.path: (float(one.value(fit.theta[i])), abs(float(one.slope(fit.theta[i]))) * reach[i])
-        for i, one in enumerate(free)
+        parameter.path: (float(parameter.value(fit.theta[i])), abs(float(parameter.slope(fit.theta[i]))) * reach[i])
+        for i, parameter in enumerate(free)
     }
 
 
 def by_trajectories(study, record):
-    found = whole.identify(record, study).summary["parameters"]
-    return {path: (one["value"], 0.5 * (one["interval"][1] - one["interval"][0])) for path, one in found.items()}
+    estimates = whole.identify(record, study).summary["parameters"]
+    return {
+        path: (estimate["value"], 0.5 * (estimate["interval"][1] - estimate["interval"][0]))
+        for path, estimate in estimates.items()
+    }
 
 
 def by_observers(study, record):
     """The paper's chain, inertias and viscous frictions given as they are; the motor's side."""
     config, missing = read_model(study)
-    known = set_leaves(on_record(config, record), arrays(SIX))
-    segments = segments_of(record, known.sides)
-    _, gains = gains_for(missing, known, segments)
-    found = log_columns.observer_chain(set_leaves(known, arrays(gains)), segments, len(record.time))[1]
-    return {f"transmission.{name}": (value["motor"], np.nan) for name, value in found.items()}
+    nominal = set_leaves(on_record(config, record), arrays(SIX))
+    segments = segments_of(record, nominal.sides)
+    _, gains = gains_for(missing, nominal, segments)
+    estimates = log_columns.observer_chain(set_leaves(nominal, arrays(gains)), segments, len(record.time))[1]
+    return {f"transmission.{name}": (value["motor"], np.nan) for name, value in estimates.items()}
 
 
 METHODS = {
@@ -179,7 +182,7 @@ METHODS = {
 }
 
 
-def simulated(options):
+def simulate_record(options):
     """One row a log, method and number."""
     rows = []
     for kind in options.excitations:
@@ -205,12 +208,14 @@ def simulated_table(frame):
     for (kind, method), part in frame.groupby(["excitation", "method"], sort=False):
         cells = []
         for path in NAMES:
-            one = part[part["path"] == path]
-            error = np.sqrt(np.mean(one["error"] ** 2)) if len(one) else np.nan
-            reach = percent(one["reach"].mean()) if len(one) else ""
+            rows = part[part["path"] == path]
+            error = np.sqrt(np.mean(rows["error"] ** 2)) if len(rows) else np.nan
+            reach = percent(rows["reach"].mean()) if len(rows) else ""
             cells.append(percent(error) + (f" (± {reach})" if reach else ""))
-        known = part[np.isfinite(part["reach"])]
-        covered = f"{int((known['error'].abs() <= known['reach']).sum())} of {len(known)}" if len(known) else "no interval"
+        bounded = part[np.isfinite(part["reach"])]
+        covered = (
+            f"{int((bounded['error'].abs() <= bounded['reach']).sum())} of {len(bounded)}" if len(bounded) else "no interval"
+        )
         lines.append(f"| {kind} | {method} | {' | '.join(cells)} | {covered} |")
     return lines
 
@@ -245,8 +250,10 @@ def emps_table():
         return ["EMPS: no recordings (the folder with them is named by JAXBL_DATA)."]
     estimation, validation = (read_record(folder / f"DATA_EMPS{x}.mat", EMPS_LOG) for x in ("", "_PULSES"))
     experiment = on_record(read_model(emps_study())[0], estimation)
-    parts = [differentiated(one.time, one.torque, one.positions, 100.0) for one in (estimation, validation)]
-    found = {
+    parts = [
+        differentiate(recording.time, recording.torque, recording.positions, 100.0) for recording in (estimation, validation)
+    ]
+    estimates = {
         "published": {path: (value, np.nan) for path, value in PUBLISHED.items()},
         "derivatives, least squares": by_derivatives(experiment, list(PUBLISHED), estimation),
         "trajectories, output error": by_trajectories(emps_study(), estimation),
@@ -254,9 +261,9 @@ def emps_table():
     }
     lines = ["| method | M (kg) | F_v (N s/m) | F_c (N) | offset (N) | force error (%) | on validation (%) |"]
     lines.append("| --- |" + " ---: |" * 6)
-    for method, values in found.items():
-        at = set_leaves(experiment, {path: jnp.asarray(value) for path, (value, _) in values.items()})
-        left = [100.0 * errors(at, [part], 10)["motor"]["relative"] for part in parts]
+    for method, values in estimates.items():
+        fitted = set_leaves(experiment, {path: jnp.asarray(value) for path, (value, _) in values.items()})
+        left = [100.0 * errors(fitted, [part], 10)["motor"]["relative"] for part in parts]
         cells = [
             f"{values[path][0]:.2f}" + (f" ± {values[path][1]:.2f}" if np.isfinite(values[path][1]) else "")
             if path in values
@@ -268,7 +275,7 @@ def emps_table():
 
 
 def table(options):
-    frame = simulated(options)
+    frame = simulate_record(options)
     lines = [
         f"{options.duration:g} s at {1.0 / PERIOD:g} Hz, {options.seeds} noise seeds; encoder noise {NOISE['motor']:g} rad",
         f"(motor), {NOISE['load']:g} rad (load). Relative errors in %, rms over seeds; in brackets the half-width of the",
@@ -362,7 +369,7 @@ class Stages:
         for place, name, function in self.kept:
             setattr(place, name, function)
 
-    def timed(self, function, label):
+    def time_stages(self, function, label):
         def call(*args, **keys):
             start = time.perf_counter()
             result = function(*args, **keys)
@@ -388,7 +395,7 @@ def stages():
     )
 
 
-def timed(options):
+def time_stages(options):
     study = twelve(lambda i: 1.0 + 0.15 * (-1) ** i)
     rows = []
     for seconds in options.seconds:
@@ -427,7 +434,7 @@ def main():
     speed = commands.add_parser("time")
     speed.add_argument("--seconds", type=float, nargs="*", default=[10.0, 20.0, 40.0], help="lengths of the logs")
     speed.add_argument("--calls", type=int, default=2, help="of each length, in one process")
-    speed.set_defaults(run=timed)
+    speed.set_defaults(run=time_stages)
     options = parser.parse_args()
     options.run(options)
 

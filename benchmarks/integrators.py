@@ -50,9 +50,9 @@ def accelerations(plant, position, velocity, torque, smoothing):
         motion = Motion(0.0, position[side], velocity[side])
         total = torque - transmitted if side == "motor" else ratio * transmitted
         total = total - plant.drive.viscous(side) * velocity[side]
-        for effect, own in zip(plant.effects, states, strict=True):
+        for effect, state in zip(plant.effects, states, strict=True):
             if effect.place == side:
-                total = total - effect.dry_friction(own, motion) * jnp.tanh(velocity[side] / smoothing)
+                total = total - effect.dry_friction(state, motion) * jnp.tanh(velocity[side] / smoothing)
         result[side] = total / plant.inertia(side)
     return result
 
@@ -243,7 +243,7 @@ def costs(problem: Problem, lanes: int, samples: int, rounds: int) -> list[float
     torques = jnp.asarray(inputs(samples))
     step = PERIOD / DEFAULT_SUBSTEPS
 
-    def compiled(scheme):
+    def compile_runs(scheme):
         def lane(plant):
             def sample(state, torque):
                 # rolled: unrolled, XLA's fusion evaluates the law over again, more so for some schemes than for others
@@ -259,7 +259,7 @@ def costs(problem: Problem, lanes: int, samples: int, rounds: int) -> list[float
 
         return jax.jit(jax.vmap(lane, (axes,))).lower(batch).compile()
 
-    runs = [compiled(scheme) for scheme in problem.schemes]
+    runs = [compile_runs(scheme) for scheme in problem.schemes]
     least = [float("inf")] * len(runs)
     for _ in range(rounds + 1):  # the first one warms up
         for i, run in enumerate(runs):

@@ -35,7 +35,7 @@ from jaxbl.sweeps.metrics import ALL_METRICS  # noqa: E402
 
 
 class Variant(NamedTuple):
-    """What is compared."""
+    """A variant that is compared."""
 
     workload: str
     observer: str

@@ -1,4 +1,4 @@
-"""What a study costs per point beside its computing, from 10^4 to 10^6 points of short runs: `jaxbl sweep` as a process.
+"""Cost of a study per point beside its computing, from 10^4 to 10^6 points of short runs: `jaxbl sweep` as a process.
 
     python benchmarks/large_study.py [--points 1e4 1e5 1e6] [--chunk N]
 
@@ -94,8 +94,8 @@ def run(*words: str) -> tuple[dict[str, list[float]], float, str]:
     done = subprocess.run(
         [sys.executable, "-c", _RUN, *words], check=True, capture_output=True, text=True, env=dict(os.environ)
     )
-    found = json.loads(done.stderr.splitlines()[-1])
-    return found["seconds"], found["memory"] / 1024.0, done.stdout
+    usage = json.loads(done.stderr.splitlines()[-1])
+    return usage["seconds"], usage["memory"] / 1024.0, done.stdout
 
 
 def main() -> None:
@@ -113,17 +113,18 @@ def main() -> None:
             config.write_text(study(points, arguments.chunk))
             spent, memory, _ = run("sweep", str(config), "--out", str(out))
             parts = len(list((out / "points").iterdir()))
-            of = {phase: one[0] for phase, one in spent.items()}
+            of = {phase: cost[0] for phase, cost in spent.items()}
             storage = of["write"] + of["look"] + of["finish"]
             # loading, compiling and one look at the folder are the same for any number of points
             scheduling = of["order"] + of["points"]
             # but for the last one, parts are written while chunks are computed
             compute = of["chunks"] - of["compile"] - of["labels"] - of["write"] * (1.0 - 1.0 / parts)
             scheduling += of["labels"]
-            each = [1e6 * one / points for one in (compute, storage, scheduling)]
+            microseconds = [1e6 * cost / points for cost in (compute, storage, scheduling)]
             share = 100.0 * (storage + scheduling) / (compute + storage + scheduling)
             print(
-                f"{points:>9} {parts:>7} {each[0]:>10.1f} {each[1]:>8.1f} {each[2]:>11.1f} {share:>5.1f} % "
+                f"{points:>9} {parts:>7} {microseconds[0]:>10.1f} {microseconds[1]:>8.1f} {microseconds[2]:>11.1f} "
+                f"{share:>5.1f} % "
                 f"{1e6 * of['report'] / points:>8.1f} {memory:>4.0f} MB",
                 flush=True,
             )

@@ -61,29 +61,29 @@ def _effect(kind: str, **numbers: Any) -> Study:
     return {"kind": kind, **numbers}
 
 
-def _damped(d: Drawn) -> Study:
+def _draw_damping(d: Drawn) -> Study:
     """A gear whose swings have a damping ratio of 1 to 10 %."""
     return _effect("transmission.damping", damping=2.0 * d.within(0.01, 0.1) * math.sqrt(d.stiffness * d.reduced))
 
 
 def _coulomb(d: Drawn, side: str = "motor") -> Study:
-    at = d.torque * (1.0 if side == "motor" else d.ratio)
-    return _effect(f"{side}.coulomb_friction", torque=at * d.within(0.03, 0.2))
+    torque = d.torque * (1.0 if side == "motor" else d.ratio)
+    return _effect(f"{side}.coulomb_friction", torque=torque * d.within(0.03, 0.2))
 
 
 KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
-    "linear shaft": ("linear_shaft", (), lambda d: [_damped(d)]),
+    "linear shaft": ("linear_shaft", (), lambda d: [_draw_damping(d)]),
     "gap without damping": ("dead_zone", (), lambda d: []),
     "gap, damping, dry friction": (
         "dead_zone",
         (),
-        lambda d: [_damped(d), _coulomb(d), _coulomb(d, "load")],
+        lambda d: [_draw_damping(d), _coulomb(d), _coulomb(d, "load")],
     ),
     "gap, damping, eccentric mass": (
         "dead_zone",
         (),
         lambda d: [
-            _damped(d),
+            _draw_damping(d),
             _effect("load.gravity", torque=d.torque * d.ratio * d.within(0.02, 0.2), phase=d.random.uniform(-3.0, 3.0)),
         ],
     ),
@@ -97,7 +97,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
         (),
         lambda d: [
             _effect("transmission.backlash", half_gap=d.gap),
-            _damped(d),
+            _draw_damping(d),
             # as much again at the deflection under the whole torque
             _effect("transmission.hardening", cubic_stiffness=d.stiffness**3 / d.torque**2 * d.within(0.1, 1.0)),
         ],
@@ -106,7 +106,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
         "dead_zone",
         ("load",),
         lambda d: [
-            _damped(d),
+            _draw_damping(d),
             _coulomb(d, "load"),
             _effect("actuator.lag", time_constant=d.within(5e-4, 5e-3)),
             _effect("actuator.saturation", limit=d.torque * d.within(0.5, 1.0)),
@@ -138,7 +138,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
         "dead_zone",
         (),
         lambda d: [
-            _damped(d),
+            _draw_damping(d),
             _effect("load.flexibility", inertia=d.inertia * d.ratio**2 * 0.2, frequency=d.within(5.0, 30.0)),
             _effect("actuator.delay", delay=d.within(5e-4, 5e-3)),
         ],
@@ -147,7 +147,7 @@ KINDS: dict[str, tuple[str | None, tuple[str, ...], Effects]] = {
         "dead_zone",
         (),
         lambda d: [
-            _damped(d),
+            _draw_damping(d),
             _effect(
                 "load.stribeck_friction",
                 torque=d.torque * d.ratio * 0.1,
@@ -162,7 +162,7 @@ COARSE = "Stribeck friction, gap, damping"
 """The kind with a friction that MuJoCo has only nearly: it is not among the fifty."""
 
 
-def drawn(kind: str, seed: int) -> Study:
+def draw_study(kind: str, seed: int) -> Study:
     """A study of a kind: a motor of 1e-5 to 1e-3 kg m² that accelerates at 200 to 2000 rad/s², a gear that swings at 20 to
     80 Hz, with a gap of up to three times its deflection, viscous time constants of 0.1 to 1 s."""
     law, linear, effects = KINDS[kind]
@@ -175,18 +175,18 @@ def drawn(kind: str, seed: int) -> Study:
     # rad for one m of a screw with a lead of 5 to 20 mm
     ratio = 1.0 if law is None else 2.0 * math.pi / within(5e-3, 2e-2) if linear else within(3.0, 100.0)
     load = within(0.3, 5.0) * inertia * ratio**2
-    whole = inertia if law is None else inertia + load / ratio**2
-    torque, frequency = whole * acceleration, within(0.3, 1.0)
+    total_inertia = inertia if law is None else inertia + load / ratio**2
+    torque, frequency = total_inertia * acceleration, within(0.3, 1.0)
     reduced = inertia if law is None else 1.0 / (1.0 / inertia + ratio**2 / load)
     stiffness = reduced * (2.0 * math.pi * within(20.0, 80.0)) ** 2
     gap = torque / stiffness * within(0.3, 3.0)
     speed = acceleration / math.hypot(1.0 / slowest, 2.0 * math.pi * frequency)
-    one = Drawn(random, torque, speed, inertia, reduced, ratio, stiffness, gap)
+    draw = Drawn(random, torque, speed, inertia, reduced, ratio, stiffness, gap)
     study: Study = {
         "drive": {"kind": "rigid", "motor_inertia": inertia, "motor_viscous": inertia / slowest},
         "transmission": None,
         "excitation": {"kind": "multisine", "amplitude": torque, "frequency": frequency, "count": 5},
-        "effects": effects(one),
+        "effects": effects(draw),
     }
     if law is not None:
         study["drive"] |= {"kind": "two_inertia", "load_inertia": load, "load_viscous": load / slowest, "gear_ratio": ratio}
@@ -204,65 +204,66 @@ def drawn(kind: str, seed: int) -> Study:
     return small({"run.duration": DURATION, "run.substeps": 10} | without, **study)
 
 
-def simulated(study: Config, finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """By jaxbl: the input, and positions and velocities of the sides, one row a sample; with so many times the substeps."""
+def simulate(study: Config, finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Simulate by jaxbl: the input, and a row of positions and velocities for each sample; `substeps` are multiplied."""
     with precision(study):
         experiment = prepare(study)
         run = dataclasses.replace(experiment.run, substeps=finer * experiment.run.substeps)
-        return tuple(map(np.asarray, _simulated(dataclasses.replace(experiment, run=run))))  # type: ignore[return-value]
+        return tuple(map(np.asarray, _run_plant(dataclasses.replace(experiment, run=run))))  # type: ignore[return-value]
 
 
 @eqx.filter_jit
-def _simulated(experiment: Experiment) -> tuple[jax.Array, jax.Array]:
+def _run_plant(experiment: Experiment) -> tuple[jax.Array, jax.Array]:
     inputs = jax.vmap(experiment.excitation)(jnp.arange(experiment.run.steps) * experiment.run.sample_period)
     states = plant_trajectory(experiment, experiment.plant.init(experiment.initial), inputs)
     columns = [one[side] for side in experiment.sides for one in (states.position, states.velocity)]
     return inputs, jnp.stack(columns, axis=1)
 
 
-def played(model: str, inputs: np.ndarray, period: float) -> np.ndarray:
-    """By MuJoCo: the same columns, under the same inputs (period in s)."""
+def play(model: str, inputs: np.ndarray, period: float) -> np.ndarray:
+    """Simulate by MuJoCo: the same columns, under the same inputs (period in s)."""
     compiled = mujoco.MjModel.from_xml_string(model)
     data = mujoco.MjData(compiled)
     mujoco.mj_resetDataKeyframe(compiled, data, 0)
-    steps, whole = round(period / compiled.opt.timestep), mujoco.mjtState.mjSTATE_FULLPHYSICS
-    start = np.zeros(mujoco.mj_stateSize(compiled, whole))
-    mujoco.mj_getState(compiled, data, start, whole)
+    steps, full_state = round(period / compiled.opt.timestep), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    start = np.zeros(mujoco.mj_stateSize(compiled, full_state))
+    mujoco.mj_getState(compiled, data, start, full_state)
     held = np.repeat(inputs, steps)[None, :-steps, None]
     states, _ = rollout.rollout(compiled, data, start[None], held)
     # a state begins with the time, then positions and velocities
-    kept = np.vstack([start, states[0, steps - 1 :: steps]])
+    sampled = np.vstack([start, states[0, steps - 1 :: steps]])
     joints = [compiled.joint(i).name for i in range(compiled.njnt)]
     columns = [1 + joints.index(side) + k * compiled.nq for side in ("motor", "load") if side in joints for k in (0, 1)]
-    return kept[:, columns]
+    return sampled[:, columns]
 
 
-def difference(found: np.ndarray, expected: np.ndarray) -> float:
+def difference(columns: np.ndarray, expected: np.ndarray) -> float:
     """Largest over the columns: rms of a difference, over rms of the signal."""
     with np.errstate(invalid="ignore"):
-        return float(np.max(np.sqrt(np.mean((found - expected) ** 2, axis=0) / np.mean(expected**2, axis=0))))
+        return float(np.max(np.sqrt(np.mean((columns - expected) ** 2, axis=0) / np.mean(expected**2, axis=0))))
 
 
 def free_runs(kind: str, count: int) -> tuple[list[float], list[float]]:
-    """How far exported models are from the studies' own runs, of so many drives of a kind whose motion is determined; and
-    of those drawn before them whose motion is not, how far their own runs are from those with a quarter of the step.
+    """Differences of exported models from the studies' own runs, for `count` drives of a kind with determined motion.
 
-    Where that is far, the motion is chaotic: contacts make large differences of small ones, and no simulator's run is true.
+    Also returned are differences of drives that were drawn before them and whose motion is not determined: their own runs
+    against those with a quarter of the step.
+    If these are large, the motion is chaotic: contacts make large differences of small ones, and no simulator's run is true.
     """
-    found: list[float] = []
+    differences: list[float] = []
     chaotic: list[float] = []
     for seed in range(20 * count):
-        if len(found) == count:
+        if len(differences) == count:
             break
-        config = read_config(drawn(kind, seed))
-        inputs, expected = simulated(config)
-        own = difference(expected, simulated(config, 4)[1])
-        if own < DETERMINED:
+        config = read_config(draw_study(kind, seed))
+        inputs, expected = simulate(config)
+        step_difference = difference(expected, simulate(config, 4)[1])
+        if step_difference < DETERMINED:
             model, _, _ = write_mjcf(config, linear=KINDS[kind][1])
-            found.append(difference(played(model, inputs, config.run.sample_period), expected))
+            differences.append(difference(play(model, inputs, config.run.sample_period), expected))
         else:
-            chaotic.append(own)
-    return found, chaotic
+            chaotic.append(step_difference)
+    return differences, chaotic
 
 
 def single_effects() -> Iterator[tuple[str, Study]]:
@@ -287,18 +288,18 @@ def main(count: int) -> None:
     """Print the figures."""
     everything: list[float] = []
     for kind in KINDS:
-        found, chaotic = free_runs(kind, count)
+        differences, chaotic = free_runs(kind, count)
         if kind != COARSE:
-            everything += found
+            everything += differences
         left = f"{len(chaotic)} left out, {min(chaotic):.1e} to {max(chaotic):.1e} from themselves" if chaotic else ""
-        print(f"{kind:40} median {np.median(found):.1e}, worst {max(found):.1e}; {left}", flush=True)
+        print(f"{kind:40} median {np.median(differences):.1e}, worst {max(differences):.1e}; {left}", flush=True)
     print(f"{len(everything)} drives but {COARSE}: median {np.median(everything):.1e}, worst {max(everything):.1e}")
     for name, study in single_effects():
         config = read_config(study)
-        model, _, said = write_mjcf(config)
-        inputs, expected = simulated(config)
-        apart = difference(played(model, inputs, config.run.sample_period), expected)
-        print(f"{name:32} {said.get(f'effects.{name}', said['transmission']).fidelity:12} {apart:.1e}", flush=True)
+        model, _, report = write_mjcf(config)
+        inputs, expected = simulate(config)
+        apart = difference(play(model, inputs, config.run.sample_period), expected)
+        print(f"{name:32} {report.get(f'effects.{name}', report['transmission']).fidelity:12} {apart:.1e}", flush=True)
 
 
 if __name__ == "__main__":

@@ -69,14 +69,14 @@ def draw(seed: int, number: int, kind: str = "gap") -> Drive:
     ratio = float(rng.choice([3.0, 5.0, 10.0, 20.0, 50.0]))
     motor = _between(rng, 1e-4, 2e-3)
     load = motor * _between(rng, 0.5, 5.0)  # at the motor
-    both = motor + load
+    total_inertia = motor + load
     amplitude, frequency = _between(rng, 1.0, 10.0), _between(rng, 0.4, 1.5)
     speed = 2.0 * math.pi * frequency * amplitude
-    torque = both * 2.0 * math.pi * frequency * speed  # of inertia, its peak in a sine
+    torque = total_inertia * 2.0 * math.pi * frequency * speed  # of inertia, its peak in a sine
     viscous = [torque / speed * _between(rng, 0.03, 0.3) for _ in range(2)]
     dry = [torque * _between(rng, low, high) for low, high in ((0.03, 0.1), (0.05, 0.3))]
-    stiffness = (2.0 * math.pi * _between(rng, 12.0, 50.0)) ** 2 * motor * load / both
-    damping = 2.0 * _between(rng, 0.02, 0.1) * math.sqrt(stiffness * motor * load / both)
+    stiffness = (2.0 * math.pi * _between(rng, 12.0, 50.0)) ** 2 * motor * load / total_inertia
+    damping = 2.0 * _between(rng, 0.02, 0.1) * math.sqrt(stiffness * motor * load / total_inertia)
     half_gap = 0.0 if kind == "no gap" else _between(rng, 5e-3, 0.1)
     if kind == "within the gap":
         half_gap = amplitude * float(rng.uniform(1.2, 2.0))
@@ -95,7 +95,7 @@ def draw(seed: int, number: int, kind: str = "gap") -> Drive:
     }  # fmt: skip
     if kind == "no gap":
         law = {"law": "linear_shaft", "stiffness": stiffness}
-    run = _run(rng, Machine(drive, law, effects), kind, amplitude, frequency, torque, both, sum(viscous))
+    run = _run(rng, Machine(drive, law, effects), kind, amplitude, frequency, torque, total_inertia, sum(viscous))
     law = law if half_gap else {"law": "dead_zone", "stiffness": stiffness, "half_gap": 0.02}
     study = _study(rng, Machine(drive, law, effects), run)
     return Drive(f"{kind} {number}", kind, run, study, half_gap, dry[1] * ratio)
@@ -152,22 +152,22 @@ def _study(rng: np.random.Generator, machine: Machine, run: Run) -> dict[str, An
     """Nominal numbers, as someone has them."""
 
     def off(table: Mapping[str, Any]) -> dict[str, Any]:
-        found = {}
+        nominal = {}
         for key, value in table.items():
             if isinstance(value, str) or key == "gear_ratio":
-                found[key] = value
+                nominal[key] = value
             elif key == "half_gap":
-                found[key] = float(f"{value * _between(rng, 0.2, 5.0):.3g}")
+                nominal[key] = float(f"{value * _between(rng, 0.2, 5.0):.3g}")
             else:
                 error = float(np.clip(rng.standard_normal(), -2.0, 2.0))
-                found[key] = float(f"{value * math.exp(_KNOWN.get(key, _GUESS) * error):.3g}")
-        return found
+                nominal[key] = float(f"{value * math.exp(_KNOWN.get(key, _GUESS) * error):.3g}")
+        return nominal
 
     return {
         "title": "motor encoder alone",
         "drive": off(machine.drive),
         "transmission": off(machine.transmission or {}),
-        "effects": [off(one) for one in machine.effects],
+        "effects": [off(effect) for effect in machine.effects],
         "run": {"sample_period": run.period, "duration": 10.0, "substeps": 5},
         "log": {"absent": ["theta_s"]},
     }
@@ -182,7 +182,7 @@ def write(drive: Drive, trace: Trace, folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was said of a drive.
+    """Result of an identification of a drive.
 
     Attributes:
         shown: whether a gap is said to be there.
@@ -205,14 +205,14 @@ class Outcome:
     seconds: float = math.nan
 
 
-def identified(drive: Drive, path: Path) -> Outcome:
+def identify_drive(drive: Drive, path: Path) -> Outcome:
     """`jaxbl.identify` on the log."""
     import jaxbl
 
     begin = time.perf_counter()
-    found = jaxbl.identify(path, drive.study).summary
+    identification = jaxbl.identify(path, drive.study).summary
     seconds = time.perf_counter() - begin
-    numbers, gap = found["parameters"], found["backlash"]
+    numbers, gap = identification["parameters"], identification["backlash"]
     dry = numbers.get("effects.load.coulomb_friction.torque")
     friction, friction_covered = math.nan, False
     if dry is not None and None not in dry["interval"]:
@@ -220,75 +220,80 @@ def identified(drive: Drive, path: Path) -> Outcome:
         friction_covered = dry["interval"][0] <= drive.friction <= dry["interval"][1]
     if not gap["shown"]:
         return Outcome(False, friction=friction, friction_covered=friction_covered, at_most=gap["at_most"], seconds=seconds)
-    one = numbers["transmission.half_gap"]
-    low, high = one["interval"]
-    error = one["value"] / drive.half_gap - 1.0 if drive.half_gap else math.inf
+    half_gap = numbers["transmission.half_gap"]
+    low, high = half_gap["interval"]
+    error = half_gap["value"] / drive.half_gap - 1.0 if drive.half_gap else math.inf
     return Outcome(
-        True, error, low <= drive.half_gap <= high, 0.5 * (high - low) / one["value"], friction, friction_covered,
+        True, error, low <= drive.half_gap <= high, 0.5 * (high - low) / half_gap["value"], friction, friction_covered,
         seconds=seconds,
     )  # fmt: skip
 
 
 def crossings(drive: Drive, trace: Trace) -> int:
-    """How often the load truly changes flanks."""
+    """Number of times that the simulated load changes flanks."""
     twist = trace.states[0] - drive.run.machine.ratio * trace.states[2]
     flank = np.sign(twist[np.abs(twist) >= drive.half_gap])
     return int(np.count_nonzero(np.diff(flank)))
 
 
-def drawn(seed: int, count: int, refused: int) -> list[tuple[Drive, Trace]]:
+def draw_drives(seed: int, count: int, refused: int) -> list[tuple[Drive, Trace]]:
     """Drives with a gap that is crossed, and drives without one, or that do not cross it."""
     drives = [draw(seed, i) for i in range(count)]
     # of three one does not cross it
     drives += [draw(seed, i, kind) for kind in REFUSED for i in range(refused if kind == REFUSED[0] else 3 * refused)]
     runs = list(zip(drives, simulate([drive.run for drive in drives]), strict=True))
-    found = runs[:count]
+    chosen = runs[:count]
     for k, kind in enumerate(REFUSED):
         fit = [(d, t) for d, t in runs if d.kind == kind and (not d.half_gap or not crossings(d, t))]
-        found += fit[: (refused + len(REFUSED) - 1 - k) // len(REFUSED)]
-    return found
+        chosen += fit[: (refused + len(REFUSED) - 1 - k) // len(REFUSED)]
+    return chosen
 
 
-def line(drive: Drive, one: Outcome) -> str:
+def line(drive: Drive, outcome: Outcome) -> str:
     """One row of the table."""
-    if one.shown:
-        said = f"{100.0 * one.error:+9.3f} %  ± {100.0 * one.width:7.3f} %  {'holds' if one.covered else 'MISSES'}"
+    if outcome.shown:
+        text = (
+            f"{100.0 * outcome.error:+9.3f} %  ± {100.0 * outcome.width:7.3f} %  {'holds' if outcome.covered else 'MISSES'}"
+        )
     else:
-        said = f"  refused; at most {one.at_most:.3g} rad"
+        text = f"  refused; at most {outcome.at_most:.3g} rad"
     dry = (
         "refused"
-        if math.isnan(one.friction)
-        else f"{100.0 * one.friction:+.2f} %{'' if one.friction_covered else ' MISSES'}"
+        if math.isnan(outcome.friction)
+        else f"{100.0 * outcome.friction:+.2f} %{'' if outcome.friction_covered else ' MISSES'}"
     )
-    return f"{drive.name:18s} {drive.half_gap:8.4f} {drive.run.motor_noise:8.1e}  {said:42s} {dry:20s} {one.seconds:5.1f}"
+    return (
+        f"{drive.name:18s} {drive.half_gap:8.4f} {drive.run.motor_noise:8.1e}  {text:42s} {dry:20s} {outcome.seconds:5.1f}"
+    )
 
 
-def summary(drives: list[Drive], found: list[Outcome]) -> list[str]:
+def summary(drives: list[Drive], outcomes: list[Outcome]) -> list[str]:
     """Figures over all drives."""
     lines = []
-    seen = [one for drive, one in zip(drives, found, strict=True) if drive.kind == "gap"]
-    shown = [one for one in seen if one.shown]
-    if seen:
-        lines.append(f"drives with a gap: {len(seen)}, refused {len(seen) - len(shown)}")
-    if shown:
-        errors = [abs(one.error) for one in shown]
-        held = sum(one.covered for one in shown)
+    with_gap = [outcome for drive, outcome in zip(drives, outcomes, strict=True) if drive.kind == "gap"]
+    accepted = [outcome for outcome in with_gap if outcome.shown]
+    if with_gap:
+        lines.append(f"drives with a gap: {len(with_gap)}, refused {len(with_gap) - len(accepted)}")
+    if accepted:
+        errors = [abs(outcome.error) for outcome in accepted]
+        held = sum(outcome.covered for outcome in accepted)
         lines.append(
             f"  half gap: median error {100.0 * np.median(errors):.3f} %, largest {100.0 * max(errors):.3f} %; "
-            f"95 % intervals hold the truth in {held} of {len(shown)} ({100.0 * held / len(shown):.0f} %)"
+            f"95 % intervals hold the truth in {held} of {len(accepted)} ({100.0 * held / len(accepted):.0f} %)"
         )
-        dry = [one for one in seen if not math.isnan(one.friction)]
+        dry = [outcome for outcome in with_gap if not math.isnan(outcome.friction)]
         if dry:
-            held = sum(one.friction_covered for one in dry)
+            held = sum(outcome.friction_covered for outcome in dry)
             lines.append(
                 f"  load's Coulomb friction: said in {len(dry)}, median error "
-                f"{100.0 * np.median([abs(one.friction) for one in dry]):.2f} %; intervals hold it in {held} of {len(dry)}"
+                f"{100.0 * np.median([abs(outcome.friction) for outcome in dry]):.2f} %; "
+                f"intervals hold it in {held} of {len(dry)}"
             )
     for kind in REFUSED:
-        some = [one for drive, one in zip(drives, found, strict=True) if drive.kind == kind]
-        if some:
-            lines.append(f"{kind}: refused {sum(not one.shown for one in some)} of {len(some)}")
-    lines.append(f"seconds for a log, median: {np.median([one.seconds for one in found]):.1f}")
+        of_kind = [outcome for drive, outcome in zip(drives, outcomes, strict=True) if drive.kind == kind]
+        if of_kind:
+            lines.append(f"{kind}: refused {sum(not outcome.shown for outcome in of_kind)} of {len(of_kind)}")
+    lines.append(f"seconds for a log, median: {np.median([outcome.seconds for outcome in outcomes]):.1f}")
     return lines
 
 
@@ -303,14 +308,14 @@ def main() -> None:
     jax.config.update("jax_compilation_cache_dir", str(CACHE))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     os.environ.setdefault("JAXBL_PROGRAMS", str(CACHE / "programs"))
-    runs = drawn(asked.seed, asked.count, asked.refused)
+    runs = draw_drives(asked.seed, asked.count, asked.refused)
     print("drive              half gap    noise  said of it" + " " * 34 + "load's friction       s", flush=True)
-    found = []
+    outcomes = []
     with tempfile.TemporaryDirectory() as folder:
         for drive, trace in runs:
-            found.append(identified(drive, write(drive, trace, Path(folder))))
-            print(line(drive, found[-1]), flush=True)
-    print(*summary([drive for drive, _ in runs], found), sep="\n")
+            outcomes.append(identify_drive(drive, write(drive, trace, Path(folder))))
+            print(line(drive, outcomes[-1]), flush=True)
+    print(*summary([drive for drive, _ in runs], outcomes), sep="\n")
 
 
 if __name__ == "__main__":

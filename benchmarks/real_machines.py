@@ -41,7 +41,7 @@ from real.table import Row, markdown, row_of, write
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 
 
-def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
+def diagnose_case(case: Case, data: Path, rivals: bool) -> Row:
     """The row of a case."""
     from jaxbl.diagnosis.diagnose import run_diagnosis
     from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
@@ -53,8 +53,8 @@ def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
         start = time.perf_counter()
         try:
             task = read_diagnosis_task(logs, case.study, holdout=holdout)
-            found = run_diagnosis(task)
-            row.summary, model = found.summary, found.model
+            diagnosis = run_diagnosis(task)
+            row.summary, model = diagnosis.summary, diagnosis.model
         except InputError as error:
             row.error, row.expected = str(error).replace(f"{data}/", ""), not case.readable
             if row.expected:
@@ -70,7 +70,7 @@ def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
 
 
 def _lost_motion(case: Case, log: Path) -> str:
-    """What `jaxbl inspect` says of the gap of a recording that cannot be diagnosed."""
+    """Gap by `jaxbl inspect` of a recording that cannot be diagnosed."""
     from jaxbl.records import inspect
 
     gearing = inspect(log, case.study["log"]).record.statistics.gearing
@@ -80,50 +80,52 @@ def _lost_motion(case: Case, log: Path) -> str:
 def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
     """Add the torque errors of all tools behind one low-pass."""
     sides = ("motor", "load") if task.config.drive.kind == "two_inertia" else ("motor",)
-    fitted, held = (parts_of(one, sides, case.cutoff) for one in (task.record, task.holdout))
+    fitted, held = (parts_of(part, sides, case.cutoff) for part in (task.record, task.holdout))
     linear = task.record.statistics.channels["theta_e"].unit == "m"
     row.unit = "N" if linear else "N m"
     row.driving = driving(held, float(task.config.drive.motor_inertia))
     errors = {"nominal": torque_error(task.config, task.holdout, held)}
     if model is not None:
         errors["jaxbl"] = torque_error(model, task.holdout, held)
-    row.torques = {name: float(np.sqrt(np.mean(one**2))) for name, one in errors.items()}
+    row.torques = {name: float(np.sqrt(np.mean(part**2))) for name, part in errors.items()}
     if not rivals:
         return
-    speed = max(float(np.max(np.abs(one.kinematics.velocity["motor"]))) for one in fitted)
-    travel = max(float(np.ptp(one.kinematics.position["motor"])) for one in fitted)
+    speed = max(float(np.max(np.abs(part.kinematics.velocity["motor"]))) for part in fitted)
+    travel = max(float(np.ptp(part.kinematics.position["motor"])) for part in fitted)
     terms, other = (terms_of(parts, task.config, linear, (speed, travel)) for parts in (fitted, held))
-    others = []
+    errors_of_rivals = []
     tools = {
         "stepwise": lambda: stepwise(terms, other),
         "pysindy": lambda: sindy(terms, other),
         "mujoco": lambda: sysid(fitted, held, task.config, linear),
     }
     for name, tool in tools.items():
-        found = tool()
-        row.rivals[name], row.torques[name] = found.said(), found.rms
-        others += [found.left] if found.rms is not None else []
+        result = tool()
+        row.rivals[name], row.torques[name] = result.to_dict(), result.rms
+        errors_of_rivals += [result.left] if result.rms is not None else []
     # beside all of them or none
-    if "jaxbl" in errors and len(others) == len(row.rivals):
-        row.margin = _margin(errors["jaxbl"], min(others, key=lambda one: float(np.mean(one**2))))
+    if "jaxbl" in errors and len(errors_of_rivals) == len(row.rivals):
+        row.margin = _margin(errors["jaxbl"], min(errors_of_rivals, key=lambda part: float(np.mean(part**2))))
 
 
 _BLOCKS = 16
-"""Of held-out data: many enough for a standard error."""
+"""Blocks of the held-out data: enough for a standard error."""
 
 
-def _margin(own: np.ndarray, other: np.ndarray) -> float | None:
+def _margin(errors: np.ndarray, other: np.ndarray) -> float | None:
     """Standard errors by which the squares of errors are less than those of another tool; None of too few of them."""
-    if len(own) < 4 * _BLOCKS:
+    if len(errors) < 4 * _BLOCKS:
         return None
-    gains = np.array([np.mean(block) for block in np.array_split(other**2 - own**2, _BLOCKS)])
+    gains = np.array([np.mean(block) for block in np.array_split(other**2 - errors**2, _BLOCKS)])
     return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder with the recordings")
-    parser.add_argument("--only", nargs="+", metavar="NAME", choices=[one.name for one in CASES], help="these rows alone")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", choices=[known_case.name for known_case in CASES], help="these rows alone"
+    )
     parser.add_argument("--rivals", action="store_true", help="fit the other tools as well")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and a figure there")
     asked = parser.parse_args()
@@ -133,19 +135,19 @@ def main() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(CACHE))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    rows, made = [], []
+    rows, files = [], []
     for case in CASES:
         if asked.only and case.name not in asked.only:
             continue
-        if why := unfit(case, asked.data):
-            print(f"{case.name} is left out: {why}", file=sys.stderr)
+        if reason := unfit(case, asked.data):
+            print(f"{case.name} is left out: {reason}", file=sys.stderr)
             continue
-        rows.append(diagnosed(case, asked.data, asked.rivals))
+        rows.append(diagnose_case(case, asked.data, asked.rivals))
         print(f"{case.name}: {rows[-1].summary.get('verdict', 'no diagnosis')}, {rows[-1].seconds:.0f} s", file=sys.stderr)
         # after each: some take minutes
-        made = [] if asked.out is None else write(rows, markdown(rows, asked.rivals), asked.out)
+        files = [] if asked.out is None else write(rows, markdown(rows, asked.rivals), asked.out)
     print(markdown(rows, asked.rivals))
-    for path in made:
+    for path in files:
         print(path)
 
 

@@ -1,4 +1,4 @@
-"""What boundary refinement saves: a refined study against the full grid of its finest level, in one run.
+"""Savings of boundary refinement: a refined study against the full grid of its finest level, in one run.
 
 The refined study runs as `jaxbl sweep` runs it, in memory. The full grid is the same study without `refine`, with as many
 values as the fine grid has, in the chunks that suit such a study. Unless `--full` is given only some of its chunks are run,
@@ -40,14 +40,14 @@ def full_grid(config):
     return read_config(data)
 
 
-def missed(config, whole, frame):
+def count_missed(config, full, frame):
     """Cells at the boundary on the full grid, and those of them that have a corner which was not simulated."""
     paths = [axis.path for axis in config.axes]
-    converged = whole.sort_values(paths)["motor.converged"].to_numpy()
-    shape = [whole[path].nunique() for path in paths]
-    keys = np.ravel_multi_index([np.searchsorted(np.unique(whole[p]), frame[p]) for p in paths], shape)
-    known = np.zeros(len(whole), bool)
-    known[keys] = True
+    converged = full.sort_values(paths)["motor.converged"].to_numpy()
+    shape = [full[path].nunique() for path in paths]
+    keys = np.ravel_multi_index([np.searchsorted(np.unique(full[p]), frame[p]) for p in paths], shape)
+    simulated = np.zeros(len(full), bool)
+    simulated[keys] = True
 
     def corners(values):
         grid = values.reshape(shape)
@@ -55,7 +55,7 @@ def missed(config, whole, frame):
         return np.array([grid[corner] for corner in itertools.product(ends, repeat=len(shape))])
 
     boundary = corners(converged).any(axis=0) & ~corners(converged).all(axis=0)
-    return int(boundary.sum()), int((boundary & ~corners(known).all(axis=0)).sum())
+    return int(boundary.sum()), int((boundary & ~corners(simulated).all(axis=0)).sum())
 
 
 def main():
@@ -93,14 +93,14 @@ def main():
     together = (whole_run + engine.compile_seconds) / (refined_run + compile_seconds)
     print(f"ratio: {whole_run / refined_run:.1f}; with compilation {together:.1f}")
     if options.full:
-        whole = pd.concat(parts, ignore_index=True)
+        full = pd.concat(parts, ignore_index=True)
         paths = [axis.path for axis in config.axes]
-        same = result.frame.merge(whole, on=paths, suffixes=("", "/full"))
+        same = result.frame.merge(full, on=paths, suffixes=("", "/full"))
         print(f"points found again on the full grid: {len(same)}")
         for name in ("motor.converged", "motor.velocity_rmse"):
             equal = (same[name] == same[f"{name}/full"]) | (same[name].isna() & same[f"{name}/full"].isna())
             print(f"{name}: {int((~equal).sum())} differ")
-        print("cells at the boundary: {}, with a corner not simulated: {}".format(*missed(config, whole, result.frame)))
+        print("cells at the boundary: {}, with a corner not simulated: {}".format(*count_missed(config, full, result.frame)))
     for size in options.layouts:
         other = Engine(config, Layout(1, size))
         (chunk, *_) = other.split_points(0, other.points.coarse_points(np.arange(other.points.coarse_size)))

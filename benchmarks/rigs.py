@@ -78,29 +78,29 @@ def main() -> None:
     for i in range(asked.count):
         truth, x, u, noise = simulate(np.random.default_rng([asked.seed, i]))
         start = time.perf_counter()
-        found = fit_element(x, u, [slice(0, len(x))], PERIOD, noise=noise, linear=False)
+        fit = fit_element(x, u, [slice(0, len(x))], PERIOD, noise=noise, linear=False)
         seconds.append(time.perf_counter() - start)
-        assert found is not None
-        missed += [f"{i} {name}" for name in truth if name not in found.numbers]
+        assert fit is not None
+        missed += [f"{i} {name}" for name in truth if name not in fit.numbers]
         # without a gap the centre stands for the offset
-        false += [f"{i} {name}" for name in found.numbers if name not in truth and name != "centre"]
-        both = [name for name in truth if name in found.numbers]
-        if "centre" not in truth and "centre" in found.numbers:
-            both.remove("offset")
-        for name in both:
-            one = found.numbers[name]
+        false += [f"{i} {name}" for name in fit.numbers if name not in truth and name != "centre"]
+        names = [name for name in truth if name in fit.numbers]
+        if "centre" not in truth and "centre" in fit.numbers:
+            names.remove("offset")
+        for name in names:
+            estimate = fit.numbers[name]
             if name not in ("offset", "centre"):
-                errors.setdefault(name, []).append(100.0 * abs(one.value / truth[name] - 1.0))
-            covered.setdefault(name, []).append(one.interval[0] <= truth[name] <= one.interval[1])
+                errors.setdefault(name, []).append(100.0 * abs(estimate.value / truth[name] - 1.0))
+            covered.setdefault(name, []).append(estimate.interval[0] <= truth[name] <= estimate.interval[1])
         if asked.each:
-            said = [f"{n} {truth[n]:.4g}: {found.numbers[n].value:.4g} ± {found.numbers[n].error:.2g}" for n in both]
-            print(f"{i} ({seconds[-1]:.1f} s, left {100 * found.share:.2g} %): " + "; ".join(said), flush=True)
+            texts = [f"{n} {truth[n]:.4g}: {fit.numbers[n].value:.4g} ± {fit.numbers[n].error:.2g}" for n in names]
+            print(f"{i} ({seconds[-1]:.1f} s, left {100 * fit.share:.2g} %): " + "; ".join(texts), flush=True)
     print("| number | rigs | error, median % | largest % | truth within 95 % |\n|---|---:|---:|---:|---:|")
     for name, inside in covered.items():
         off = errors.get(name)
         text = "| | " if off is None else f"| {np.median(off):.2g} | {max(off):.2g} "
         print(f"| {name} | {len(inside)} {text}| {sum(inside)} of {len(inside)} |")
-    total = [one for inside in covered.values() for one in inside]
+    total = [estimate for inside in covered.values() for estimate in inside]
     print(f"\n{sum(total)} of {len(total)} intervals hold ({100 * np.mean(total):.0f} %).")
     print(f"Not found: {', '.join(missed) or 'none'}. Found though not there: {', '.join(false) or 'none'}.")
     print(f"{np.median(seconds):.1f} s a rig, at most {max(seconds):.1f} s.")

@@ -1,4 +1,4 @@
-"""What large studies cost, from small ones measured here: processor time, disk, start-up; then hours and money.
+"""Cost of large studies, from small ones measured here: processor time, disk, start-up; then hours and money.
 
 Three kinds of study are run in a few thousand lanes: `gain_map` and `dead_zone_noise` as they stand (float64, implicit, ten
 steps of the plant a sample), and a lean chain (gain_map in float32, explicit, one step). Time is processor time, which other
@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 
 
 class Cost(NamedTuple):
-    """Of a run: samples, core-seconds of computing and of storing, bytes."""
+    """Cost of a run: samples, core-seconds of computing and of storing, bytes."""
 
     samples: int
     computing: float
@@ -69,7 +69,7 @@ def measure(data: dict[str, Any], folder: Path) -> Cost:
         store.write_part(index, frame)
     end = time.process_time()
     size = sum(path.stat().st_size for path in store.list_part_files())
-    return Cost(config.run.steps, *(what / engine.rows for what in (between - start, end - between, size)))
+    return Cost(config.run.steps, *(amount / engine.rows for amount in (between - start, end - between, size)))
 
 
 _COMMAND = """
@@ -98,7 +98,7 @@ program()
 """
 
 
-def started(folder: Path) -> list[float]:
+def measure_process(folder: Path) -> list[float]:
     """Seconds, and processor seconds, of the command until its first lanes begin, and until its first part is there."""
     small = (
         f'include = "{ROOT}/sweeps/gain_map.toml"\n[sweep]\nchunk = 64\n[run]\nduration = 0.1\n[identifier]\nstart = 0.05\n'
@@ -113,15 +113,15 @@ def started(folder: Path) -> list[float]:
         times = process.cpu_times()
         wall = time.time() - start
         process.kill()
-        _, said = process.communicate()
-    return [*map(float, said.split()[:2]), wall, times.user + times.system]
+        _, output = process.communicate()
+    return [*map(float, output.split()[:2]), wall, times.user + times.system]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--price", type=float, default=0.04, help="of a core-hour, in dollars")
     parser.add_argument("--cores", type=int, nargs="+", default=[64, 10_000])
-    given = parser.parse_args()
+    args = parser.parse_args()
     kinds = {
         "lean": lean(),
         "gain_map": study("gain_map", 32),
@@ -137,21 +137,21 @@ def main() -> None:
             f"{1e3 * cost.computing:.3f} ms a run; storing {1e6 * cost.storing:.1f} us, {cost.size:.0f} bytes a run"
         )
     with tempfile.TemporaryDirectory() as folder:
-        begun, used, there, used_there = started(Path(folder))
+        begun, used, there, used_there = measure_process(Path(folder))
     print(
         f"programs kept: start to first lane-step {begun:.1f} s, {used:.1f} s of processor time; "
         f"to first part {there:.1f} s, {used_there:.1f} s"
     )
     print(
         f"\n{'runs':>8} {'study':16} {'core-hours':>11} {'dollars':>10}"
-        + "".join(f"{n:>9} cores" for n in given.cores)
+        + "".join(f"{n:>9} cores" for n in args.cores)
         + f"{'TB':>9}"
     )
     for runs in (1e9, 1e12):
         for name, cost in costs.items():
             hours = runs * (cost.computing + cost.storing) / 3600.0
-            row = f"{runs:8.0e} {name:16} {hours:11.3g} {given.price * hours:10.3g}"
-            print(row + "".join(f"{hours / n:13.3g} h" for n in given.cores) + f"{runs * cost.size / 1e12:9.3g}")
+            row = f"{runs:8.0e} {name:16} {hours:11.3g} {args.price * hours:10.3g}"
+            print(row + "".join(f"{hours / n:13.3g} h" for n in args.cores) + f"{runs * cost.size / 1e12:9.3g}")
 
 
 if __name__ == "__main__":

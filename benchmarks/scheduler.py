@@ -1,4 +1,4 @@
-"""What Dask's own scheduler costs with as many bundles and workers as a large study has, on one machine.
+"""Cost of Dask's own scheduler with as many bundles and workers as a large study has, on one machine.
 
 The scheduler is a process of its own, as on a cluster. Workers are Dask's, of one thread each, many of them in each of a few
 processes; their jobs sleep, or return at once, and give back what a bundle of ten parts gives. The client is
@@ -47,11 +47,11 @@ from jaxbl.cluster import Cluster
 _PARTS = 10
 """Parts of a bundle."""
 _PROCESSES = 4
-"""Of workers."""
+"""Processes that the workers share."""
 
 
 class Job(NamedTuple):
-    """What a bundle is: some strings and numbers (:class:`jaxbl.sweeps.bundles.Bundle`)."""
+    """A bundle: strings and numbers (:class:`jaxbl.sweeps.bundles.Bundle`)."""
 
     folder: str
     identity: str
@@ -67,7 +67,7 @@ def jobs(count: int, seconds: float) -> Iterator[tuple[int, Job]]:
 
 
 def done(job: Job) -> tuple[dict[int, str], float, str]:
-    """What a worker gives back of a bundle: a checksum for each part."""
+    """Return a worker's result of a bundle: a checksum for each part."""
     time.sleep(job.seconds)
     return dict.fromkeys(job.chunks, "0123456789abcdef" * 2), 1.0, "host"
 
@@ -94,10 +94,12 @@ def work(address: str, count: int, folder: str, channel) -> None:
 
     async def run() -> None:
         async with contextlib.AsyncExitStack() as stack:
-            given = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "local_directory": folder}
+            options = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "local_directory": folder}
             for first in range(0, count, 25):
-                some = (stack.enter_async_context(Worker(address, **given)) for _ in range(first, min(first + 25, count)))
-                await asyncio.gather(*some)
+                workers = (
+                    stack.enter_async_context(Worker(address, **options)) for _ in range(first, min(first + 25, count))
+                )
+                await asyncio.gather(*workers)
             channel.send(count)
             while not channel.poll():
                 await asyncio.sleep(0.2)
@@ -138,20 +140,22 @@ class Pass:
     def __init__(self, scheduler: int, workers: list[int]):
         self.scheduler, self.workers, self.here = scheduler, workers, os.getpid()
         self.peaks = Peaks(scheduler, self.here)
-        self.used = self._used()
+        self.used = self._read_usage()
         self.start = time.perf_counter()
         self.first = 0.0
         print(f"  before it: scheduler {megabytes(scheduler):.0f} MB, client {megabytes(self.here):.0f} MB")
         print("".join(f"{name:>10}" for name in _HEAD))
 
-    def _used(self) -> list[float]:
+    def _read_usage(self) -> list[float]:
         return [seconds_of(self.scheduler), seconds_of(self.here), sum(map(seconds_of, self.workers))]
 
     def row(self, bundles: int) -> None:
         wall = time.perf_counter() - self.start
-        each = [1e3 * (now - old) / bundles for now, old in zip(self._used(), self.used, strict=True)]
-        row = f"{bundles:10d}{wall:10.1f}{self.first:10.2f}{bundles / wall:10.0f}" + "".join(f"{one:10.2f}" for one in each)
-        print(row + "".join(f"{one:10.0f}" for one in self.peaks.most.values()), flush=True)
+        milliseconds = [1e3 * (now - old) / bundles for now, old in zip(self._read_usage(), self.used, strict=True)]
+        row = f"{bundles:10d}{wall:10.1f}{self.first:10.2f}{bundles / wall:10.0f}" + "".join(
+            f"{number:10.2f}" for number in milliseconds
+        )
+        print(row + "".join(f"{number:10.0f}" for number in self.peaks.most.values()), flush=True)
 
     def by_client(self, client: Client, marks: list[int], seconds: float) -> None:
         count = 0
@@ -162,7 +166,7 @@ class Pass:
         assert count == max(marks)
         self.peaks.stop.set()
 
-    def left(self, client: Client, bundles: int) -> None:
+    def submit_unending(self, client: Client, bundles: int) -> None:
         """Hand over bundles of which none ends, until the scheduler knows them all."""
         Cluster(client, local=False).submit_jobs(done, [job for _, job in jobs(bundles, 1e6)])
         self.first = time.perf_counter() - self.start
@@ -179,15 +183,15 @@ def main() -> None:
     parser.add_argument("--sleep", type=float, default=0.0, help="seconds of a bundle")
     parser.add_argument("--heartbeat", type=float, help="of a worker, s [default: Dask's, 1 + workers / 200]")
     parser.add_argument("--leave", action="store_true", help="hand all over at once; none is done")
-    given = parser.parse_args()
+    args = parser.parse_args()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    for count in given.workers:
+    for count in args.workers:
         with tempfile.TemporaryDirectory() as folder:
-            run(count, given, folder)
+            run(count, args, folder)
 
 
-def run(count: int, given: argparse.Namespace, folder: str) -> None:
+def run(count: int, args: argparse.Namespace, folder: str) -> None:
     """All passes with so many workers."""
     context = multiprocessing.get_context("spawn")
     channels, processes = [], []
@@ -198,7 +202,7 @@ def run(count: int, given: argparse.Namespace, folder: str) -> None:
         processes.append(context.Process(target=function, args=(*arguments, theirs), daemon=True))
         processes[-1].start()
 
-    begin(schedule, given.heartbeat)
+    begin(schedule, args.heartbeat)
     address = channels[0].recv()
     start = time.perf_counter()
     for number in range(min(_PROCESSES, count)):
@@ -214,10 +218,10 @@ def run(count: int, given: argparse.Namespace, folder: str) -> None:
         f" scheduler {megabytes(scheduler):.0f} MB, {100 * idle:.0f} % of a core while they are idle"
     )
     with Client(address, set_as_default=False, timeout=120) as client:
-        if given.leave:
-            Pass(scheduler, workers).left(client, max(given.bundles))
+        if args.leave:
+            Pass(scheduler, workers).submit_unending(client, max(args.bundles))
         else:
-            Pass(scheduler, workers).by_client(client, given.bundles, given.sleep)
+            Pass(scheduler, workers).by_client(client, args.bundles, args.sleep)
     for channel in channels[::-1]:
         channel.send("stop")
     for process in processes[::-1]:

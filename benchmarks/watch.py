@@ -1,4 +1,4 @@
-"""How far `jaxbl watch` can be trusted: false alarms, coverage of its intervals, and delay of the alarm on simulated drives
+"""Reliability of `jaxbl watch`: false alarms, coverage of its intervals, and delay of the alarm on simulated drives
 whose gap stays or grows; and how many samples a second it takes.
 
     python benchmarks/watch.py alarms [--runs 100]     # constant gaps, several noise levels
@@ -31,10 +31,10 @@ from jaxbl.simulate import Sample, initial_state, replay, step, unit_noise
 SWEEPS = Path(__file__).parent.parent / "sweeps"
 STUDIES = {"hard gap": "geared_axis.toml", "law (3)": "dead_zone_noise.toml"}
 ADDRESS = "udp://127.0.0.1:0"
-"""Of a task without a log; nothing listens there."""
+"""Address of a task without a log; nothing listens there."""
 
 
-def simulated(config: Config, gaps: np.ndarray, seeds: np.ndarray, noise: float) -> list[np.ndarray]:
+def simulate_rows(config: Config, gaps: np.ndarray, seeds: np.ndarray, noise: float) -> list[np.ndarray]:
     """Input, motor and load position, each (runs, samples), of a drive whose gap is `gaps` times its own at each sample."""
     with jax.enable_x64(True):
         experiment = prepare(config)
@@ -51,23 +51,23 @@ def simulated(config: Config, gaps: np.ndarray, seeds: np.ndarray, noise: float)
             indices = jnp.arange(len(gaps), dtype=jnp.int32)
             noises = unit_noise(seed, indices, experiment.sides)
 
-            def sample(state: Any, given: Any) -> Any:
-                index, gap, noise = given
-                own = eqx.tree_at(lambda e: getattr(e.transmission, key), experiment, size * gap)
-                state, signals = step(own, state, Sample(index.astype(float) * period, noise=noise))
+            def sample(state: Any, sample_inputs: Any) -> Any:
+                index, gap, noise = sample_inputs
+                changed = eqx.tree_at(lambda e: getattr(e.transmission, key), experiment, size * gap)
+                state, signals = step(changed, state, Sample(index.astype(float) * period, noise=noise))
                 return state, (signals.input, *(signals.side(side).measured for side in experiment.sides))
 
             return jax.lax.scan(sample, initial_state(experiment), (indices, jnp.asarray(gaps), noises))[1]
 
-        return [np.asarray(one) for one in jax.jit(jax.vmap(run))(jnp.asarray(seeds))]
+        return [np.asarray(column) for column in jax.jit(jax.vmap(run))(jnp.asarray(seeds))]
 
 
-def watched(model: Config, rows: list[np.ndarray], window: float) -> Any:
+def watch_rows(model: Config, rows: list[np.ndarray], window: float) -> Any:
     """Values over time of one run."""
     with jax.enable_x64(True):
         watcher = Watcher(read_watch_task(ADDRESS, model, window=window), lambda values: None)
         watcher.take(Rows(0.0, rows[0], {"motor": rows[1], "load": rows[2]}, True))
-    return {name: np.array([one[name] for one in watcher.values]) for name in watcher.columns}
+    return {name: np.array([window_values[name] for window_values in watcher.values]) for name in watcher.columns}
 
 
 def half_gap_of(config: Config) -> float:
@@ -94,20 +94,20 @@ def alarms(drives: list[str], runs: int, duration: float = 40.0, window: float =
         true = half_gap_of(model)
         for noise in (0.0, 1e-5, 1e-4, 3e-4):
             count = round(duration / model.run.sample_period)
-            rows = simulated(model, np.ones(count), np.arange(runs), noise)
-            found = [watched(model, [one[i] for one in rows], window) for i in range(runs)]
+            rows = simulate_rows(model, np.ones(count), np.arange(runs), noise)
+            watched = [watch_rows(model, [columns[i] for columns in rows], window) for i in range(runs)]
             gap, low, high, least = (
-                np.stack([one[f"half_gap{end}"] for one in found]) for end in ("", "_from", "_to", "_least")
+                np.stack([columns[f"half_gap{end}"] for columns in watched]) for end in ("", "_from", "_to", "_least")
             )
-            known = np.isfinite(gap)
-            error = float(np.sqrt(np.mean((gap[known] / true - 1.0) ** 2)))
-            inside = float(np.mean((low[known] <= true) & (true <= high[known])))
+            finite = np.isfinite(gap)
+            error = float(np.sqrt(np.mean((gap[finite] / true - 1.0) ** 2)))
+            inside = float(np.mean((low[finite] <= true) & (true <= high[finite])))
             limits = (1.0, 1.02, 1.05, 1.25)
             raised = [int(np.sum(np.any(np.nan_to_num(least) > limit * true, axis=1))) for limit in limits]
-            friction.append([name, f"{noise:g}", *frictions(found, model)])
+            friction.append([name, f"{noise:g}", *frictions(watched, model)])
             print(
-                f"| {name} | {noise:g} | {gap.size} | {100 * known.mean():.1f} % | {100 * error:.2g} % | "
-                f"{100 * inside:.1f} % | " + " | ".join(f"{one} of {runs}" for one in raised) + " |",
+                f"| {name} | {noise:g} | {gap.size} | {100 * finite.mean():.1f} % | {100 * error:.2g} % | "
+                f"{100 * inside:.1f} % | " + " | ".join(f"{columns} of {runs}" for columns in raised) + " |",
                 flush=True,
             )
     print(
@@ -119,19 +119,19 @@ def alarms(drives: list[str], runs: int, duration: float = 40.0, window: float =
         print("| " + " | ".join(row) + " |")
 
 
-def frictions(found: Any, model: Config) -> list[str]:
+def frictions(watched: Any, model: Config) -> list[str]:
     """Mean errors of friction, and how often its interval holds the truth."""
     drive: Any = model.drive
-    dry = {one.kind: float(one.build().torque) for one in model.effects if one.kind.endswith("coulomb_friction")}  # type: ignore[attr-defined]
+    dry = {effect.kind: float(effect.build().torque) for effect in model.effects if effect.kind.endswith("coulomb_friction")}  # type: ignore[attr-defined]
     truths = {f"{side}.coulomb": dry.get(f"{side}.coulomb_friction", 0.0) for side in ("motor", "load")}
     truths |= {f"{side}.viscous": getattr(drive, f"{side}_viscous") for side in ("motor", "load")}
     errors, inside = [], []
     for key, truth in truths.items():
-        value, error = (np.concatenate([one[f"{key}{end}"] for one in found]) for end in ("", "_error"))
-        known = np.isfinite(value)
-        mean = float(np.mean(value[known] - truth))
+        value, error = (np.concatenate([effect[f"{key}{end}"] for effect in watched]) for end in ("", "_error"))
+        finite = np.isfinite(value)
+        mean = float(np.mean(value[finite] - truth))
         errors.append(f"{100 * mean / truth:+.2g} %" if key.endswith("viscous") else f"{mean:+.2g}")
-        inside.append(f"{100 * np.mean(np.abs(value[known] - truth) <= INTERVAL * error[known]):.0f} %")
+        inside.append(f"{100 * np.mean(np.abs(value[finite] - truth) <= INTERVAL * error[finite]):.0f} %")
     return [*errors, *inside]
 
 
@@ -148,21 +148,21 @@ def growth(drives: list[str], runs: int, noise: float = 1e-4) -> None:
             times = np.arange(round((rise + 60.0) / period)) * period
             gaps = 1.0 + np.clip((times - 20.0) / rise, 0.0, 1.0)
             passed = 20.0 + 0.5 * rise
-            rows = simulated(model, gaps, np.arange(runs), noise)
-            of_sums = [sums_over_all_time(model, [one[i] for one in rows], 1.5 * true) - passed for i in range(runs)]
+            rows = simulate_rows(model, gaps, np.arange(runs), noise)
+            of_sums = [sums_over_all_time(model, [columns[i] for columns in rows], 1.5 * true) - passed for i in range(runs)]
             for window in (5.0, 10.0):
                 delays, errors = [], []
                 for i in range(runs):
-                    found = watched(model, [one[i] for one in rows], window)
-                    raised = found["t"][np.nan_to_num(found["half_gap_least"]) > 1.5 * true]
+                    watched = watch_rows(model, [columns[i] for columns in rows], window)
+                    raised = watched["t"][np.nan_to_num(watched["half_gap_least"]) > 1.5 * true]
                     delays.append(raised[0] - passed if len(raised) else np.inf)
-                    middle = np.interp(found["t"] - 0.5 * window, times, gaps) * true
-                    errors.append((found["half_gap"] / middle - 1.0)[np.isfinite(found["half_gap"])])
+                    middle = np.interp(watched["t"] - 0.5 * window, times, gaps) * true
+                    errors.append((watched["half_gap"] / middle - 1.0)[np.isfinite(watched["half_gap"])])
                 rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
                 size = np.interp(passed + np.median(delays), times, gaps) / 1.5
                 print(
                     f"| {name} | {rise:g} | {window:g} | {100 * rms:.2g} % | {np.median(delays):.0f} | "
-                    f"{np.max(delays):.0f} | {size:.3f} | {sum(one < 0.0 for one in delays)} of {runs} | "
+                    f"{np.max(delays):.0f} | {size:.3f} | {sum(columns < 0.0 for columns in delays)} of {runs} | "
                     f"{np.median(of_sums):.0f} |",
                     flush=True,
                 )
@@ -177,14 +177,14 @@ def sums_over_all_time(model: Config, rows: list[np.ndarray], limit: float) -> f
         def keep(state: Any, signals: Any) -> Any:
             return experiment.identifier.estimate(state.identifier, experiment.transmission)["motor"]["half_gap"]
 
-        given = jnp.asarray(rows[0]), {"motor": jnp.asarray(rows[1]), "load": jnp.asarray(rows[2])}
-        found = np.asarray(jax.jit(lambda torque, measured: replay(experiment, torque, measured, record=keep)[1])(*given))
-    beyond = np.flatnonzero(found[round(10.0 / model.run.sample_period) :] > limit)
+        inputs = jnp.asarray(rows[0]), {"motor": jnp.asarray(rows[1]), "load": jnp.asarray(rows[2])}
+        sums = np.asarray(jax.jit(lambda torque, measured: replay(experiment, torque, measured, record=keep)[1])(*inputs))
+    beyond = np.flatnonzero(sums[round(10.0 / model.run.sample_period) :] > limit)
     return 10.0 + float(beyond[0]) * model.run.sample_period if len(beyond) else np.inf
 
 
-def wrong(drives: list[str], runs: int, noise: float = 1e-4) -> None:
-    """What an error of the model's numbers makes of the gap and the stiffness."""
+def compare_wrong_models(drives: list[str], runs: int, noise: float = 1e-4) -> None:
+    """Compare gap and stiffness under errors of the model's numbers."""
     print("| drive | wrong in the model | side chosen | half gap | by the motor | by the load | stiffness | ", end="")
     print("sides contradict | ", end="")
     print("alarms, limit 1.1 times the gap |")
@@ -199,43 +199,45 @@ def wrong(drives: list[str], runs: int, noise: float = 1e-4) -> None:
         "motor's alpha a quarter, lambda a half": {"observer.motor.alpha": 0.25, "observer.motor.lambda": 0.5},
     }
     for name in drives:
-        own = study(name)
-        rows = simulated(own, np.ones(round(40.0 / own.run.sample_period)), np.arange(runs), noise)
-        experiment = own.build()
+        config = study(name)
+        rows = simulate_rows(config, np.ones(round(40.0 / config.run.sample_period)), np.arange(runs), noise)
+        experiment = config.build()
         leaves = leaf_paths(experiment)
-        for what, factors in changes.items():
+        for change, factors in changes.items():
             if not {*factors} <= {*leaves}:
                 continue
-            model = with_values(own, {path: factor * float(get_leaf(experiment, path)) for path, factor in factors.items()})
-            found = [watched(model, [one[i] for one in rows], 10.0) for i in range(runs)]
-            true, stiffness = half_gap_of(own), float(get_leaf(experiment, "transmission.stiffness"))
+            model = with_values(
+                config, {path: factor * float(get_leaf(experiment, path)) for path, factor in factors.items()}
+            )
+            watched = [watch_rows(model, [columns[i] for columns in rows], 10.0) for i in range(runs)]
+            true, stiffness = half_gap_of(config), float(get_leaf(experiment, "transmission.stiffness"))
             gap, k, contrary, least, side = (
-                np.concatenate([one[key] for one in found])
+                np.concatenate([columns[key] for columns in watched])
                 for key in ("half_gap", "stiffness", "contradiction", "half_gap_least", "side")
             )
-            of_side = [np.concatenate([one[f"{side}.half_gap"] for one in found]) for side in ("motor", "load")]
+            of_side = [np.concatenate([columns[f"{side}.half_gap"] for columns in watched]) for side in ("motor", "load")]
             print(
-                f"| {name} | {what} | motor {100 * np.mean(side == 'motor'):.0f} % | "
+                f"| {name} | {change} | motor {100 * np.mean(side == 'motor'):.0f} % | "
                 f"{100 * (np.nanmean(gap) / true - 1.0):+.2g} % | "
-                + " | ".join(f"{100 * (np.nanmedian(one) / true - 1.0):+.2g} %" for one in of_side)
+                + " | ".join(f"{100 * (np.nanmedian(columns) / true - 1.0):+.2g} %" for columns in of_side)
                 + f" | {100 * (np.nanmean(k) / stiffness - 1.0):+.2g} % | "
                 f"{100 * np.mean(contrary):.0f} % | {int(np.sum(np.nan_to_num(least) > 1.1 * true))} of {len(gap)} values |",
                 flush=True,
             )
 
 
-def speed(seconds: float = 20.0) -> None:
+def measure_speed(seconds: float = 20.0) -> None:
     """Samples a second on the cores that this process has: from memory, and by UDP from another thread at 10 kHz."""
     model = study("hard gap", run__sample_period=1e-4, run__substeps=1, run__duration=seconds)
     count = round(seconds / model.run.sample_period)
-    rows = [one[0] for one in simulated(model, np.ones(count), np.arange(1), 1e-4)]
-    watched(model, [one[: round(11.0 / model.run.sample_period)] for one in rows], 10.0)
+    rows = [column[0] for column in simulate_rows(model, np.ones(count), np.arange(1), 1e-4)]
+    watch_rows(model, [column[: round(11.0 / model.run.sample_period)] for column in rows], 10.0)
     start = time.process_time()
-    watched(model, rows, 10.0)
+    watch_rows(model, rows, 10.0)
     print(f"10 kHz from memory: {count / (time.process_time() - start):.3g} samples a second of processor time")
     table = np.stack([np.arange(count) * model.run.sample_period, *rows], axis=1)
-    by_udp("float64", [one.astype("<f8").tobytes() for one in table], model)
-    by_udp("text", [",".join(map(repr, one.tolist())).encode() for one in table], model)
+    by_udp("float64", [column.astype("<f8").tobytes() for column in table], model)
+    by_udp("text", [",".join(map(repr, column.tolist())).encode() for column in table], model)
 
 
 def by_udp(form: str, rows: list[bytes], model: Config) -> None:
@@ -248,34 +250,34 @@ def by_udp(form: str, rows: list[bytes], model: Config) -> None:
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            for i, one in enumerate(rows):
+            for i, datagram in enumerate(rows):
                 if i % 20 == 0 and (wait := began[0] + i * model.run.sample_period - time.perf_counter()) > 0.0:
                     time.sleep(wait)
-                out.sendto(one, ("127.0.0.1", port))
+                out.sendto(datagram, ("127.0.0.1", port))
         time.sleep(0.5)
         sent.set()
 
     sender = threading.Thread(target=send)
 
-    def ended() -> bool:
+    def has_ended() -> bool:
         # the first call comes once everything is compiled and the address is open
         if not began:
             began.append(time.perf_counter())
             sender.start()
         return sent.is_set()
 
-    def said(values: Any) -> None:
+    def note_values(values: Any) -> None:
         late.append(time.perf_counter() - began[0] - values["t"])
 
     start = time.process_time()
-    found = run_watch(task, on_values=said, ended=ended)
+    watched = run_watch(task, on_values=note_values, ended=has_ended)
     used = time.process_time() - start
     sender.join()
     print(
-        f"10 kHz by UDP, {form}, one row a datagram: {found.summary['samples']} of {len(rows)} samples, {used:.1f} s of "
+        f"10 kHz by UDP, {form}, one row a datagram: {watched.summary['samples']} of {len(rows)} samples, {used:.1f} s of "
         f"processor time with sending and compiling for {len(rows) * model.run.sample_period:g} s; values "
         f"{1e3 * np.median(late):.0f} ms after their last sample (worst {1e3 * max(late):.0f} ms); left out: "
-        f"{found.summary['left_out'] or 'nothing'}"
+        f"{watched.summary['left_out'] or 'nothing'}"
     )
 
 
@@ -284,12 +286,12 @@ def main() -> None:
     parser.add_argument("what", choices=("alarms", "growth", "wrong", "speed"))
     parser.add_argument("--runs", type=int, default=None)
     parser.add_argument("--drive", choices=STUDIES, help="left out: both")
-    given = parser.parse_args()
-    if given.what == "speed":
-        speed()
+    args = parser.parse_args()
+    if args.what == "speed":
+        measure_speed()
     else:
-        function, runs = {"alarms": (alarms, 100), "growth": (growth, 10), "wrong": (wrong, 10)}[given.what]
-        function([given.drive] if given.drive else [*STUDIES], given.runs or runs)
+        function, runs = {"alarms": (alarms, 100), "growth": (growth, 10), "wrong": (compare_wrong_models, 10)}[args.what]
+        function([args.drive] if args.drive else [*STUDIES], args.runs or runs)
 
 
 if __name__ == "__main__":

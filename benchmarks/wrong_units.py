@@ -38,7 +38,7 @@ RECORDINGS = ("emps", "servo_1khz-S1", "flexible_link")
 LONGEST = 60.0
 """Seconds that a command may take."""
 DOUBT = "Doubtful: "
-"""How a warning of wrong units begins."""
+"""Beginning of a warning of wrong units."""
 
 
 class MeasuredLog(NamedTuple):
@@ -50,7 +50,7 @@ class MeasuredLog(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a command ended: its first line, exit code, how long it took, s, and how long processors computed, s."""
+    """End of a command: its first line, exit code, wall time in s, and processor time in s."""
 
     line: str
     code: int
@@ -73,9 +73,9 @@ def hidden_effect() -> MeasuredLog:
 
 def recording(name: str, data: Path, folder: Path) -> MeasuredLog:
     """One of real/machines.py, its first log."""
-    case = next(one for one in CASES if one.name == name)
-    if why := unfit(case, data):
-        raise SystemExit(f"{name}: {why}")
+    case = next(candidate for candidate in CASES if candidate.name == name)
+    if reason := unfit(case, data):
+        raise SystemExit(f"{name}: {reason}")
     logs, _ = logs_of(case, data, folder)
     config, _ = read_model(case.study)
     record = read_record(logs[0], config.log)
@@ -87,48 +87,48 @@ def recording(name: str, data: Path, folder: Path) -> MeasuredLog:
     return MeasuredLog(frame, dict(case.study) | {"log": log}, linear)
 
 
-def _scaled(log: MeasuredLog, columns: tuple[str, ...], factor: float) -> pd.DataFrame:
+def _scale(log: MeasuredLog, columns: tuple[str, ...], factor: float) -> pd.DataFrame:
     return log.frame.assign(**{name: factor * log.frame[name] for name in columns if name in log.frame})
 
 
 _BOTH = ("theta_e", "theta_s")
 WRONG: dict[str, Callable[[MeasuredLog], pd.DataFrame]] = {
-    "torque x 1000": lambda log: _scaled(log, ("u",), 1e3),
-    "degrees": lambda log: _scaled(log, _BOTH, 1e3 if log.linear else 180.0 / np.pi),
-    "sign of u": lambda log: _scaled(log, ("u",), -1.0),
-    "time in ms": lambda log: _scaled(log, ("t",), 1e3),
-    "positions / 1000": lambda log: _scaled(log, _BOTH, 1e-3),
+    "torque x 1000": lambda log: _scale(log, ("u",), 1e3),
+    "degrees": lambda log: _scale(log, _BOTH, 1e3 if log.linear else 180.0 / np.pi),
+    "sign of u": lambda log: _scale(log, ("u",), -1.0),
+    "time in ms": lambda log: _scale(log, ("t",), 1e3),
+    "positions / 1000": lambda log: _scale(log, _BOTH, 1e-3),
 }
 RIGHT: dict[str, Callable[[MeasuredLog], pd.DataFrame]] = {"nothing": lambda log: log.frame}
 
 
-def ended(command: str, log: Path, model: Path, out: Path, limit: float) -> Ended:
+def run_command(command: str, log: Path, model: Path, out: Path, limit: float) -> Ended:
     """Run a command in a process of its own, ended after `limit` seconds."""
     call = [sys.executable, "-m", "jaxbl", command, str(log), "--model", str(model), "--out", str(out), "--overwrite"]
-    start, before = time.perf_counter(), _computed()
+    start, before = time.perf_counter(), _processor_seconds()
     try:
         done = subprocess.run(call, capture_output=True, text=True, timeout=limit, check=False, env=os.environ)
     except subprocess.TimeoutExpired:
-        return Ended("(not ended)", -1, time.perf_counter() - start, _computed() - before)
-    said = done.stderr if done.returncode else done.stdout
-    line = next(iter(said.splitlines()), "")
-    return Ended(line.replace(f"{log}: ", ""), done.returncode, time.perf_counter() - start, _computed() - before)
+        return Ended("(not ended)", -1, time.perf_counter() - start, _processor_seconds() - before)
+    output = done.stderr if done.returncode else done.stdout
+    line = next(iter(output.splitlines()), "")
+    return Ended(line.replace(f"{log}: ", ""), done.returncode, time.perf_counter() - start, _processor_seconds() - before)
 
 
-def _computed() -> float:
+def _processor_seconds() -> float:
     """Processor time of all processes that have ended, s."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def fault(what: str, one: Ended) -> str:
-    """What is wrong with how a command took a log; "" for nothing."""
-    doubts = one.line.startswith(DOUBT)
-    if what in RIGHT:
-        return "false doubt" if one.code or doubts else ""
-    if one.code == 2 or (one.code == 0 and doubts):
-        return "slow" if one.seconds > LONGEST else ""
-    return "silent" if one.code == 0 else "failed"
+def fault(change_name: str, run: Ended) -> str:
+    """Fault in a command's answer to a log; empty if there is none."""
+    doubts = run.line.startswith(DOUBT)
+    if change_name in RIGHT:
+        return "false doubt" if run.code or doubts else ""
+    if run.code == 2 or (run.code == 0 and doubts):
+        return "slow" if run.seconds > LONGEST else ""
+    return "silent" if run.code == 0 else "failed"
 
 
 def rows(asked: argparse.Namespace, folder: Path) -> Iterator[tuple[str, str, str, Ended, str]]:
@@ -142,14 +142,14 @@ def rows(asked: argparse.Namespace, folder: Path) -> Iterator[tuple[str, str, st
         log = maker()
         model = folder / f"{name}.toml"
         model.write_text(tomli_w.dumps(log.study))
-        for what, change in (RIGHT if asked.right else WRONG).items():
-            if asked.wrong and what not in asked.wrong:
+        for change_name, change in (RIGHT if asked.right else WRONG).items():
+            if asked.wrong and change_name not in asked.wrong:
                 continue
             path = folder / f"{name}.parquet"
             change(log).to_parquet(path)
             for command in asked.commands:
-                one = ended(command, path, model, folder / "out" / command, asked.limit)
-                yield name, what, command, one, fault(what, one)
+                run = run_command(command, path, model, folder / "out" / command, asked.limit)
+                yield name, change_name, command, run, fault(change_name, run)
 
 
 def main() -> None:
@@ -165,12 +165,13 @@ def main() -> None:
     print("| log | wrong | command | first line | exit | s | processor s | fault |")
     print("|---|---|---|---|---:|---:|---:|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for name, what, command, one, wrong in rows(asked, Path(folder)):
+        for name, change_name, command, run, wrong in rows(asked, Path(folder)):
             count, faults = count + 1, faults + bool(wrong)
-            line = one.line.replace("|", "/")
+            line = run.line.replace("|", "/")
             line = f"{line[:150]}..." if len(line) > 150 else line
             print(
-                f"| {name} | {what} | {command} | {line} | {one.code} | {one.seconds:.1f} | {one.computed:.1f} | {wrong} |",
+                f"| {name} | {change_name} | {command} | {line} | {run.code} | {run.seconds:.1f} | "
+                f"{run.computed:.1f} | {wrong} |",
                 flush=True,
             )
     print(f"\n{faults} of {count} with a fault")

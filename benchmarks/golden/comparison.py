@@ -146,12 +146,12 @@ def gather(file: str, places: Iterable[_Place]) -> list[Difference]:
     for (path, sentences), group in by_path.items():
         largest = max(group, key=lambda place: place.relative)
         amount = f" (by {largest.relative:.1e} of it)" if largest.relative else ""
-        others = f", and {len(group) - 1} more" if len(group) > 1 else ""
-        differences.append(Difference(file, path, _shortened(largest.what) + amount + others, largest.relative, sentences))
+        further = f", and {len(group) - 1} more" if len(group) > 1 else ""
+        differences.append(Difference(file, path, _shorten(largest.what) + amount + further, largest.relative, sentences))
     return differences
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 
@@ -190,8 +190,8 @@ def compare_columns(file: str, name: str, base: np.ndarray, tree: np.ndarray, to
     if not differs.any():
         return []
     relative = math.inf if math.isnan(relative) else relative
-    what = f"{int(differs.sum())} of {len(base)} numbers, by up to {relative:.1e} of the largest"
-    return [Difference(file, name, what, relative)]
+    description = f"{int(differs.sum())} of {len(base)} numbers, by up to {relative:.1e} of the largest"
+    return [Difference(file, name, description, relative)]
 
 
 _COMMENTS = {
@@ -210,8 +210,8 @@ def compare_text(file: str, base: str, tree: str) -> Difference:
         (number for number, (first, second) in pairs if first != second), min(len(base_lines), len(tree_lines)) + 1
     )
     first, second = (lines[number - 1].strip() if number <= len(lines) else "(end)" for lines in (base_lines, tree_lines))
-    what = _shortened(f"line {number}: {first!r} -> {second!r}")
+    description = _shorten(f"line {number}: {first!r} -> {second!r}")
     comments = _COMMENTS.get(Path(file).suffix)
     if comments is not None and comments.sub("", base).split() == comments.sub("", tree).split():
-        return Difference(file, "comments", what)
-    return Difference(file, "", what)
+        return Difference(file, "comments", description)
+    return Difference(file, "", description)

@@ -39,7 +39,7 @@ def tutorial(folder: Path) -> None:
     simulated_log(str(machine), folder / "log.csv", ["t", "u", "theta_e"])
 
 
-def simulated(folder: Path) -> None:
+def write_simulated(folder: Path) -> None:
     """A geared axis with both encoders, a direct drive three times, and a transmission on a test rig."""
     simulated_log(f"{SWEEPS}/geared_axis.toml", folder / "geared.parquet", ["t", "u", "theta_e", "theta_s"])
     for seed, name in enumerate(("direct", "direct_1", "direct_2")):
@@ -56,9 +56,9 @@ def hidden(folder: Path) -> None:
     """Forty machines with hidden effects, in four folders as `jaxbl diagnose --batch` reads them."""
     from hidden.cases import cases, save
 
-    found = cases(41, 40, "all")
+    hidden_cases = cases(41, 40, "all")
     for part in range(PARTS_OF_HIDDEN):
-        save(found[part::PARTS_OF_HIDDEN], folder / str(part + 1))
+        save(hidden_cases[part::PARTS_OF_HIDDEN], folder / str(part + 1))
         (folder / str(part + 1) / "truth.json").unlink()
 
 
@@ -74,17 +74,17 @@ def effects(folder: Path) -> None:
         for kind, numbers in values.items()
     ]
     on_one_side = [table for table in tables if str(table["kind"]).startswith(("motor.", "actuator.", "encoder."))]
-    others = {
+    tables_beside = {
         "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
         "encoders": {"noise": 1e-3, "motor_resolution": 1e-3},
     }
     moved = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
     length = {"run.duration": 1.5, "run.substeps": 4}
-    (folder / "geared.toml").write_text(tomli_w.dumps(small(length, effects=tables, initial=moved, **others)))
-    (folder / "rigid.toml").write_text(tomli_w.dumps(rigid(length, effects=on_one_side, **others)))
+    (folder / "geared.toml").write_text(tomli_w.dumps(small(length, effects=tables, initial=moved, **tables_beside)))
+    (folder / "rigid.toml").write_text(tomli_w.dumps(rigid(length, effects=on_one_side, **tables_beside)))
 
 
-def recorded(folder: Path) -> None:
+def write_recorded(folder: Path) -> None:
     """Nominal models of real machines, and one log that is put together from three files."""
     from real.machines import CASES, logs_of
 
@@ -107,6 +107,6 @@ if __name__ == "__main__":
     import jaxbl
 
     SWEEPS = Path(jaxbl.__file__).parents[1] / "sweeps"
-    {"tutorial": tutorial, "simulated": simulated, "hidden": hidden, "effects": effects, "recorded": recorded}[name](
-        Path(place)
-    )
+    {"tutorial": tutorial, "simulated": write_simulated, "hidden": hidden, "effects": effects, "recorded": write_recorded}[
+        name
+    ](Path(place))

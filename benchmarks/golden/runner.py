@@ -26,7 +26,7 @@ COMPARED = (*TEXT, ".parquet")
 
 
 def printed_by(arguments: list[str]) -> str:
-    """What a command prints; where it fails otherwise than by an exit code, a JSON object with the error."""
+    """Output of a command; a JSON object with the error if it fails otherwise than by an exit code."""
     sys.argv = ["jaxbl", *arguments]
     printed = io.StringIO()
     try:

@@ -99,7 +99,7 @@ class Log:
         return {name: values for name, values in named.items() if values is not None}
 
     def write(self, path: Path) -> None:
-        """As CSV, with all digits that the encoders have."""
+        """Write the log as CSV, with all digits that the encoders have."""
         columns = self.columns()
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savetxt(path, np.column_stack(list(columns.values())), "%.10g", ",", header=",".join(columns), comments="")
@@ -173,22 +173,22 @@ def cases(seed: int, count: int, kind: str = "single", duration: float | None = 
         raise ValueError(f"unknown kind {kind!r}; one of {', '.join((*KINDS, *ALONE, 'all'))}")
     counts = {kind: count}
     if kind == "all":
-        each = count // (2 * (len(KINDS) - 1))
-        counts = dict.fromkeys(KINDS, each) | {"single": count - each * (len(KINDS) - 1)}
-    wanted = [(part, i, *target) for part, n in counts.items() for i, target in enumerate(_targets(seed, n, part))]
-    found: dict[int, Case] = {}
+        share = count // (2 * (len(KINDS) - 1))
+        counts = dict.fromkeys(KINDS, share) | {"single": count - share * (len(KINDS) - 1)}
+    targets = [(part, i, *target) for part, n in counts.items() for i, target in enumerate(_targets(seed, n, part))]
+    cases_by_number: dict[int, Case] = {}
     for draw_number in range(_MOST_DRAWS):
-        missing = [i for i in range(len(wanted)) if i not in found]
+        missing = [i for i in range(len(targets)) if i not in cases_by_number]
         if not missing:
             break
-        plans = [_plan(seed, draw_number, *wanted[i], duration) for i in missing]
+        plans = [_plan(seed, draw_number, *targets[i], duration) for i in missing]
         for i, case in zip(missing, _carry_out(seed, plans), strict=True):
             if case is not None:
-                found[i] = case
-    left = [wanted[i] for i in range(len(wanted)) if i not in found]
+                cases_by_number[i] = case
+    left = [targets[i] for i in range(len(targets)) if i not in cases_by_number]
     if left:
         raise RuntimeError(f"no fit case in {_MOST_DRAWS} draws for {left}")
-    return [found[i] for i in range(len(wanted))]
+    return [cases_by_number[i] for i in range(len(targets))]
 
 
 def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[str, float], ...]]]:
@@ -232,34 +232,34 @@ def _plan(
 ) -> _Plan:
     rng = np.random.default_rng([seed, (*KINDS, *ALONE).index(kind), 2, index, draw_number])
     names = [name for name, _ in hidden]
-    given = _PLANTS[plant]
+    ranges = _PLANTS[plant]
     conditions, uncertainty = _conditions(kind, plant, rng)
     if duration is not None:
         conditions["duration"] = duration
     # machines of a kind are not all alike
     drive = {
         key: value * float(np.exp(rng.normal(0.0, 0.15))) if key not in ("kind", "gear_ratio") else value
-        for key, value in given["drive"].items()
+        for key, value in ranges["drive"].items()
     }
-    machine = Machine(drive, None if plant == "direct" else _law(given, names, rng))
-    machine = replace(machine, effects=_known(machine, names, given, rng))
-    runs = _runs(machine, given, conditions, rng)
+    machine = Machine(drive, None if plant == "direct" else _law(ranges, names, rng))
+    machine = replace(machine, effects=_add_known_effect(machine, names, ranges, rng))
+    runs = _runs(machine, ranges, conditions, rng)
     return _Plan(index, kind, plant, hidden, rng, seed, machine, conditions, runs, uncertainty)
 
 
 def _conditions(kind: str, plant: str, rng: np.random.Generator) -> tuple[dict[str, Any], float]:
-    """What is measured and how, and the relative uncertainty of the nominal numbers."""
+    """Draw excitations, encoders and sampling of a case, and the relative uncertainty of its nominal numbers."""
     hard = set(rng.permutation(5)[: rng.integers(3, 6)].tolist()) if kind == "hard" else set()
     easy_loop = kind != "hard" and rng.random() < 0.3
     coarse = 2 in hard
     torque_noise = float(rng.uniform(0.01, 0.03)) if 4 in hard else 0.01 if kind != "hard" and rng.random() < 0.25 else 0.0
     uncertainty = round(float(rng.uniform(0.04, 0.06) if 3 in hard else rng.uniform(0.01, 0.03)), 3)
     quantised = rng.random() < (0.7 if coarse else 0.4)
-    one, two = rng.permutation(EXCITATIONS)[:2]
+    first, second = rng.permutation(EXCITATIONS)[:2]
     conditions = {
         "plant": plant,
-        "excitation": str(one),
-        "holdout": str(two),
+        "excitation": str(first),
+        "holdout": str(second),
         "loop": "closed" if easy_loop or 0 in hard else "open",
         "period": float(rng.choice([1e-3, 2e-3])),
         "duration": 3.0 if 1 in hard else float(rng.integers(10, 21)),
@@ -272,9 +272,9 @@ def _conditions(kind: str, plant: str, rng: np.random.Generator) -> tuple[dict[s
     return conditions, uncertainty
 
 
-def _law(given: Mapping[str, Any], names: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
-    stiffness = given["stiffness"] * float(np.exp(rng.normal(0.0, 0.15)))
-    gap, smooth = rng.random() < given["gap"], rng.random() < 0.25
+def _law(ranges: Mapping[str, Any], names: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
+    stiffness = ranges["stiffness"] * float(np.exp(rng.normal(0.0, 0.15)))
+    gap, smooth = rng.random() < ranges["gap"], rng.random() < 0.25
     if not gap or "transmission.backlash" in names:
         return {"law": "linear_shaft", "stiffness": stiffness}
     scale = float(np.exp(rng.normal(0.0, 0.15)))
@@ -282,14 +282,14 @@ def _law(given: Mapping[str, Any], names: Sequence[str], rng: np.random.Generato
         return {
             "law": "sigmoid_backlash",
             "stiffness": stiffness,
-            "dead_zone": given["dead_zone"] * scale,
-            "slope": given["slope"],
+            "dead_zone": ranges["dead_zone"] * scale,
+            "slope": ranges["slope"],
         }
-    return {"law": "dead_zone", "stiffness": stiffness, "half_gap": given["half_gap"] * scale}
+    return {"law": "dead_zone", "stiffness": stiffness, "half_gap": ranges["half_gap"] * scale}
 
 
-def _known(
-    machine: Machine, names: Sequence[str], given: Mapping[str, Any], rng: np.random.Generator
+def _add_known_effect(
+    machine: Machine, names: Sequence[str], ranges: Mapping[str, Any], rng: np.random.Generator
 ) -> tuple[dict[str, Any], ...]:
     """Another effect, which the nominal model has too."""
     rigid = machine.rigid
@@ -297,35 +297,35 @@ def _known(
     possible = [kind for kind in possible if not any(exclusive(name, kind) for name in names)]
     if not possible:
         return ()
-    chosen, wanted = str(rng.choice(possible)), rng.random() < 0.3
-    torque = float(rng.uniform(0.05, 0.12)) * float(np.mean(given["torque"]))
+    chosen, adds_effect = str(rng.choice(possible)), rng.random() < 0.3
+    torque = float(rng.uniform(0.05, 0.12)) * float(np.mean(ranges["torque"]))
     torque *= machine.ratio if chosen.startswith("load.") else 1.0
-    if "unknown.drifting_friction" in names or not wanted:
+    if "unknown.drifting_friction" in names or not adds_effect:
         return ()
     return ({"kind": chosen, "torque": torque} | ({"phase": 0.0} if chosen == "load.gravity" else {}),)
 
 
 def _runs(
-    machine: Machine, given: Mapping[str, Any], conditions: dict[str, Any], rng: np.random.Generator
+    machine: Machine, ranges: Mapping[str, Any], conditions: dict[str, Any], rng: np.random.Generator
 ) -> tuple[Run, Run]:
     drive, ratio, period = machine.drive, machine.ratio, conditions["period"]
     inertia = drive["motor_inertia"] + drive.get("load_inertia", 0.0) / ratio**2
     viscous = drive["motor_viscous"] + drive.get("load_viscous", 0.0) / ratio**2
-    torque = float(rng.uniform(*given["torque"]))
-    frequency = float(rng.uniform(*given["frequency"]))
-    bandwidth = float(rng.uniform(*given["bandwidth"]))
+    torque = float(rng.uniform(*ranges["torque"]))
+    frequency = float(rng.uniform(*ranges["frequency"]))
+    bandwidth = float(rng.uniform(*ranges["bandwidth"]))
     if conditions["duration"] < 5.0:
         frequency *= 2.0
     half_gap = (machine.transmission or {}).get("half_gap", 0.0)
     speed = torque / math.hypot(viscous, inertia * 2.0 * math.pi * frequency)
     resolution = 2.0 * math.pi / conditions["counts"] if conditions["counts"] else 0.0
     runs = []
-    for number, which in enumerate(("excitation", "holdout")):
+    for number, key in enumerate(("excitation", "holdout")):
         duration = conditions["duration"]
         if number == 1 and duration >= 3.0:
             duration = max(5.0, 0.5 * duration)
         n = round(duration / period)
-        wave = _wave(conditions[which], n, period, frequency * float(rng.uniform(0.8, 1.25)), rng)
+        wave = _wave(conditions[key], n, period, frequency * float(rng.uniform(0.8, 1.25)), rng)
         turn = float(rng.uniform(-0.5, 0.5))
         start = (ratio * turn + half_gap * float(rng.uniform(-0.8, 0.8)), 0.0, turn, 0.0)
         if conditions["initial_state"] == "unknown":
@@ -344,7 +344,7 @@ def _runs(
         if conditions["loop"] == "open":
             runs.append(Run(machine, period, torque * wave / rms(wave), **shared))
             continue
-        reference = _smooth(wave, period, 4.0 * frequency) if conditions[which] == "steps" else wave
+        reference = _smooth(wave, period, 4.0 * frequency) if conditions[key] == "steps" else wave
         rate = np.gradient(reference, period)
         needed = rms(inertia * np.gradient(rate, period) + viscous * rate)
         reference, rate = torque / needed * reference, torque / needed * rate
@@ -405,23 +405,25 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
             effects.extend(drawn)
             found[str(drawn[0]["kind"])] = size
         small = _clutter(plan, list(found), motion) if fine and plan.kind == "clutter" else []
-        full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects), *small)))
+        full.append(replace(plan.machine, effects=(*plan.machine.effects, *_order_effects(effects), *small)))
         sizes.append(found)
         clutter.append(small)
     runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]
     nudges = [_NUDGE * rms(trace.states[1]) for trace in plain]
     traces = simulate(runs)
-    nudged = simulate([_nudged(runs[2 * i], nudge) for i, nudge in enumerate(nudges)])
+    nudged = simulate([_nudge(runs[2 * i], nudge) for i, nudge in enumerate(nudges)])
     result: list[Case | None] = []
     for i, plan in enumerate(plans):
-        pair, made = (runs[2 * i], runs[2 * i + 1]), (traces[2 * i], traces[2 * i + 1])
-        seen = _seen(pair[0], plain[i], made[0])
-        fit = all(_fit(trace, plain[i], plan.machine) for trace in made) and (not plan.hidden or seen >= _LEAST_SEEN)
+        pair, pair_traces = (runs[2 * i], runs[2 * i + 1]), (traces[2 * i], traces[2 * i + 1])
+        visibility = _seen(pair[0], plain[i], pair_traces[0])
+        fit = all(_fit(trace, plain[i], plan.machine) for trace in pair_traces) and (
+            not plan.hidden or visibility >= _LEAST_SEEN
+        )
         if not fit:
             result.append(None)
             continue
-        growth = rms(nudged[i].states[0] - made[0].states[0]) / nudges[i]
-        result.append(_case(seed, plan, sizes[i], clutter[i], {"seen": seen, "growth": growth}, pair, made))
+        growth = rms(nudged[i].states[0] - pair_traces[0].states[0]) / nudges[i]
+        result.append(_case(seed, plan, sizes[i], clutter[i], {"seen": visibility, "growth": growth}, pair, pair_traces))
     return result
 
 
@@ -434,7 +436,7 @@ def _clutter(plan: _Plan, hidden: Sequence[str], motion: Motion) -> list[dict[st
 _ORDER = ("actuator.delay", "actuator.gain_error", "actuator.saturation", "actuator.lag")
 
 
-def _ordered(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _order_effects(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Actuator effects in the order in which the simulator applies them."""
     return sorted(effects, key=lambda effect: _ORDER.index(effect["kind"]) if effect["kind"] in _ORDER else -1)
 
@@ -442,24 +444,24 @@ def _ordered(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
 _NUDGE = 1e-6
 
 
-def _nudged(run: Run, nudge: float) -> Run:
+def _nudge(run: Run, nudge: float) -> Run:
     theta_e, w_e, theta_s, w_s = run.initial
     return replace(run, initial=(theta_e, w_e + nudge, theta_s, w_s))
 
 
-def _seen(run: Run, plain: Trace, made: Trace) -> float:
+def _seen(run: Run, plain: Trace, trace: Trace) -> float:
     """Change of what the encoders read, over their noise; the larger of both sides."""
     noises = [math.hypot(noise, count / math.sqrt(12.0)) for noise, count in
               ((run.motor_noise, run.motor_resolution), (run.load_noise, run.load_resolution))]  # fmt: skip
-    change = made.states - plain.states
-    seen = [rms(change[0]) / noises[0]]
+    change = trace.states - plain.states
+    ratios = [rms(change[0]) / noises[0]]
     if not run.machine.rigid:
-        seen.append(rms(change[2]) / noises[1])
-    return float(max(seen))
+        ratios.append(rms(change[2]) / noises[1])
+    return float(max(ratios))
 
 
 def _fit(trace: Trace, plain: Trace, machine: Machine) -> bool:
-    """Whether a drive moves, and stays within bounds."""
+    """True if a drive moves, and stays within bounds."""
     if not np.isfinite(trace.states).all():
         return False
     moving = rms(trace.states[1]) / rms(plain.states[1])
@@ -479,16 +481,16 @@ def _case(
     machine = runs[0].machine
     hidden = {str(effect["kind"]): {k: v for k, v in effect.items() if k != "kind"} for effect in
               machine.effects[len(plan.machine.effects) : len(machine.effects) - len(clutter)]}  # fmt: skip
-    known = list(plan.machine.effects)
+    nominal_effects = list(plan.machine.effects)
     drift = hidden.get("unknown.drifting_friction")
     if drift is not None:  # its mean is known
-        known.append({"kind": f"{drift['side']}.coulomb_friction", "torque": drift["torque"]})
+        nominal_effects.append({"kind": f"{drift['side']}.coulomb_friction", "torque": drift["torque"]})
     verdict = {"none": "no_discrepancy", "unknown": "unknown_effect"}.get(plan.kind, "explained")
-    true = Machine(machine.drive, machine.transmission, (*known, *_ordered(_explained(machine, hidden))))
+    true = Machine(machine.drive, machine.transmission, (*nominal_effects, *_order_effects(_explain(machine, hidden))))
     nominal = Machine(
         _off(machine.drive, plan.uncertainty, plan.rng, [error_of(kind) for kind in hidden]),
         None if machine.transmission is None else _off(machine.transmission, plan.uncertainty, plan.rng),
-        [_off(effect, plan.uncertainty, plan.rng) for effect in known],
+        [_off(effect, plan.uncertainty, plan.rng) for effect in nominal_effects],
     )
     name = f"{plan.kind}-{seed}-{plan.index:03d}"
     truth = {
@@ -514,7 +516,7 @@ def _case(
     )
 
 
-def _explained(machine: Machine, hidden: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _explain(machine: Machine, hidden: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [{"kind": kind, **values} for kind, values in hidden.items() if not kind.startswith("unknown.")]
 
 
@@ -522,15 +524,15 @@ def _off(
     table: Mapping[str, Any], uncertainty: float, rng: np.random.Generator, exact: Collection[str | None] = ()
 ) -> dict[str, Any]:
     """A table as someone knows it who knows its numbers so well, to four digits; but for those that are exact."""
-    found = {}
+    nominal = {}
     for key, value in table.items():
         if isinstance(value, str) or key == "gear_ratio":
-            found[key] = value
+            nominal[key] = value
         else:
             error = 0.0 if key in exact else 1.0
             error *= float(np.clip(rng.standard_normal(), -2.0, 2.0))
-            found[key] = float(f"{value * (1.0 + uncertainty * error):.4g}")
-    return found
+            nominal[key] = float(f"{value * (1.0 + uncertainty * error):.4g}")
+    return nominal
 
 
 def _study(title: str, machine: Machine, conditions: Mapping[str, Any], run: Run) -> dict[str, Any]:
@@ -552,16 +554,18 @@ def _study(title: str, machine: Machine, conditions: Mapping[str, Any], run: Run
     return study
 
 
-def save(found: Sequence[Case], folder: Path) -> None:
+def save(hidden_cases: Sequence[Case], folder: Path) -> None:
     """Write cases as files: NAME.csv and NAME.toml side by side, hold-out logs in `holdout/`, the truth in truth.json."""
     import json
 
     import tomli_w
 
     folder.mkdir(parents=True, exist_ok=True)
-    for case in found:
+    for case in hidden_cases:
         case.log.write(folder / f"{case.name}.csv")
         case.holdout.write(folder / "holdout" / f"{case.name}.csv")
         (folder / f"{case.name}.toml").write_text(tomli_w.dumps(case.model), encoding="utf-8")
-    truths = {case.name: {"truth": case.truth, "conditions": case.conditions, "oracle": case.oracle} for case in found}
+    truths = {
+        case.name: {"truth": case.truth, "conditions": case.conditions, "oracle": case.oracle} for case in hidden_cases
+    }
     (folder / "truth.json").write_text(json.dumps(truths, indent=1), encoding="utf-8")

@@ -30,7 +30,7 @@ LOAD_EFFECTS = ("load.gravity", "load.periodic_disturbance")
 GEAR_EFFECTS = ("transmission.backlash", "transmission.hardening", "transmission.damping", "transmission.eccentricity")
 ACTUATOR_EFFECTS = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 EFFECTS = (*SIDE_EFFECTS, *LOAD_EFFECTS, "motor.cogging", *GEAR_EFFECTS, *ACTUATOR_EFFECTS)
-"""What the package knows: design.md, section 6."""
+"""Effects that the package knows."""
 PINION = "transmission.pinion"
 """Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
 _FRICTIONS = (f"{side}.{kind}_friction" for kind in ("presliding", "drifting", "asymmetric") for side in ("motor", "load"))
@@ -48,7 +48,7 @@ _LARGEST, _LEAST = 3.0, -0.6
 
 
 def on_rigid(effect: str) -> bool:
-    """Whether an effect has a meaning on a rigid drive."""
+    """True if an effect has a meaning on a rigid drive."""
     return not effect.startswith("transmission.") and not (effect.startswith("load.") and effect not in LOAD_EFFECTS)
 
 
@@ -58,13 +58,13 @@ def error_of(effect: str) -> str | None:
     return {"inertia": f"{side}_inertia", "viscous_friction": f"{side}_viscous"}.get(kind) if side != "actuator" else None
 
 
-def exclusive(one: str, other: str) -> bool:
-    """Whether two effects are too much alike to be hidden, or known, together."""
-    place = one.split(".")[0]
-    pair = {one, other}
+def exclusive(first: str, second: str) -> bool:
+    """True if two effects are too much alike to be hidden, or known, together."""
+    place = first.split(".")[0]
+    pair = {first, second}
     dry = {f"{place}.{kind}_friction" for kind in ("coulomb", "stribeck", "presliding", "drifting")}
     scaling = {"actuator.gain_error", "motor.inertia", "motor.viscous_friction"}
-    return one == other or pair <= dry or (pair <= scaling and "actuator.gain_error" in pair)
+    return first == second or pair <= dry or (pair <= scaling and "actuator.gain_error" in pair)
 
 
 @dataclass(frozen=True)
@@ -135,18 +135,18 @@ def draw(kind: str, size: float, motion: Motion, uncertainty: float, rng: np.ran
     scale = rms(motion.u)
     target = size * scale
 
-    def added(amount: float) -> float:
+    def add_effect(amount: float) -> float:
         return rms(torque(amount))
 
     # all grow with their amount, most in proportion to it
     low, high = 1e-9, 1.0
-    while added(high) < target and high < 1e9:
+    while add_effect(high) < target and high < 1e9:
         low, high = high, high * 10.0
     for _ in range(60):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if added(middle) < target else (low, middle)
+        low, high = (middle, high) if add_effect(middle) < target else (low, middle)
     amount = min(max(high, least), most)
-    return [{"kind": kind, **build(amount)}], added(amount) / scale
+    return [{"kind": kind, **build(amount)}], add_effect(amount) / scale
 
 
 def _shape(
@@ -257,13 +257,13 @@ def _shape(
             )  # fmt: skip
         case "delay":
             # of whole samples; controllers and buses have a few
-            def shifted(c: float) -> np.ndarray:
+            def shift_phase(c: float) -> np.ndarray:
                 late = _samples_of(c, motion.period)
                 return u - np.concatenate([np.zeros(late), u[: len(u) - late]])
 
-            return lambda c: {"delay": _samples_of(c, motion.period) * motion.period}, shifted, 0.0, math.inf
+            return lambda c: {"delay": _samples_of(c, motion.period) * motion.period}, shift_phase, 0.0, math.inf
         case "lag":
-            return lambda c: {"time_constant": c}, lambda c: u - _lagged(u, motion.period, c), 0.0, math.inf
+            return lambda c: {"time_constant": c}, lambda c: u - _lag(u, motion.period, c), 0.0, math.inf
         case "presliding_friction":
             length = float(np.exp(rng.uniform(*np.log([0.02, 0.3])))) * float(np.std(x))
             return linear("torque", dahl(v, motion.period, length), length=length)
@@ -312,7 +312,7 @@ def _samples_of(delay: float, period: float) -> int:
     return int(min(max(round(delay / period), 1), 12))
 
 
-def _lagged(u: np.ndarray, period: float, time_constant: float) -> np.ndarray:
+def _lag(u: np.ndarray, period: float, time_constant: float) -> np.ndarray:
     """Mean over each sample of a first-order lag of the held torque."""
     from scipy.signal import lfilter
 
@@ -336,6 +336,6 @@ def _swinging(v: np.ndarray, period: float, rate: float, damping: float) -> np.n
     from scipy.signal import cont2discrete, dlsim
 
     system = np.array([[0.0, 1.0], [-(rate**2), -2.0 * damping * rate]]), np.array([[-1.0], [2.0 * damping * rate]])
-    seen = np.array([[-(rate**2), -2.0 * damping * rate]]), np.array([[2.0 * damping * rate]])
-    found = cont2discrete((*system, *seen), period, "foh")
-    return dlsim(found, v)[1][:, 0]
+    outputs = np.array([[-(rate**2), -2.0 * damping * rate]]), np.array([[2.0 * damping * rate]])
+    discrete = cont2discrete((*system, *outputs), period, "foh")
+    return dlsim(discrete, v)[1][:, 0]

@@ -15,7 +15,7 @@ from .outcomes import TARGETS, Outcome, calibration, calibration_error, confusio
 
 def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
     """Draw what the outcomes give reason to."""
-    made = []
+    files = []
     with style():
         for name, figure in (
             ("confusion", _confusion(outcomes)),
@@ -24,8 +24,8 @@ def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
             ("gap", _gap(outcomes)),
         ):
             if figure is not None:
-                made.append(save(figure, folder / f"{name}.png"))
-    return made
+                files.append(save(figure, folder / f"{name}.png"))
+    return files
 
 
 def _confusion(outcomes: Sequence[Outcome]) -> Figure | None:
@@ -86,8 +86,8 @@ def _calibration(outcomes: Sequence[Outcome]) -> Figure | None:
 
 def _sizes(outcomes: Sequence[Outcome]) -> Figure | None:
     names = {"single": "single", "new": "new", "hard": "hard", "pairs": "pairs, both", "unknown": "unknown, abstains"}
-    groups = {kind: [one for one in outcomes if one.kind == kind] for kind in names}
-    groups = {kind: ones for kind, ones in groups.items() if ones}
+    groups = {kind: [outcome for outcome in outcomes if outcome.kind == kind] for kind in names}
+    groups = {kind: kind_outcomes for kind, kind_outcomes in groups.items() if kind_outcomes}
     if not groups:
         return None
     aims = {kind: kind for kind in names} | {"unknown": "abstentions"}
@@ -95,11 +95,11 @@ def _sizes(outcomes: Sequence[Outcome]) -> Figure | None:
     axes = figure.subplots()
     width = 0.8 / len(LEVELS)
     for k, level in enumerate(LEVELS):
-        for i, ones in enumerate(groups.values()):
-            group = [one for one in ones if one.level == level]
+        for i, kind_outcomes in enumerate(groups.values()):
+            group = [outcome for outcome in kind_outcomes if outcome.level == level]
             if not group:
                 continue
-            hits = sum(one.is_right for one in group)
+            hits = sum(outcome.is_right for outcome in group)
             low, high = wilson_interval(hits, len(group))
             x, rate = i + (k - 1) * width, hits / len(group)
             colour = (COLOURS[5], COLOURS[0], COLOURS[6])[k]
@@ -118,13 +118,19 @@ def _sizes(outcomes: Sequence[Outcome]) -> Figure | None:
 
 
 def _gap(outcomes: Sequence[Outcome]) -> Figure | None:
-    known = [one for one in outcomes if one.hidden and one.reduction is not None]
-    if not known:
+    measured = [outcome for outcome in outcomes if outcome.hidden and outcome.reduction is not None]
+    if not measured:
         return None
     figure = Figure(figsize=(6.4, 3.6))
     axes = figure.subplots()
     for i, kind in enumerate(("single", "hard", "pairs", "new")):
-        left = np.sort([max(1.0 - one.reduction, 1e-4) for one in known if one.kind == kind and one.reduction is not None])
+        left = np.sort(
+            [
+                max(1.0 - outcome.reduction, 1e-4)
+                for outcome in measured
+                if outcome.kind == kind and outcome.reduction is not None
+            ]
+        )
         if len(left):
             axes.step(
                 left, np.arange(1, len(left) + 1) / len(left), where="post", color=COLOURS[i], label=f"{kind} ({len(left)})"

@@ -10,7 +10,7 @@ import numpy as np
 from .effects import EFFECTS, NEW, UNKNOWN
 
 BINS = 10
-"""Of the calibration curve, over confidences from 0 to 1."""
+"""Bins of the calibration curve, over confidences from 0 to 1."""
 
 TARGETS = {
     "single": (0.97, True),

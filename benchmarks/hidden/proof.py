@@ -44,16 +44,16 @@ def foretold(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[dict[str, 
         runs += windows
         ranges.append(range(first, len(runs)))
     traces = simulate(runs, batch=2048)
-    found: list[dict[str, float] | None] = []
-    for (case, _), own in zip(asked, ranges, strict=True):
+    errors_of_models: list[dict[str, float] | None] = []
+    for (case, _), case_rows in zip(asked, ranges, strict=True):
         states, squares = case.traces[1].states, []
-        for i in own:
+        for i in case_rows:
             k, length = round(runs[i].origin / runs[i].period), len(runs[i].torque)
             squares.append(np.mean((traces[i].states - states[:, k : k + length]) ** 2, axis=1))
         errors = np.sqrt(np.mean(squares, axis=0)) if squares else np.zeros(0)
         channels = {"theta_e": 0} if case.runs[1].machine.rigid else {"theta_e": 0, "theta_s": 2}
-        found.append({name: float(errors[row]) for name, row in channels.items()} if squares else None)
-    return found
+        errors_of_models.append({name: float(errors[row]) for name, row in channels.items()} if squares else None)
+    return errors_of_models
 
 
 def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
@@ -83,10 +83,10 @@ def proofs(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[tuple[float 
     Without a gap before there is no reduction; without a model that the bench can run there is neither.
     """
     pairs = foretold([*((case, case.model) for case, _ in asked), *asked])
-    found: list[tuple[float | None, bool | None]] = []
+    results: list[tuple[float | None, bool | None]] = []
     for (case, _), before, after in zip(asked, pairs[: len(asked)], pairs[len(asked) :], strict=True):
         if before is None or after is None:
-            found.append((None, None))
+            results.append((None, None))
             continue
         noise = {"theta_e": case.runs[1].motor_noise, "theta_s": case.runs[1].load_noise}
         reductions, worse = [], False
@@ -95,8 +95,8 @@ def proofs(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[tuple[float 
             worse = worse or not new <= 1.05 * max(old, small)  # nan is worse
             if old > small:
                 reductions.append(1.0 - new / old if math.isfinite(new) else -math.inf)
-        found.append((float(np.mean(reductions)) if reductions else None, worse))
-    return found
+        results.append((float(np.mean(reductions)) if reductions else None, worse))
+    return results
 
 
 def _bent(machine: Machine, truth: Trace) -> np.ndarray:

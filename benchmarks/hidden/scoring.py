@@ -65,7 +65,7 @@ def _one(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome
     return outcome(case, diagnosis, best, seconds, error), diagnosis.get("model")
 
 
-def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None, jobs: int = 1) -> list[Outcome]:
+def run(hidden_cases: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None, jobs: int = 1) -> list[Outcome]:
     """Diagnose every case.
 
     Args:
@@ -75,22 +75,24 @@ def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None,
         jobs: processes that share the work; functions must then be importable.
     """
     results = []
-    for i, (one, model) in enumerate(map_jobs(partial(_one, diagnose=diagnose, oracle=oracle), found, jobs)):
-        results.append((one, model))
-        said = "right" if one.is_right and not one.spurious_effects else "WRONG"
+    for i, (result, model) in enumerate(map_jobs(partial(_one, diagnose=diagnose, oracle=oracle), hidden_cases, jobs)):
+        results.append((result, model))
+        judgement = "right" if result.is_right and not result.spurious_effects else "WRONG"
         print(
-            f"{i + 1} of {len(found)}: {one.name} {said} ({_tells(one)}), {one.seconds:.0f} s", file=sys.stderr, flush=True
+            f"{i + 1} of {len(hidden_cases)}: {result.name} {judgement} ({_tells(result)}), {result.seconds:.0f} s",
+            file=sys.stderr,
+            flush=True,
         )
-    outcomes = [one for one, _ in results]
-    prove(found, outcomes, [model for _, model in results])
+    outcomes = [result for result, _ in results]
+    prove(hidden_cases, outcomes, [model for _, model in results])
     return outcomes
 
 
-def prove(found: Sequence[Case], outcomes: Sequence[Outcome], models: Sequence[Mapping[str, Any] | None]) -> None:
+def prove(hidden_cases: Sequence[Case], outcomes: Sequence[Outcome], models: Sequence[Mapping[str, Any] | None]) -> None:
     """Add the bench's own account of the gap to outcomes, where there is an extended model."""
-    given = [i for i, model in enumerate(models) if model]
-    results = proofs([(found[i], models[i] or {}) for i in given])
-    for i, (reduction, worse) in zip(given, results, strict=True):
+    with_model = [i for i, model in enumerate(models) if model]
+    results = proofs([(hidden_cases[i], models[i] or {}) for i in with_model])
+    for i, (reduction, worse) in zip(with_model, results, strict=True):
         outcomes[i].proved, outcomes[i].proved_worse = reduction, worse
 
 
@@ -101,7 +103,7 @@ def outcome(
     seconds: float = 0.0,
     error: str = "",
 ) -> Outcome:
-    """What a diagnosis says about a case.
+    """Compare a diagnosis with the truth of its case.
 
     Raises:
         ValueError: a verdict that there is not.
@@ -120,8 +122,8 @@ def outcome(
         verdict=verdict,
         clutter=list(case.truth.get("clutter", ())),
         findings=[
-            (one["effect"], float(one["confidence"]), [other["effect"] for other in one.get("alternatives", [])])
-            for one in diagnosis.get("findings", [])
+            (finding["effect"], float(finding["confidence"]), [other["effect"] for other in finding.get("alternatives", [])])
+            for finding in diagnosis.get("findings", [])
         ],
         seconds=seconds,
         error=error,
@@ -139,21 +141,21 @@ def _gap(
     floor: Mapping[str, float],
     oracle: Mapping[str, float] | None,
 ) -> None:
-    def given(numbers: Mapping[str, float], channel: str) -> float:
+    def channel_error(numbers: Mapping[str, float], channel: str) -> float:
         value = numbers.get(channel)
         return math.nan if value is None else float(value)
 
     reductions, best, ratios, worse = [], [], [], False
     for channel in before:
-        b, a = given(before, channel), given(after, channel)
-        f = given(floor, channel) if channel in floor else 0.0
+        b, a = channel_error(before, channel), channel_error(after, channel)
+        f = channel_error(floor, channel) if channel in floor else 0.0
         if not math.isfinite(b):
             continue
         worse = worse or not a <= 1.05 * max(b, f)  # nan is worse
-        o = math.nan if oracle is None else given(oracle, channel)
+        o = math.nan if oracle is None else channel_error(oracle, channel)
         if b > 0.0 and b**2 - f**2 >= f**2:
-            for found, left in ((reductions, a), (best, o)):
-                found.append(1.0 - math.sqrt(max(left**2 - f**2, 0.0) / (b**2 - f**2)))
+            for reductions_found, left in ((reductions, a), (best, o)):
+                reductions_found.append(1.0 - math.sqrt(max(left**2 - f**2, 0.0) / (b**2 - f**2)))
         if o > 0.0:
             ratios.append(a / o)
     result.worse = worse
@@ -166,7 +168,7 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """All figures; rates as `{"value", "count", "interval"}`, None where there is no such case."""
 
     def rate(group: Sequence[Outcome], hit: Callable[[Outcome], bool]) -> dict[str, Any] | None:
-        hits = sum(hit(one) for one in group)
+        hits = sum(hit(case_outcome) for case_outcome in group)
         if not group:
             return None
         return {"value": hits / len(group), "count": len(group), "interval": wilson_interval(hits, len(group))}
@@ -174,41 +176,66 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     def number(values: list[float]) -> dict[str, Any] | None:
         return {"value": float(np.median(values)), "count": len(values)} if values else None
 
-    by = {kind: [one for one in outcomes if one.kind == kind] for kind in (*KINDS, *ALONE)}
-    weak = [one for one in by["single"] if one.weak]
-    known = [one for one in outcomes if one.hidden]
+    by_kind = {kind: [case_outcome for case_outcome in outcomes if case_outcome.kind == kind] for kind in (*KINDS, *ALONE)}
+    weak = [case_outcome for case_outcome in by_kind["single"] if case_outcome.weak]
+    with_effects = [case_outcome for case_outcome in outcomes if case_outcome.hidden]
     curve = calibration(outcomes)
     error = calibration_error(curve)
     return {
-        "single": rate(by["single"], lambda one: one.is_right),
-        "single_strong": rate([one for one in by["single"] if not one.weak], lambda one: one.is_right),
-        "weak": rate(weak, lambda one: one.is_right),
-        "single_tied": rate(by["single"], lambda one: one.is_tied),
-        "single_spurious": rate(by["single"], lambda one: bool(one.hidden and one.is_right and one.spurious_effects)),
-        "new": rate(by["new"], lambda one: one.is_right),
-        "new_tied": rate(by["new"], lambda one: one.is_tied),
-        "clutter": rate(by["clutter"], lambda one: one.is_right),
-        "clutter_spurious": rate(by["clutter"], lambda one: bool(one.spurious_effects)),
-        "clutter_overstated": rate(by["clutter"], lambda one: bool(one.spurious_effects) and one.verdict == "explained"),
-        "hard": rate(by["hard"], lambda one: one.is_right),
-        "hard_weak": rate([one for one in by["hard"] if one.weak], lambda one: one.is_right),
-        "hard_tied": rate(by["hard"], lambda one: one.is_tied),
-        "pairs": rate(by["pairs"], lambda one: one.is_right),
-        "pairs_one": rate(by["pairs"], lambda one: bool(set(one.hidden) & set(one.named_effects))),
-        "pairs_spurious": rate(by["pairs"], lambda one: bool(one.spurious_effects)),
-        "false_alarms": rate(by["none"], lambda one: not one.is_right),
-        "abstentions": rate(by["unknown"], lambda one: one.is_right),
-        "unknown_missed": rate(by["unknown"], lambda one: one.verdict == "no_discrepancy"),
-        "confidently_wrong": rate(by["unknown"], lambda one: bool(one.named_effects) and one.findings[0][1] >= CONFIDENT),
-        "gap_reduction": number([one.reduction for one in known if one.reduction is not None]),
-        "reachable": number([one.reachable for one in known if one.reachable is not None]),
-        "oracle_ratio": number([one.ratio for one in known if one.ratio is not None]),
-        "proved": number([one.proved for one in known if one.proved is not None]),
-        "proved_worse": rate([one for one in outcomes if one.proved_worse is not None], lambda one: bool(one.proved_worse)),
-        "worse": rate([one for one in outcomes if one.worse is not None], lambda one: bool(one.worse)),
+        "single": rate(by_kind["single"], lambda case_outcome: case_outcome.is_right),
+        "single_strong": rate(
+            [case_outcome for case_outcome in by_kind["single"] if not case_outcome.weak],
+            lambda case_outcome: case_outcome.is_right,
+        ),
+        "weak": rate(weak, lambda case_outcome: case_outcome.is_right),
+        "single_tied": rate(by_kind["single"], lambda case_outcome: case_outcome.is_tied),
+        "single_spurious": rate(
+            by_kind["single"],
+            lambda case_outcome: bool(case_outcome.hidden and case_outcome.is_right and case_outcome.spurious_effects),
+        ),
+        "new": rate(by_kind["new"], lambda case_outcome: case_outcome.is_right),
+        "new_tied": rate(by_kind["new"], lambda case_outcome: case_outcome.is_tied),
+        "clutter": rate(by_kind["clutter"], lambda case_outcome: case_outcome.is_right),
+        "clutter_spurious": rate(by_kind["clutter"], lambda case_outcome: bool(case_outcome.spurious_effects)),
+        "clutter_overstated": rate(
+            by_kind["clutter"],
+            lambda case_outcome: bool(case_outcome.spurious_effects) and case_outcome.verdict == "explained",
+        ),
+        "hard": rate(by_kind["hard"], lambda case_outcome: case_outcome.is_right),
+        "hard_weak": rate(
+            [case_outcome for case_outcome in by_kind["hard"] if case_outcome.weak],
+            lambda case_outcome: case_outcome.is_right,
+        ),
+        "hard_tied": rate(by_kind["hard"], lambda case_outcome: case_outcome.is_tied),
+        "pairs": rate(by_kind["pairs"], lambda case_outcome: case_outcome.is_right),
+        "pairs_one": rate(
+            by_kind["pairs"], lambda case_outcome: bool(set(case_outcome.hidden) & set(case_outcome.named_effects))
+        ),
+        "pairs_spurious": rate(by_kind["pairs"], lambda case_outcome: bool(case_outcome.spurious_effects)),
+        "false_alarms": rate(by_kind["none"], lambda case_outcome: not case_outcome.is_right),
+        "abstentions": rate(by_kind["unknown"], lambda case_outcome: case_outcome.is_right),
+        "unknown_missed": rate(by_kind["unknown"], lambda case_outcome: case_outcome.verdict == "no_discrepancy"),
+        "confidently_wrong": rate(
+            by_kind["unknown"],
+            lambda case_outcome: bool(case_outcome.named_effects) and case_outcome.findings[0][1] >= CONFIDENT,
+        ),
+        "gap_reduction": number(
+            [case_outcome.reduction for case_outcome in with_effects if case_outcome.reduction is not None]
+        ),
+        "reachable": number([case_outcome.reachable for case_outcome in with_effects if case_outcome.reachable is not None]),
+        "oracle_ratio": number([case_outcome.ratio for case_outcome in with_effects if case_outcome.ratio is not None]),
+        "proved": number([case_outcome.proved for case_outcome in with_effects if case_outcome.proved is not None]),
+        "proved_worse": rate(
+            [case_outcome for case_outcome in outcomes if case_outcome.proved_worse is not None],
+            lambda case_outcome: bool(case_outcome.proved_worse),
+        ),
+        "worse": rate(
+            [case_outcome for case_outcome in outcomes if case_outcome.worse is not None],
+            lambda case_outcome: bool(case_outcome.worse),
+        ),
         "calibration_error": None if error is None else {"value": error, "count": sum(int(row["count"]) for row in curve)},
-        "failed": rate(list(outcomes), lambda one: one.verdict == "failed"),
-        "seconds": number([one.seconds for one in outcomes]),
+        "failed": rate(list(outcomes), lambda case_outcome: case_outcome.verdict == "failed"),
+        "seconds": number([case_outcome.seconds for case_outcome in outcomes]),
     }
 
 
@@ -246,8 +273,8 @@ _TITLES = {
 _PLAIN = ("oracle_ratio", "calibration_error", "seconds")
 
 
-def met(key: str, value: float) -> bool | None:
-    """Whether a figure is what it must be; None where nothing is asked of it."""
+def meets_target(key: str, value: float) -> bool | None:
+    """True if a score meets its target; None if it has none."""
     if key not in TARGETS:
         return None
     target, more = TARGETS[key]
@@ -266,8 +293,8 @@ def markdown(outcomes: Sequence[Outcome], heading: str = "") -> str:
         asked, mark = "", ""
         if key in TARGETS:
             target, more = TARGETS[key]
-            shown = f"{target:g}" if key in _PLAIN else f"{100 * target:g} %"
-            asked, mark = f"{'≥' if more else '≤'} {shown}", "met" if met(key, value) else "**not met**"
+            target_text = f"{target:g}" if key in _PLAIN else f"{100 * target:g} %"
+            asked, mark = f"{'≥' if more else '≤'} {target_text}", "met" if meets_target(key, value) else "**not met**"
         lines.append(f"| {_TITLES[key]} | {text} | {interval} | {figure['count']} | {asked} | {mark} |")
     rows, columns, counts = confusion(outcomes)
     wrong = Counter(
@@ -279,36 +306,36 @@ def markdown(outcomes: Sequence[Outcome], heading: str = "") -> str:
     )
     if wrong:
         lines += ["", "| hidden | said | times | of |", "| --- | --- | ---: | ---: |"]
-        for (truth, said), times in wrong.most_common():
-            lines.append(f"| {truth} | {said} | {times} | {counts[rows.index(truth)].sum()} |")
-    lines += _by_condition([one for one in outcomes if one.kind in ("single", "hard")])
-    missed = [one for one in outcomes if not one.is_right]
+        for (truth, finding), times in wrong.most_common():
+            lines.append(f"| {truth} | {finding} | {times} | {counts[rows.index(truth)].sum()} |")
+    lines += _by_condition([case_outcome for case_outcome in outcomes if case_outcome.kind in ("single", "hard")])
+    missed = [case_outcome for case_outcome in outcomes if not case_outcome.is_right]
     if missed:
-        lines += ["", "Wrong: " + "; ".join(f"{one.name} ({_tells(one)})" for one in missed)]
+        lines += ["", "Wrong: " + "; ".join(f"{case_outcome.name} ({_tells(case_outcome)})" for case_outcome in missed)]
     return "\n".join(lines) + "\n"
 
 
-def _agrees(truth: str, said: str) -> bool:
-    return truth == said or (truth.startswith("unknown.") and said == "unknown_effect")
+def _agrees(truth: str, finding: str) -> bool:
+    return truth == finding or (truth.startswith("unknown.") and finding == "unknown_effect")
 
 
-def _tells(one: Outcome) -> str:
-    truth = " + ".join(one.hidden) or one.unknown or "nothing"
-    said = (
-        " + ".join(f"{effect} {confidence:.2f}" for effect, confidence, _ in one.findings)
-        if one.named_effects
-        else one.verdict
+def _tells(case_outcome: Outcome) -> str:
+    truth = " + ".join(case_outcome.hidden) or case_outcome.unknown or "nothing"
+    text = (
+        " + ".join(f"{effect} {confidence:.2f}" for effect, confidence, _ in case_outcome.findings)
+        if case_outcome.named_effects
+        else case_outcome.verdict
     )
-    return f"{truth}, said {said}{': ' + one.error if one.error else ''}"
+    return f"{truth}, said {text}{': ' + case_outcome.error if case_outcome.error else ''}"
 
 
-def _by_condition(ones: Sequence[Outcome]) -> list[str]:
+def _by_condition(group_outcomes: Sequence[Outcome]) -> list[str]:
     lines: list[str] = []
     for key in ("plant", "loop", "excitation", "initial_state", "period"):
-        values = sorted({str(one.conditions[key]) for one in ones})
+        values = sorted({str(case_outcome.conditions[key]) for case_outcome in group_outcomes})
         for value in values:
-            group = [one for one in ones if str(one.conditions[key]) == value]
-            right = sum(one.is_right for one in group)
+            group = [case_outcome for case_outcome in group_outcomes if str(case_outcome.conditions[key]) == value]
+            right = sum(case_outcome.is_right for case_outcome in group)
             lines.append(f"| {key} | {value} | {100 * right / len(group):.0f} % | {len(group)} |")
     return ["", "| single and hard, by | | right | cases |", "| --- | --- | ---: | ---: |", *lines] if lines else []
 
@@ -319,5 +346,7 @@ def write(outcomes: Sequence[Outcome], folder: Path, heading: str = "") -> list[
     (folder / "scores.md").write_text(markdown(outcomes, heading), encoding="utf-8")
     figures = {"scores": scores(outcomes), "calibration": calibration(outcomes)}
     (folder / "scores.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    (folder / "outcomes.json").write_text(json.dumps([asdict(one) for one in outcomes], indent=1), encoding="utf-8")
+    (folder / "outcomes.json").write_text(
+        json.dumps([asdict(case_outcome) for case_outcome in outcomes], indent=1), encoding="utf-8"
+    )
     return draw(outcomes, folder)

@@ -45,7 +45,7 @@ P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
 
 ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE = 1e-11, 1e-10, 1e-9
-"""How near an event a step must end: rad, rad/s, and share of the friction level."""
+"""Largest distance from an event at which a step ends: rad, rad/s, and share of the friction level."""
 
 SPARE = 60
 """Attempts in a sample beyond its steps, after which one is taken as it is: a guard against chatter."""
@@ -127,7 +127,7 @@ class Run:
 
 @dataclass
 class Trace:
-    """What a run leaves: readings, and the truth behind them.
+    """Readings of a run, and the true states.
 
     Attributes:
         t, u, theta_e, theta_s: time, recorded torque, encoder readings (no theta_s on a rigid drive).
@@ -358,12 +358,12 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         return y[1], a_e, y[3], a_s, w_rate, shaft, spring, third
 
     @jit
-    def held(p, s, u, lagged):
+    def lagged_torque(p, s, u, lagged):
         """Torque that acts s seconds after the sample: first-order lag of the held one, exactly."""
         return pick(p[LAG] > 0.0, u + (lagged - u) * np.exp(-s * p[LAG]), u)
 
     @jit
-    def moved(y, k, h):
+    def take_step(y, k, h):
         return (
             y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3],
             y[4] + h * k[4], y[5] + h * k[5], y[6] + h * k[6], y[7] + h * k[7],
@@ -373,11 +373,11 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     def advance(p, y, modes, s, h, start, u, lagged, n0, slope):
         """One step of the classical Runge-Kutta method."""
         m, e = s + 0.5 * h, s + h
-        u_m = held(p, m, u, lagged)
-        k1 = rates(p, y, modes, start + s, held(p, s, u, lagged), n0 + slope * s)
-        k2 = rates(p, moved(y, k1, 0.5 * h), modes, start + m, u_m, n0 + slope * m)
-        k3 = rates(p, moved(y, k2, 0.5 * h), modes, start + m, u_m, n0 + slope * m)
-        k4 = rates(p, moved(y, k3, h), modes, start + e, held(p, e, u, lagged), n0 + slope * e)
+        u_m = lagged_torque(p, m, u, lagged)
+        k1 = rates(p, y, modes, start + s, lagged_torque(p, s, u, lagged), n0 + slope * s)
+        k2 = rates(p, take_step(y, k1, 0.5 * h), modes, start + m, u_m, n0 + slope * m)
+        k3 = rates(p, take_step(y, k2, 0.5 * h), modes, start + m, u_m, n0 + slope * m)
+        k4 = rates(p, take_step(y, k3, h), modes, start + e, lagged_torque(p, e, u, lagged), n0 + slope * e)
         c = h / 6.0
         return (
             y[0] + c * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
@@ -392,7 +392,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
 
     @jit
     def holds(dry, d, velocity, total, level):
-        """How far a side is from an event, in tolerances: speed left in its direction, or friction left while it sticks."""
+        """Distance of a side from an event, in tolerances: speed left in its direction, or friction left while it sticks."""
         sliding = pick(d != 0.0, d * velocity / speed, (level - np.abs(total)) / (share * level + 1e-300))
         return pick(dry > 0.0, sliding, 1.0)
 
@@ -410,7 +410,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         )  # fmt: skip
 
     @jit
-    def settled(total, level):
+    def mode_at_rest(total, level):
         """Mode of a side at rest: it sticks, or starts where the torques push it."""
         return pick(np.abs(total) <= level, 0.0, np.sign(total))
 
@@ -418,10 +418,10 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     def attempt(p, y, modes, s, h, tries, start, u, lagged, n0, slope):
         """Try a step: take it, take it and change modes, or shorten it."""
         h = np.minimum(h, p[PERIOD] - s)
-        old = distances(p, y, modes, start + s, held(p, s, u, lagged), n0 + slope * s)
+        old = distances(p, y, modes, start + s, lagged_torque(p, s, u, lagged), n0 + slope * s)
         new_y = advance(p, y, modes, s, h, start, u, lagged, n0, slope)
         end = s + h
-        new = distances(p, new_y, modes, start + end, held(p, end, u, lagged), n0 + slope * end)
+        new = distances(p, new_y, modes, start + end, lagged_torque(p, end, u, lagged), n0 + slope * end)
         cut = 1.0
         crossed = False
         for i in range(3):
@@ -433,8 +433,8 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         contact, d_e, d_s = modes
         c = pick(taken & (new[0] <= 0.0), pick(contact != 0.0, 0.0, np.sign(new[7])), contact)
         event_e, event_s = taken & (new[1] <= 0.0), taken & (new[2] <= 0.0)
-        e = pick(event_e, settled(new[3], new[4]), d_e)
-        l = pick(event_s, settled(new[5], new[6]), d_s)  # noqa: E741
+        e = pick(event_e, mode_at_rest(new[3], new[4]), d_e)
+        l = pick(event_s, mode_at_rest(new[5], new[6]), d_s)  # noqa: E741
         y = (
             pick(taken, new_y[0], y[0]),
             pick(taken, pick(event_e, 0.0, new_y[1]), y[1]),
@@ -453,7 +453,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     def begin(p, y, modes, start, u, lagged, n0):
         """Modes at a sample: the input has jumped, and what stuck may not do so any more."""
         contact, d_e, d_s = modes
-        sum_e, dry_e, sum_s, dry_s, _, _, _, _ = torques(p, y, contact, start, held(p, 0.0, u, lagged), n0)
+        sum_e, dry_e, sum_s, dry_s, _, _, _, _ = torques(p, y, contact, start, lagged_torque(p, 0.0, u, lagged), n0)
         stuck_e, stuck_s = (d_e == 0.0) & (np.abs(sum_e) > dry_e), (d_s == 0.0) & (np.abs(sum_s) > dry_s)
         return contact, pick(stuck_e, np.sign(sum_e), d_e), pick(stuck_s, np.sign(sum_s), d_s)
 
@@ -482,10 +482,12 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         scaled = p[GAIN] * u
         return np.minimum(np.maximum(scaled, -p[LIMIT]), p[LIMIT])
 
-    return SimpleNamespace(attempt=attempt, begin=begin, first=first, control=control, acting=acting, held=held)
+    return SimpleNamespace(
+        attempt=attempt, begin=begin, first=first, control=control, acting=acting, lagged_torque=lagged_torque
+    )
 
 
-def _compiled() -> Any:
+def _compile_loop() -> Any:
     """The engine that numba compiles, or None without numba (or with BENCH_ENGINE=numpy in the environment)."""
     if os.environ.get("BENCH_ENGINE") == "numpy":
         return None
@@ -495,8 +497,8 @@ def _compiled() -> Any:
         return None
     jit = numba.njit(inline="never")
     engine = build(jit, jit(lambda condition, a, b: a if condition else b))
-    attempt, begin, first, control, acting, held = (
-        engine.attempt, engine.begin, engine.first, engine.control, engine.acting, engine.held,
+    attempt, begin, first, control, acting, lagged_torque = (
+        engine.attempt, engine.begin, engine.first, engine.control, engine.acting, engine.lagged_torque,
     )  # fmt: skip
     period, steps, origin, delayed = P.period, P.steps, P.origin, P.delayed
 
@@ -524,12 +526,12 @@ def _compiled() -> Any:
                 while s < p[period] * (1.0 - 1e-12):
                     y, modes, s, h = attempt(p, y, modes, s, h, tries, start, u, lagged, noise[lane, k], slope)
                     tries += 1
-                lagged = held(p, p[period], u, lagged)
+                lagged = lagged_torque(p, p[period], u, lagged)
 
     return run
 
 
-def _vectorised() -> Any:
+def _vectorise_loop() -> Any:
     """The engine in NumPy: all lanes of a batch advance together, longest first; what has its sample done waits."""
     engine = build(lambda function: function, np.where)
 
@@ -552,17 +554,17 @@ def _vectorised() -> Any:
             command[order, k], readings[order, k] = u, previous
             for i in range(4):
                 states[order, i, k] = y[i]
-            at = k - p[P.delayed].astype(int)
-            u = engine.acting(p, np.where(at >= 0, command[order, np.maximum(at, 0)], initial[order, 4]))
+            delayed = k - p[P.delayed].astype(int)
+            u = engine.acting(p, np.where(delayed >= 0, command[order, np.maximum(delayed, 0)], initial[order, 4]))
             n0 = noise[order, k]
             slope = (noise[order, k + 1] - n0) / p[P.period]
             modes = engine.begin(p, y, modes, start, u, lagged, n0)
             s, h = np.zeros(live), p[P.period] / p[P.steps]
             open_, tries = np.arange(live), 0
             y, modes, h = [part.copy() for part in y], [part.copy() for part in modes], h.copy()
-            whole = True
+            all_open = True
             while len(open_):
-                i = slice(None) if whole else open_
+                i = slice(None) if all_open else open_
                 new = engine.attempt(
                     p[:, i], tuple(part[i] for part in y), tuple(part[i] for part in modes), s[i], h[i], tries,
                     start[i], u[i], lagged[i], n0[i], slope[i],
@@ -571,9 +573,9 @@ def _vectorised() -> Any:
                     part[i] = values
                 tries += 1
                 open_ = np.flatnonzero(s < p[P.period] * (1.0 - 1e-12))
-                whole = len(open_) == live
+                all_open = len(open_) == live
             y, modes = tuple(y), tuple(modes)
-            lagged = engine.held(p, p[P.period], u, lagged)
+            lagged = engine.lagged_torque(p, p[P.period], u, lagged)
 
     return run
 
@@ -582,10 +584,10 @@ _ENGINE: list[Any] = []
 
 
 def engine() -> tuple[Any, str]:
-    """What runs the lanes, and its name."""
+    """The function that runs the lanes, and its name."""
     if not _ENGINE:
-        compiled = _compiled()
-        _ENGINE.extend((compiled, "numba") if compiled is not None else (_vectorised(), "numpy"))
+        compiled = _compile_loop()
+        _ENGINE.extend((compiled, "numba") if compiled is not None else (_vectorise_loop(), "numpy"))
     return _ENGINE[0], _ENGINE[1]
 
 

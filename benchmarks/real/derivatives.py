@@ -16,7 +16,7 @@ from jaxbl.identification.regression import Kinematics, balance
 from jaxbl.records import Record
 
 sys.path.append(str(Path(__file__).parents[1]))
-from filtered_derivatives import differentiated
+from filtered_derivatives import differentiate
 
 _ENDS = 4.0
 """Left out at either end of a part, in periods of the cutoff: there the filter has readings on one side only. With 1.5 the
@@ -63,32 +63,32 @@ class Part:
 def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
     """All parts of a log that are longer than what is left out at their ends."""
     assert record.torque is not None
-    found = []
+    parts = []
     for rows in record.segments:
         if (rows.stop - rows.start) * record.sample_period < _LEAST * _ENDS / cutoff:
             continue
         positions = {side: record.positions[side][rows] for side in sides}
         with jax.enable_x64(True):
-            motion = differentiated(record.time[rows], record.torque[rows], positions, cutoff)
+            motion = differentiate(record.time[rows], record.torque[rows], positions, cutoff)
         least = _SEEN * _speed_noise(record, cutoff)
         moving = np.abs(np.asarray(motion.velocity["motor"])) > least
-        found.append(Part(motion, record.sample_period, cutoff, moving))
-    return found
+        parts.append(Part(motion, record.sample_period, cutoff, moving))
+    return parts
 
 
 def _speed_noise(record: Record, cutoff: float) -> float:
     """Standard deviation of the motor's speed behind an ideal low-pass, by the noise of the readings and their steps."""
-    about, h = record.statistics.channels["theta_e"], record.sample_period
-    noise = np.hypot(about.noise, about.resolution / np.sqrt(12.0))
+    channel, h = record.statistics.channels["theta_e"], record.sample_period
+    noise = np.hypot(channel.noise, channel.resolution / np.sqrt(12.0))
     return float(2.0 * np.pi * noise * np.sqrt(2.0 * h * min(cutoff, 0.5 / h) ** 3 / 3.0))
 
 
 def driving(parts: Sequence[Part], inertia: float) -> float:
     """Rms of the input, or where there is none of the inertia's torque, N m."""
-    torque = np.concatenate([one.low_passed(np.asarray(one.kinematics.torque)) for one in parts])
+    torque = np.concatenate([part.low_passed(np.asarray(part.kinematics.torque)) for part in parts])
     if np.any(torque):
         return float(np.sqrt(np.mean(torque**2)))
-    speeding = np.concatenate([one.low_passed(np.asarray(one.kinematics.acceleration["motor"])) for one in parts])
+    speeding = np.concatenate([part.low_passed(np.asarray(part.kinematics.acceleration["motor"])) for part in parts])
     return float(inertia * np.sqrt(np.mean(speeding**2)))
 
 
@@ -101,17 +101,17 @@ def torque_error(model: Config, record: Record, parts: Sequence[Part]) -> np.nda
 
     Referred to the input: a model that multiplies all its torques, and the input by a gain, by one factor misses the same.
     """
-    missed, acting, given = [], [], []
+    missed, acting, torques = [], [], []
     with jax.enable_x64(True):
         experiment = on_record(model, record)
-        for one in parts:
-            k = one.kinematics
+        for part in parts:
+            k = part.kinematics
             raised = dataclasses.replace(k, torque=(1.0 + _MORE) * k.torque)
             left, more = (np.asarray(balance(experiment, motion)["motor"].residual) for motion in (k, raised))
-            missed.append(one.low_passed(left))
-            acting.append(one.low_passed((more - left) / _MORE))
-            given.append(one.low_passed(np.asarray(k.torque)))
-    torque = np.concatenate(given)
+            missed.append(part.low_passed(left))
+            acting.append(part.low_passed((more - left) / _MORE))
+            torques.append(part.low_passed(np.asarray(k.torque)))
+    torque = np.concatenate(torques)
     gain = np.concatenate(acting) @ torque / (torque @ torque) if np.any(torque) else 1.0
     return np.concatenate(missed) / gain
 
@@ -151,13 +151,13 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
         spans: largest speed and travel of the log that is fitted, which say what is tried.
     """
     drive = model.drive
-    known = drive.motor_inertia if "drive.motor_inertia" in model.uncertainty.exact else None
+    exact_inertia = drive.motor_inertia if "drive.motor_inertia" in model.uncertainty.exact else None
     rigid = drive.kind == "rigid"
     target, rows, names, units = [], [], [], []
     force = "N" if linear else "N m"
     for part in parts:
         k = part.kinematics
-        q, v, a = (np.asarray(one["motor"]) for one in (k.position, k.velocity, k.acceleration))
+        q, v, a = (np.asarray(column["motor"]) for column in (k.position, k.velocity, k.acceleration))
         columns = _columns(q, v, a, linear, spans)
         if not rigid:
             twist = q - np.asarray(k.position["load"]) * float(drive.gear_ratio)
@@ -167,15 +167,15 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
                 ("twist rate", "N m s/rad", rate),
                 ("twist cubed", "N m/rad³", twist**3),
             ]
-        if known is not None:
+        if exact_inertia is not None:
             columns = columns[1:]
-        torque = np.asarray(k.torque) - (known or 0.0) * a
+        torque = np.asarray(k.torque) - (exact_inertia or 0.0) * a
         target.append(part.low_passed(torque))
-        rows.append(part.low_passed(np.stack([one for _, _, one in columns], axis=1)))
-        names, units = [one for one, _, _ in columns], [one.replace("N m", force) for _, one, _ in columns]
-    base = ([] if known is not None else ["inertia"]) + (["viscous"] if drive.motor_viscous > 0.0 else [])
+        rows.append(part.low_passed(np.stack([column for _, _, column in columns], axis=1)))
+        names, units = [column for column, _, _ in columns], [column.replace("N m", force) for _, column, _ in columns]
+    base = ([] if exact_inertia is not None else ["inertia"]) + (["viscous"] if drive.motor_viscous > 0.0 else [])
     base += [] if rigid else ["twist"]
-    slow = tuple(one for one in names if one.startswith("Stribeck"))
+    slow = tuple(column for column in names if column.startswith("Stribeck"))
     return Terms(np.concatenate(target), tuple(names), tuple(units), np.concatenate(rows), tuple(base), slow)
 
 
@@ -183,7 +183,7 @@ def _columns(
     q: np.ndarray, v: np.ndarray, a: np.ndarray, linear: bool, spans: tuple[float, float]
 ) -> list[tuple[str, str, np.ndarray]]:
     fastest, travel = spans
-    found = [
+    columns = [
         ("inertia", "kg m²" if not linear else "kg", a),
         ("viscous", "N m s/rad" if not linear else "N s/m", v),
         ("Coulomb", "N m", np.sign(v)),
@@ -192,10 +192,10 @@ def _columns(
         ("viscous by direction", "N m s/rad" if not linear else "N s/m", np.abs(v)),
     ]
     for share in _SLOW:
-        found.append((f"Stribeck at {share * fastest:.2g}", "N m", np.sign(v) * np.exp(-((v / (share * fastest)) ** 2))))
+        columns.append((f"Stribeck at {share * fastest:.2g}", "N m", np.sign(v) * np.exp(-((v / (share * fastest)) ** 2))))
     if not linear:
         for n in range(1, _HARMONICS + 1):
             # one whole wave, or it cannot be told from the slower terms; of gravity a pendulum shows less
             if n == 1 or travel >= 2.0 * np.pi / n:
-                found += [(f"{n} a turn", "N m", np.sin(n * q)), (f"{n} a turn", "N m", np.cos(n * q))]
-    return found
+                columns += [(f"{n} a turn", "N m", np.sin(n * q)), (f"{n} a turn", "N m", np.cos(n * q))]
+    return columns

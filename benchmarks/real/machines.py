@@ -79,7 +79,7 @@ class Case:
     @property
     def split(self) -> str:
         """In words."""
-        fit = " + ".join(Path(one).stem for one in self.fit)
+        fit = " + ".join(Path(file).stem for file in self.fit)
         return f"{fit}; held out: {Path(self.holdout).stem if self.holdout else 'last quarter'}"
 
 
@@ -274,17 +274,17 @@ def unfit(case: Case, data: Path) -> str:
         path = data / name
         if not path.is_file():
             return f"{path}: no such file"
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
-        if found != SHA256[name]:
-            return f"{path}: SHA-256 {found[:12]}..., expected {SHA256[name][:12]}...: another version of the file"
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if digest != SHA256[name]:
+            return f"{path}: SHA-256 {digest[:12]}..., expected {SHA256[name][:12]}...: another version of the file"
     return ""
 
 
 def logs_of(case: Case, data: Path, folder: Path) -> tuple[list[Path], Path | None]:
     """Files as the package reads them, fitted and held out; those of the flexible link are made one, in `folder`."""
     if case.fit != _LINK_FILES:
-        return [data / one for one in case.fit], data / case.holdout if case.holdout else None
-    volts, servo, bend = (loadmat(data / one)[Path(one).stem] for one in case.fit)
+        return [data / file for file in case.fit], data / case.holdout if case.holdout else None
+    volts, servo, bend = (loadmat(data / file)[Path(file).stem] for file in case.fit)
     # the last column is the reading; the second of `data_theta` is the reference of the position controller
     table = np.column_stack([volts, servo[:, -1], servo[:, -1] + bend[:, -1]])
     path = folder / "flexible_link.csv"

@@ -56,42 +56,42 @@ def sysid(fitted: Sequence[Part], held: Sequence[Part], model: Config, linear: b
     spec = _spec(model, linear, period / np.ceil(period / _STEP))
     names = ["motor"] if rigid else ["motor", "twist"]
     built = spec.compile()
-    states = [np.stack(_states(one, rigid), axis=-1) for one in fitted]
+    states = [np.stack(_states(estimate, rigid), axis=-1) for estimate in fitted]
     length = max(round(_WINDOW / period), 2)
     rows = [
         (part, state, first)
         for part, state in zip(fitted, states, strict=True)
         for first in range(0, len(state) - length, length)
     ]
-    scale = np.std(np.concatenate([one[:, :, 0] for one in states]), axis=0)
+    scale = np.std(np.concatenate([estimate[:, :, 0] for estimate in states]), axis=0)
     chosen = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, _MOST).astype(int))]
     starts, inputs, readings = [], [], []
     for part, state, first in chosen:
-        at = slice(first, first + length)
+        window = slice(first, first + length)
         time = period * np.arange(length)
-        torque = np.asarray(part.kinematics.torque)[at, None]
+        torque = np.asarray(part.kinematics.torque)[window, None]
         starts.append(tool.create_initial_state(built, state[first, :, 0], state[first, :, 1]))
         inputs.append(tool.TimeSeries.from_control_names(time, torque, built))
-        readings.append(tool.TimeSeries.from_names(time, state[at, :, 0], built, names))
+        readings.append(tool.TimeSeries.from_names(time, state[window, :, 0], built, names))
     sequences = tool.ModelSequences("log", spec, [str(i) for i in range(len(chosen))], starts, inputs, readings)
 
-    def left(_params: Any, simulated: Any, measured: Any, *_rest: Any, **_more: Any) -> tuple[Any, Any, Any]:
+    def residuals(_params: Any, simulated: Any, measured: Any, *_arguments: Any, **_options: Any) -> tuple[Any, Any, Any]:
         simulated = simulated.resample(measured.times)
         return (simulated.data - measured.data) / scale, simulated, measured
 
     size = driving(fitted, inertia)
-    fastest = max(float(np.max(np.abs(one[:, 0, 1]))) for one in states)
+    fastest = max(float(np.max(np.abs(estimate[:, 0, 1]))) for estimate in states)
     params = tool.ParameterDict()
     for name, (start, least, most, change) in _numbers(model, linear, size, fastest).items():
         params.add(tool.Parameter(name, start, least, most, modifier=change))
-    function = tool.build_residual_fn(models_sequences=[sequences], modify_residual=left, n_threads=2)
+    function = tool.build_residual_fn(models_sequences=[sequences], modify_residual=residuals, n_threads=2)
     with contextlib.redirect_stdout(io.StringIO()):
-        found, _ = tool.optimize(params, function, optimizer="scipy", verbose=False, x_scale="jac", max_iters=60)
-    values = {name: float(one.value[0]) for name, one in found.items()}
-    best = tool.apply_param_modifiers(found, spec)
+        estimates, _ = tool.optimize(params, function, optimizer="scipy", verbose=False, x_scale="jac", max_iters=60)
+    values = {name: float(estimate.value[0]) for name, estimate in estimates.items()}
+    best = tool.apply_param_modifiers(estimates, spec)
     best.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
-    missing = np.concatenate([_missing(mujoco, best, one, rigid, values["dry friction"]) for one in held])
-    return Found(list(values), {name: [one] for name, one in values.items()}, _units(values, linear), {}, missing)
+    missing = np.concatenate([_missing(mujoco, best, estimate, rigid, values["dry friction"]) for estimate in held])
+    return Found(list(values), {name: [estimate] for name, estimate in values.items()}, _units(values, linear), {}, missing)
 
 
 def _spec(model: Config, linear: bool, step: float) -> Any:
@@ -115,7 +115,7 @@ def _spec(model: Config, linear: bool, step: float) -> Any:
 
 
 def _numbers(model: Config, linear: bool, size: float, fastest: float) -> dict[str, tuple]:
-    """What is fitted: start, bounds, and how it is put into a model; `size` of the torque, `fastest` speed."""
+    """Fitted numbers by name: start, bounds, and function that sets it in a model; `size` of the torque, `fastest` speed."""
     drive, exact = model.drive, model.uncertainty.exact
     mass = _LIGHT * float(drive.motor_inertia)
 
@@ -127,42 +127,42 @@ def _numbers(model: Config, linear: bool, size: float, fastest: float) -> dict[s
         field[i] = value / mass
         spec.option.gravity = field
 
-    def armature(spec: Any, one: Any) -> None:
-        spec.joint("motor").armature = one.value[0]
+    def armature(spec: Any, parameter: Any) -> None:
+        spec.joint("motor").armature = parameter.value[0]
 
-    def loss(spec: Any, one: Any) -> None:
-        spec.joint("motor").frictionloss = one.value[0]
+    def loss(spec: Any, parameter: Any) -> None:
+        spec.joint("motor").frictionloss = parameter.value[0]
 
-    found: dict[str, tuple] = {}
+    numbers: dict[str, tuple] = {}
     inertia, viscous = float(drive.motor_inertia), float(drive.motor_viscous)
     if "drive.motor_inertia" not in exact:
-        found["inertia"] = (inertia, inertia / _AWAY, inertia * _AWAY, armature)
+        numbers["inertia"] = (inertia, inertia / _AWAY, inertia * _AWAY, armature)
     most = max(_AWAY * viscous, 3.0 * size / fastest)
-    found["viscous"] = (
-        max(viscous, 0.01 * most), 0.0, most, lambda spec, one: damping(spec, "motor", one.value[0]),
+    numbers["viscous"] = (
+        max(viscous, 0.01 * most), 0.0, most, lambda spec, parameter: damping(spec, "motor", parameter.value[0]),
     )  # fmt: skip
-    found["dry friction"] = (0.1 * size, 0.0, 3.0 * size, loss)
+    numbers["dry friction"] = (0.1 * size, 0.0, 3.0 * size, loss)
     if drive.kind == "rigid" and not linear:
         for i, name in ((0, "gravity, cosine"), (2, "gravity, sine")):
-            found[name] = (
-                0.0, -_AWAY * size, _AWAY * size, lambda spec, one, i=i: gravity(spec, i, one.value[0]),
+            numbers[name] = (
+                0.0, -_AWAY * size, _AWAY * size, lambda spec, parameter, i=i: gravity(spec, i, parameter.value[0]),
             )  # fmt: skip
     if drive.kind != "rigid":
         stiffness, load = _stiffness(model), float(drive.load_inertia)
 
-        def spring(spec: Any, one: Any) -> None:
-            spec.joint("twist").stiffness = [one.value[0], 0.0, 0.0]
+        def spring(spec: Any, parameter: Any) -> None:
+            spec.joint("twist").stiffness = [parameter.value[0], 0.0, 0.0]
 
-        def mass_of(spec: Any, one: Any) -> None:
+        def mass_of(spec: Any, parameter: Any) -> None:
             body = spec.joint("twist").parent
-            body.inertia = np.full(3, one.value[0])
+            body.inertia = np.full(3, parameter.value[0])
 
-        found["stiffness"] = (stiffness, stiffness / _AWAY, stiffness * _AWAY, spring)
-        found["load inertia"] = (load, load / _AWAY, load * _AWAY, mass_of)
-        found["damping of the twist"] = (
-            1e-3 * stiffness, 0.0, stiffness, lambda spec, one: damping(spec, "twist", one.value[0]),
+        numbers["stiffness"] = (stiffness, stiffness / _AWAY, stiffness * _AWAY, spring)
+        numbers["load inertia"] = (load, load / _AWAY, load * _AWAY, mass_of)
+        numbers["damping of the twist"] = (
+            1e-3 * stiffness, 0.0, stiffness, lambda spec, parameter: damping(spec, "twist", parameter.value[0]),
         )  # fmt: skip
-    return found
+    return numbers
 
 
 def _stiffness(model: Config) -> float:
@@ -172,17 +172,17 @@ def _stiffness(model: Config) -> float:
 
 def _units(values: dict[str, float], linear: bool) -> dict[str, str]:
     force, inertia = ("N", "kg") if linear else ("N m", "kg m²")
-    by = {"viscous": f"{force} s/{'m' if linear else 'rad'}", "damping of the twist": "N m s/rad", "stiffness": "N m/rad"}
-    return {name: by.get(name, inertia if "inertia" in name else force) for name in values}
+    units = {"viscous": f"{force} s/{'m' if linear else 'rad'}", "damping of the twist": "N m s/rad", "stiffness": "N m/rad"}
+    return {name: units.get(name, inertia if "inertia" in name else force) for name in values}
 
 
 def _states(part: Part, rigid: bool) -> list[np.ndarray]:
     """Positions, velocities and accelerations of MuJoCo's joints; shape (samples, joints) each."""
-    k, found = part.kinematics, []
-    for one in (k.position, k.velocity, k.acceleration):
-        motor = np.asarray(one["motor"])
-        found.append(np.stack([motor] if rigid else [motor, np.asarray(one["load"]) - motor], axis=1))
-    return found
+    k, columns = part.kinematics, []
+    for motion in (k.position, k.velocity, k.acceleration):
+        motor = np.asarray(motion["motor"])
+        columns.append(np.stack([motor] if rigid else [motor, np.asarray(motion["load"]) - motor], axis=1))
+    return columns
 
 
 def _missing(mujoco: Any, model: Any, part: Part, rigid: bool, friction: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a row of the bench holds, as Markdown, JSON and a figure."""
+"""Rows of the bench as Markdown, JSON and a figure."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -58,26 +58,28 @@ def _number(value: float | None, digits: int = 3) -> str:
 def findings(summary: Mapping[str, Any]) -> list[str]:
     """Effects with confidence and numbers, and the model's own numbers."""
     lines = []
-    for one in summary["findings"]:
-        numbers = ", ".join(f"{name} {_value(about)}" for name, about in one["parameters"].items())
-        lines.append(f"{one['effect']} ({one['confidence']:.2f}): {numbers}")
-    for path, about in summary["parameters"].items():
-        lines.append(f"{path} {_value(about)} (nominal {about['nominal']:.3g})")
+    for finding in summary["findings"]:
+        numbers = ", ".join(f"{name} {_value(number)}" for name, number in finding["parameters"].items())
+        lines.append(f"{finding['effect']} ({finding['confidence']:.2f}): {numbers}")
+    for path, number in summary["parameters"].items():
+        lines.append(f"{path} {_value(number)} (nominal {number['nominal']:.3g})")
     return lines or ["nothing"]
 
 
-def _value(about: Mapping[str, Any]) -> str:
-    error = f" ± {about['standard_error']:.1g}" if about["standard_error"] else ""
-    return f"{about['value']:.4g}{error} {about['unit']}".rstrip()
+def _value(number: Mapping[str, Any]) -> str:
+    error = f" ± {number['standard_error']:.1g}" if number["standard_error"] else ""
+    return f"{number['value']:.4g}{error} {number['unit']}".rstrip()
 
 
-def _rival(said: Mapping[str, Any]) -> str:
-    if said["note"]:
-        return said["note"]
+def _rival(result: Mapping[str, Any]) -> str:
+    if result["note"]:
+        return result["note"]
     lines = []
-    for name in said["names"]:
-        gain = f" (-{said['gains'][name]:.0%} of rms)" if name in said["gains"] else ""
-        lines.append(f"{name} {', '.join(f'{one:.3g}' for one in said['factors'][name])} {said['units'][name]}{gain}")
+    for name in result["names"]:
+        gain = f" (-{result['gains'][name]:.0%} of rms)" if name in result["gains"] else ""
+        lines.append(
+            f"{name} {', '.join(f'{factor:.3g}' for factor in result['factors'][name])} {result['units'][name]}{gain}"
+        )
     return "<br>".join(lines) or "nothing"
 
 
@@ -88,7 +90,7 @@ def _errors(row: Row, kind: str) -> str:
         if name.startswith(kind):
             limit = (gap["expected"].get(name) or {}).get("limit")
             after, noise = gap["holdout_rmse_after"][name], gap["noise_floor"][name]
-            mark = " **fails**" if name in _failed(gap["test"]) else ""
+            mark = " **fails**" if name in _failed_checks(gap["test"]) else ""
             lines.append(
                 f"{name}: {_number(before)} → {_number(after)}, limit {_number(limit)}{mark}, noise {_number(noise)} "
                 f"{gap['units'][name]}"
@@ -103,7 +105,7 @@ _REASONS = {
 """Reasons against a verdict, beside errors."""
 
 
-def _failed(test: Mapping[str, Any]) -> list[str]:
+def _failed_checks(test: Mapping[str, Any]) -> list[str]:
     """Channels that failed at any bandwidth."""
     return list(dict.fromkeys(name.partition(" ")[0] for name in test["failed"]))
 
@@ -112,18 +114,18 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
     """All rows as tables."""
     lines = ["| recordings | verdict | explained | named by jaxbl, and its numbers | known | s |"]
     lines += ["|---|---|---:|---|---|---:|"]
-    for one in rows:
-        where = f"{one.name}<br>{one.split}"
-        if one.error:
-            said = "has no torque" if one.expected else "no diagnosis"
-            lines.append(f"| {where} | {said} | – | {one.error} | {one.published} | {one.seconds:.0f} |")
+    for row in rows:
+        where = f"{row.name}<br>{row.split}"
+        if row.error:
+            status = "has no torque" if row.expected else "no diagnosis"
+            lines.append(f"| {where} | {status} | – | {row.error} | {row.published} | {row.seconds:.0f} |")
             continue
-        share = one.summary["explained_share"]
+        share = row.summary["explained_share"]
         lines.append(
-            f"| {where} | {one.summary['verdict']} | {'–' if share is None else f'{share:.1%}'} | "
-            f"{'<br>'.join(findings(one.summary))} | {one.published} | {one.seconds:.0f} |"
+            f"| {where} | {row.summary['verdict']} | {'–' if share is None else f'{share:.1%}'} | "
+            f"{'<br>'.join(findings(row.summary))} | {row.published} | {row.seconds:.0f} |"
         )
-    done = [one for one in rows if not one.error]
+    done = [row for row in rows if not row.error]
     if not done:
         return "\n".join(lines if rows else ["no recordings"])
     lines += [
@@ -132,48 +134,48 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
         "",
     ]
     lines += ["| recordings | positions | torques | failed tests |", "|---|---|---|---|"]
-    for one in done:
-        test = one.summary["gap"]["test"]
-        why = [*_failed(test), *test["far"]]
-        why += [text for key, text in _REASONS.items() if test[key]]
-        lines.append(f"| {one.name} | {_errors(one, 'theta')} | {_errors(one, 'torque')} | {', '.join(why) or 'none'} |")
-    lines += ["", *_compared(rows, rivals)]
+    for row in done:
+        test = row.summary["gap"]["test"]
+        reasons = [*_failed_checks(test), *test["far"]]
+        reasons += [text for key, text in _REASONS.items() if test[key]]
+        lines.append(f"| {row.name} | {_errors(row, 'theta')} | {_errors(row, 'torque')} | {', '.join(reasons) or 'none'} |")
+    lines += ["", *_compare_torques(rows, rivals)]
     return "\n".join(lines)
 
 
-def _compared(rows: Sequence[Row], rivals: bool) -> list[str]:
-    some = [one for one in rows if one.torques]
+def _compare_torques(rows: Sequence[Row], rivals: bool) -> list[str]:
+    compared = [row for row in rows if row.torques]
     tools = TOOLS if rivals else TOOLS[:2]
     lines = ["Held-out torque error of the motor side behind one low-pass, rms, and its share of the driving torque:", ""]
     margin = [" against the best other |", "---:|"] if rivals else ["", ""]
     lines += [f"| recordings | low-pass | {' | '.join(tools)} |{margin[0]}", f"|---|---:|{'---:|' * len(tools)}{margin[1]}"]
-    for one in some:
+    for row in compared:
         cells = []
         for tool in tools:
-            value = one.torques.get(tool)
-            cells.append("–" if value is None else f"{value:.4g} {one.unit} ({value / one.driving:.1%})")
+            value = row.torques.get(tool)
+            cells.append("–" if value is None else f"{value:.4g} {row.unit} ({value / row.driving:.1%})")
         if rivals:
-            cells.append("–" if one.margin is None else f"{one.margin:+.1f} standard errors")
-        lines.append(f"| {one.name} | {one.cutoff:g} Hz | {' | '.join(cells)} |")
+            cells.append("–" if row.margin is None else f"{row.margin:+.1f} standard errors")
+        lines.append(f"| {row.name} | {row.cutoff:g} Hz | {' | '.join(cells)} |")
     if rivals:
         lines += ["", "| recordings | stepwise least squares | pysindy | mujoco |", "|---|---|---|---|"]
-        lines += [f"| {one.name} | {' | '.join(_rival(one.rivals[tool]) for tool in TOOLS[2:])} |" for one in some]
+        lines += [f"| {row.name} | {' | '.join(_rival(row.rivals[tool]) for tool in TOOLS[2:])} |" for row in compared]
     return lines
 
 
 def write(rows: Sequence[Row], text: str, folder: Path) -> list[Path]:
     """Leave the tables, JSON of each row, and the figure."""
     folder.mkdir(parents=True, exist_ok=True)
-    made = [folder / "scores.md"]
-    made[0].write_text(text + "\n", encoding="utf-8")
-    for one in rows:
-        made.append(folder / f"{one.name}.json")
-        made[-1].write_text(json.dumps(asdict(one), indent=1), encoding="utf-8")
-    some = [one for one in rows if one.torques and not one.error]
-    if some:
+    files = [folder / "scores.md"]
+    files[0].write_text(text + "\n", encoding="utf-8")
+    for row in rows:
+        files.append(folder / f"{row.name}.json")
+        files[-1].write_text(json.dumps(asdict(row), indent=1), encoding="utf-8")
+    drawn = [row for row in rows if row.torques and not row.error]
+    if drawn:
         with style():
-            made.append(save(_figure(some), folder / "torque_errors.png"))
-    return made
+            files.append(save(_figure(drawn), folder / "torque_errors.png"))
+    return files
 
 
 _LOOKS = {
@@ -192,9 +194,9 @@ _MOST = 300.0
 def _figure(rows: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(9.6, 1.6 + 0.42 * len(rows)))
     left, right = figure.subplots(1, 2, sharey=True)
-    for i, one in enumerate(rows):
-        gap = one.summary["gap"]
-        scale = gap["driving"]["motor"] or one.driving
+    for i, row in enumerate(rows):
+        gap = row.summary["gap"]
+        scale = gap["driving"]["motor"] or row.driving
         before, after = (100.0 * gap[f"holdout_rmse_{when}"]["torque_motor"] / scale for when in ("before", "after"))
         limit = 100.0 * gap["expected"]["torque_motor"]["limit"] / scale
         noise = 100.0 * gap["noise_floor"]["torque_motor"] / scale
@@ -211,15 +213,15 @@ def _figure(rows: Sequence[Row]) -> Figure:
         )
         left.plot([noise, noise], [i - 0.3, i + 0.3], color="#999999", linestyle=":", label="noise" if first else "")
         for j, tool in enumerate(TOOLS):
-            value = one.torques.get(tool)
+            value = row.torques.get(tool)
             if value is not None:
                 label, colour, marker = _LOOKS[tool]
-                share = 100.0 * value / one.driving
+                share = 100.0 * value / row.driving
                 right.plot(
                     min(share, _MOST), i + 0.15 * (j - 2.0), marker if share <= _MOST else ">", color=colour,
                     label=label if first else "",
                 )  # fmt: skip
-    left.set_yticks(range(len(rows)), [one.name for one in rows])
+    left.set_yticks(range(len(rows)), [row.name for row in rows])
     left.invert_yaxis()
     for axes, title in ((left, "by jaxbl's own account"), (right, "all tools behind one low-pass")):
         axes.set_xscale("log")

@@ -17,13 +17,13 @@ def _double():
 
 
 def largest(kind, gains, noise, paths):
-    return float(jax.vmap(lambda x: audit.simulated(kind, gains, noise, x))(paths).max())
+    return float(jax.vmap(lambda x: audit.simulate_errors(kind, gains, noise, x))(paths).max())
 
 
 def test_the_worst_error_is_the_larger_of_search_and_pairs():
     kind, gains, noise = ImplicitSuperTwisting, (1.5, 1.1), 2.0
     pairs = [largest(kind, gains, noise, x[None]) for x in audit.pairs(noise, audit.horizon(noise))]
-    found = audit.searched(kind, gains, noise)
+    found = audit.search_worst(kind, gains, noise)
     assert found > max(pairs)
     assert audit.worst(kind, gains, noise, audit.horizon(noise)) == found
 
@@ -31,7 +31,9 @@ def test_the_worst_error_is_the_larger_of_search_and_pairs():
 def test_pairs_make_super_twisting_err_by_the_bounds():
     noise, gains = 10.0, (1.8 * 1.1**0.5, 1.1)
     samples = audit.horizon(noise)
-    plain, exact = (float(audit.simulated(ImplicitSuperTwisting, gains, noise, x)) for x in audit.pairs(noise, samples))
+    plain, exact = (
+        float(audit.simulate_errors(ImplicitSuperTwisting, gains, noise, x)) for x in audit.pairs(noise, samples)
+    )
     assert plain == pytest.approx(least_worst_error(noise, 1.0, 1.0), rel=1e-6)
     assert exact == pytest.approx(least_exact_error(noise, 1.0, 1.0), rel=1e-6)
 
@@ -40,7 +42,7 @@ def test_a_linear_observer_has_its_worst_case_in_closed_form():
     kind, gains, noise, samples = Luenberger, (0.4, 0.7), 3.0, 60
     found = float(audit.worst_linear(kind, gains, noise, samples))
     sensitivity = jax.grad(lambda x: audit.error(kind(*gains), noise, x))(jnp.zeros((2, samples)))
-    assert found == pytest.approx(float(audit.simulated(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
+    assert found == pytest.approx(float(audit.simulate_errors(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
     random = np.random.default_rng(0).choice([-1.0, 1.0], (500, 2, samples))
     assert largest(kind, gains, noise, jnp.asarray(random)) < found
 

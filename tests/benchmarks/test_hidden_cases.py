@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden.cases import _PLANTS, ALONE, KINDS, _known, _targets, cases, save
+from hidden.cases import _PLANTS, ALONE, KINDS, _add_known_effect, _targets, cases, save
 from hidden.effects import APART, EFFECTS, LEVELS, NEW, PINION, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
 from hidden.simulator import Machine
-from hidden_effects import left
+from hidden_effects import read_outcomes
 
 from jaxbl.config import read_model
 from jaxbl.drive import Initial, Plant, as_arrays, effects
@@ -72,9 +72,9 @@ def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
     given = _PLANTS["direct"]
     machine = Machine(given["drive"], None)
     hidden = ["motor.coulomb_friction", "load.gravity"]
-    drawn = [_known(machine, hidden, given, np.random.default_rng(seed)) for seed in range(20)]
+    drawn = [_add_known_effect(machine, hidden, given, np.random.default_rng(seed)) for seed in range(20)]
     assert drawn == [()] * 20
-    one = [_known(machine, hidden[:1], given, np.random.default_rng(seed)) for seed in range(20)]
+    one = [_add_known_effect(machine, hidden[:1], given, np.random.default_rng(seed)) for seed in range(20)]
     assert {effects[0]["kind"] for effects in one if effects} == {"load.gravity"}
 
 
@@ -282,7 +282,7 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tm
         (folder / "diagnosis.json").write_text(json.dumps(oracle(None, case.model, None)))
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
     assert set(truth) == {case.name for case in some}
-    outcomes = left(found[:4], tmp_path / "found")
+    outcomes = read_outcomes(found[:4], tmp_path / "found")
     assert [one.is_right for one in outcomes] == [True, True, True, False]
     made = write(outcomes, tmp_path / "out", "A seed")
     assert {path.name for path in made} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}

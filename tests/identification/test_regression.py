@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from filtered_derivatives import differentiated
+from filtered_derivatives import differentiate
 from measured import EMPS, real
 from scipy import signal
 from small_study import rigid, small
@@ -148,7 +148,7 @@ def test_emps_by_the_published_method_and_measure():
              "effects.motor.constant_torque.torque"]  # fmt: skip
     free = make_free_parameters(experiment, paths, 50.0)
     records = [read_record(real(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
-    parts = [differentiated(r.time, r.torque, r.positions, 100.0) for r in records]
+    parts = [differentiate(r.time, r.torque, r.positions, 100.0) for r in records]
     found = regress(experiment, free, parts[:1], 10)
     values = [float(one.value(found.theta[i])) for i, one in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
