@@ -8,6 +8,7 @@ import numpy as np
 from jaxbl.validation import suggest_word
 
 from .files import LogFile
+from .libraries import ColumnName
 from .signal_quality import find_resolution
 from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
@@ -88,7 +89,7 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
     return False
 
 
-def _read_numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
+def _read_numbers(file: LogFile, name: str, column: ColumnName, bits: int | None, stamps: TimeStamps) -> np.ndarray:
     """Read the numbers of a column at the selected rows; unsigned words become signed."""
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
     values = file.load_numbers(column, f"{name}.column")
@@ -239,7 +240,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarr
 # units
 
 
-def _check_unsigned(file: LogFile, name: str, column: str | int, values: np.ndarray) -> None:
+def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: np.ndarray) -> None:
     """Refuse whole numbers from 0 up without any in the middle of a word's range: negative words, logged as unsigned."""
     if values.min() < 0.0 or (values != np.round(values)).any():
         return

@@ -54,7 +54,7 @@ TERMS = ("gap", "damping", "dry friction", "hysteresis", "friction under load")
 """Terms of a transmission beside its stiffness."""
 _SHAPES_BY_TERM = {"gap": ("centre", "half_gap"), "hysteresis": ("length",), "friction under load": ("centre",)}
 """Term -> its nonlinear numbers."""
-_SIZE_NAMES = {
+SIZE_NAMES = {
     "damping": "damping",
     "dry friction": "dry_friction",
     "hysteresis": "hysteresis",
@@ -340,10 +340,10 @@ def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
 def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:
     """Drop terms with a negative size; if `new_term` is among them, return the model unchanged."""
     while True:
-        sized_terms = [term for term in model.terms if term in _SIZE_NAMES]
+        sized_terms = [term for term in model.terms if term in SIZE_NAMES]
         positive_terms = {term for term, size in zip(sized_terms, model.sizes[2:], strict=True) if size > 0.0}
-        terms = tuple(term for term in model.terms if term not in _SIZE_NAMES or term in positive_terms)
-        if terms == model.terms or (new_term in _SIZE_NAMES and new_term not in positive_terms):
+        terms = tuple(term for term in model.terms if term not in SIZE_NAMES or term in positive_terms)
+        if terms == model.terms or (new_term in SIZE_NAMES and new_term not in positive_terms):
             return model
         model = _fit_model(rig, terms, model)
 
@@ -422,17 +422,14 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
     names = [
         "stiffness",
         "offset",
-        *(_SIZE_NAMES[term] for term in model.terms if term in _SIZE_NAMES),
+        *(SIZE_NAMES[term] for term in model.terms if term in SIZE_NAMES),
         *_shape_names(model.terms),
     ]
     values = np.concatenate([model.sizes, model.shapes])
     columns = rig.columns(model.terms, model.shapes, rig.rows)
-    slopes = []
-    for i in range(len(model.shapes)):
-        step = 1e-4 * rig.half_range
-        ends = [model.shapes.copy(), model.shapes.copy()]
-        ends[0][i] -= step
-        ends[1][i] += step
+    slopes, step = [], 1e-4 * rig.half_range
+    for offset in step * np.eye(len(model.shapes)):
+        ends = model.shapes - offset, model.shapes + offset
         low, high = (rig.columns(model.terms, shapes, rig.rows) @ model.sizes for shapes in ends)
         slopes.append((high - low) / (2.0 * step))
     jacobian = np.column_stack([columns, *slopes])

@@ -431,13 +431,18 @@ class TextFormat(NamedTuple):
         return np.stack([pd.to_numeric(frame[i], errors="coerce").to_numpy(float) for i in range(self.count)], axis=1)
 
 
+def has_cells(line: str) -> bool:
+    """Return True if a line is neither blank nor a comment."""
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
 def detect_text_format(lines: list[str]) -> TextFormat:
     """Detect the format of rows from the first lines of a text.
 
     Raises:
         InputError: only remarks, too many columns, or two with the same name; the message is without the path.
     """
-    start = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
+    start = next((i for i, line in enumerate(lines) if has_cells(line)), None)
     if start is None:
         raise InputError("holds only remarks; rows of numbers are needed")
     separator = _find_separator(lines[start])
@@ -486,7 +491,7 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
         ),
         0,
     )
-    remarks = [line for line in lines[:start] if line.strip() and not line.lstrip().startswith("#")]
+    remarks = [line for line in lines[:start] if has_cells(line)]
     if len(remarks) < 2:
         return None
     separator = _find_separator(lines[start])

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .alignment import NominalDrive
-from .element import Element, fit_element
+from .element import SIZE_NAMES, Element, fit_element
 from .gearing import Gearing, twist_noise
 from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
@@ -173,10 +173,7 @@ def element_noise(record: Record, gear_ratio: float | None) -> float:
     return float(np.hypot.reduce(np.ravel(noise)))
 
 
-_ELEMENT_NUMBERS = {
-    "stiffness": "stiffness", "gap": "half_gap", "damping": "damping", "dry friction": "dry_friction",
-    "hysteresis": "hysteresis", "friction under load": "friction_coefficient",
-}  # fmt: skip
+_ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap"} | SIZE_NAMES
 """Quantity of an element -> name of its number."""
 
 
@@ -249,21 +246,16 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
     ]
 
     def judge(name: str, i: int, evidence: str, similar_term: str) -> Identifiability:
+        weakness = ""
         if rigid_fit.inflation[i] > 10.0:
-            return Identifiability(
-                name, "weak", f"hard to separate from {similar_term} here (variance × {rigid_fit.inflation[i]:.0f})"
-            )
-        if rigid_fit.values[i] < 2.0 * rigid_fit.errors[i]:
-            return Identifiability(
-                name, "weak", f"a rough fit finds no positive value ({percent[i]}): other effects hide it"
-            )
-        if rigid_fit.shares[i] < 0.05:
-            return Identifiability(name, "weak", f"it makes only {percent[i]}")
-        if relative_errors[i] > 0.2:
-            return Identifiability(
-                name, "weak", f"a rough fit finds it only to ± {100 * relative_errors[i]:.0f} % ({percent[i]})"
-            )
-        return Identifiability(name, "yes", f"{evidence}: {percent[i]}")
+            weakness = f"hard to separate from {similar_term} here (variance × {rigid_fit.inflation[i]:.0f})"
+        elif rigid_fit.values[i] < 2.0 * rigid_fit.errors[i]:
+            weakness = f"a rough fit finds no positive value ({percent[i]}): other effects hide it"
+        elif rigid_fit.shares[i] < 0.05:
+            weakness = f"it makes only {percent[i]}"
+        elif relative_errors[i] > 0.2:
+            weakness = f"a rough fit finds it only to ± {100 * relative_errors[i]:.0f} % ({percent[i]})"
+        return Identifiability(name, "weak" if weakness else "yes", weakness or f"{evidence}: {percent[i]}")
 
     judgements = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
     one_way_text = "motion in one direction only: hard to separate from"

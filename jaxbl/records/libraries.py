@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -108,17 +108,8 @@ _MAX_LIST_LENGTH = 64
 """Elements of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
 
 
-class _Recording(NamedTuple):
-    """Messages of a recording.
-
-    Attributes:
-        counts: topic -> number of messages.
-        messages: function of topics that yields their messages in the order of time: topic, time of recording in ns, the
-            decoded message.
-    """
-
-    counts: dict[str, int]
-    messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
+_Messages = Iterator[tuple[str, int, Any]]
+"""Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
 
 
 def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
@@ -137,7 +128,7 @@ def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
         else:
             other_topics.add(f"{channel.topic} ({channel.message_encoding})")
 
-    def iterate_messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    def iterate_messages(topics: Collection[str]) -> _Messages:
         with path.open("rb") as file:
             for schema, channel, message in library.make_reader(file).iter_messages(topics=list(topics)):
                 if channel.message_encoding == "json":
@@ -147,7 +138,7 @@ def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
                         types[schema.id] = _message_types(schema)
                     yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
-    columns = _recording_columns(_Recording(counts, iterate_messages), selection)
+    columns = _recording_columns(counts, iterate_messages, selection)
     if other_topics:
         columns.notes.append(
             f"Messages in other formats than JSON and ROS 2 are not read: {', '.join(sorted(other_topics))}."
@@ -178,27 +169,32 @@ def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
         for connection in reader.connections:
             counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
 
-    def iterate_messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    def iterate_messages(topics: Collection[str]) -> _Messages:
         with library.AnyReader([path]) as reader:
             connections = [connection for connection in reader.connections if connection.topic in topics]
             for connection, time, message in reader.messages(connections=connections):
                 yield connection.topic, time, reader.deserialize(message, connection.msgtype)
 
-    return _recording_columns(_Recording(counts, iterate_messages), selection)
+    return _recording_columns(counts, iterate_messages, selection)
 
 
-def _recording_columns(recording: _Recording, selection: Collection[ColumnName]) -> Columns:
-    """Return the columns of a recording; the first one that is used of a topic loads all its selected ones."""
+def _recording_columns(
+    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Collection[ColumnName]
+) -> Columns:
+    """Return the columns of a recording; the first one that is used of a topic loads all its selected ones.
+
+    `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of topics.
+    """
     fields: dict[str, dict[str, list[ColumnName]]] = {}
-    for topic, count in recording.counts.items():
-        first_message = next(recording.messages([topic]), None) if count else None
+    for topic, count in counts.items():
+        first_message = next(iterate_messages([topic]), None) if count else None
         if first_message is not None:
             fields[topic] = dict(_find_numbers(first_message[2], []))
     places = {f"{topic}.{field}": (topic, field) for topic, paths in fields.items() for field in paths}
     if not places:
         raise InputError("holds no messages with numbers; a log needs them")
     selected_topics = {places[name][0] for name in selection if name in places}
-    main = max((topic for topic in selected_topics or fields if fields[topic]), key=lambda topic: recording.counts[topic])
+    main = max((topic for topic in selected_topics or fields if fields[topic]), key=lambda topic: counts[topic])
     loaded_values: dict[str, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
 
@@ -209,7 +205,7 @@ def _recording_columns(recording: _Recording, selection: Collection[ColumnName])
             ]
             paths = [fields[topic][places[column][1]] for column in names]
             stamps, recording_times, rows = array("q"), array("q"), array("d")
-            for _, time, message in recording.messages([topic]):
+            for _, time, message in iterate_messages([topic]):
                 stamps.append(_header_time(message))
                 recording_times.append(time)
                 rows.extend(float(_number_at(message, path)) for path in paths)
@@ -230,7 +226,7 @@ def _recording_columns(recording: _Recording, selection: Collection[ColumnName])
         values = load_values(topic, name)
         return values if topic == main else np.interp(load_seconds(main), load_seconds(topic), values)
 
-    count = recording.counts[main]
+    count = counts[main]
     columns = Columns(t=Column(lambda: load_seconds(main), count))
     for name, (topic, _) in places.items():
         columns[name] = Column(partial(load_column, topic, name), count)

@@ -22,7 +22,7 @@ from jaxbl.errors import InputError, shorten
 from jaxbl.validation import check_file, explain_missing_file
 
 from .channels import to_si, to_signed
-from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, log_suffixes
+from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, log_suffixes
 from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
@@ -167,28 +167,26 @@ class _ChannelReader:
             stamps = values[:, self._indices[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
         torque_table = self._table.u or TorqueTable()
         torque = to_si(torque_table, self._read_numbers(values, torque_table.column_or("u"), torque_table.signed_bits))
-        numbers, tables = {}, {}
+        numbers = {}
         for side, name in POSITION_CHANNELS.items():
             channel, position_table = self._table.position_source(name)
-            tables[side] = position_table
             bits = position_table.signed_bits
             numbers[side] = self._read_numbers(values, position_table.column_or(channel), bits)
             if isinstance(position_table, PositionTable) and position_table.minus is not None:
                 numbers[side] = numbers[side] - self._read_numbers(values, position_table.minus, bits)
         is_readable = np.isfinite(np.stack([stamps, torque, *numbers.values()])).all(axis=0)
         stamps = stamps[is_readable]
-        positions = {side: self._read_position(side, tables[side], numbers[side][is_readable], stamps) for side in numbers}
+        positions = {side: self._read_position(side, numbers[side][is_readable], stamps) for side in numbers}
         return _Samples(stamps, torque[is_readable], positions), int(np.count_nonzero(~is_readable))
 
     def _read_numbers(self, values: np.ndarray, column: ColumnName, bits: int | None) -> np.ndarray:
         numbers = values[:, self._indices[column]]
         return numbers if bits is None else to_signed(numbers, bits)
 
-    def _read_position(
-        self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray
-    ) -> np.ndarray:
+    def _read_position(self, side: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):
             return values
+        _, table = self._table.position_source(POSITION_CHANNELS[side])
         if isinstance(table, SpeedTable):
             speed = to_si(table, values)
             speeds = np.append(self._previous.get(f"{side} speed", float(speed[0])), speed)
@@ -337,10 +335,6 @@ class _TextSource:
         return values
 
 
-def _drop_remarks(lines: list[str]) -> list[str]:
-    return [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
-
-
 class FollowedFile(_TextSource):
     """Rows of a text file, from its beginning on, and those that are written to it later.
 
@@ -374,7 +368,7 @@ class FollowedFile(_TextSource):
         if len(self._incomplete_line) > MAX_LINE_BYTES:
             raise InputError(f"{self.name}: has a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; it should have one a row")
         self._lines += [line.decode("utf-8-sig", errors="replace").strip("\r") for line in lines]
-        rows = _drop_remarks(self._lines)
+        rows = list(filter(has_cells, self._lines))
         if self._format is None:
             # the header and a row: the decimal sign shows only in a row
             if len(rows) < 2:
@@ -487,7 +481,7 @@ class Datagrams(_TextSource):
 
     def _parse_text(self, lines: list[str]) -> np.ndarray:
         """Parse lines into numbers, shape (rows, columns). Lines before the first one in a fit format are malformed."""
-        lines = _drop_remarks(lines)
+        lines = list(filter(has_cells, lines))
         while lines and self._format is None and not self._detect_format(lines):
             lines = lines[1:]
         return np.empty((0, 0)) if self._format is None else self._parse_rows(self._format, lines)

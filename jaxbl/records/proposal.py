@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from .alignment import NominalDrive
 from .files import LogFile, read_log_file
 from .inspection import Inspection, inspect
 from .least_squares import fit_with_jackknife
+from .libraries import ColumnName
 from .rigid_body import smooth_sign
 from .signal_quality import long_segments, low_pass, trim_filter_ends
 from .table import POSITION_CHANNELS
@@ -38,12 +40,12 @@ _UNIT_NAMES = {
     "%": "%", "ma": "mA",
 }  # fmt: skip
 """Spelling of a unit -> its name in `[log]`."""
-_SPEED_UNITS = ("rpm", "rad/s", "deg/s", "turn/s", "m/s", "mm/s")
+_SPEED_UNITS = ("rad/s", "rpm", "deg/s", "turn/s", "m/s", "mm/s")
 _POSITION_UNITS = ("rad", "deg", "turn", "counts", "m", "mm")
 _TORQUE_UNITS = ("N m", "N", "A", "V", "counts", "mN m", "%", "mA")
 
 
-def _split_unit(file: LogFile, column: str | int) -> tuple[str, str]:
+def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
     """Split the name of a column: in lower case without its unit, and the unit as `[log]` calls it, "" for none."""
     name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
     if match := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
@@ -97,7 +99,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
             f"{path}: --write goes by the names of columns, and the file has none; a file with [log] for --model can give "
             "their numbers"
         )
-    candidates: dict[str, list[tuple[bool, str | int, str, np.ndarray]]] = {}
+    candidates: dict[str, list[tuple[bool, ColumnName, str, np.ndarray]]] = {}
     for column in file.columns:
         name, unit = _split_unit(file, column)
         channel, is_setpoint = _guess_channel(name, unit), _matches("setpoint", name)
@@ -122,7 +124,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
             table[channel] = _guess_position_table(column, unit, numbers, guesses)
         # a measured position is better than the integral of a speed
         elif channel and channel.replace("omega", "theta") not in candidates:
-            table[channel] = _guess_speed_table(column, unit, guesses)
+            table[channel] = _assume_unit(column, unit, _SPEED_UNITS, guesses)
     if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
@@ -134,7 +136,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     return table, guesses
 
 
-def _guess_time_table(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
     if unit not in ("s", "ms", "us", "ns"):
         median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
         # drives are sampled every 10 us to 0.1 s
@@ -146,7 +148,7 @@ def _guess_time_table(column: str | int, unit: str, values: np.ndarray, guesses:
     return {"column": column, "unit": unit}
 
 
-def _guess_torque_table(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
+def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> dict[str, Any]:
     plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
     if unit in ("A", "V", "%", "mA", "counts"):
         quantity = "100 %" if unit == "%" else f"one {unit}"
@@ -167,20 +169,20 @@ def _describe_unit_guess(quantity: str, unit: str, default: str) -> str:
     return f"The unit of {quantity} is {fault}{default} is assumed."
 
 
-def _guess_position_table(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
     is_whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
     if unit == "counts" or (not unit and is_whole):
         guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
         return {"column": column, "unit": "counts", "counts_per_turn": 4096.0}
-    if unit not in _POSITION_UNITS:
-        guesses.append(_describe_unit_guess(f"'{column}'", unit, "rad"))
-    return {"column": column, "unit": unit if unit in _POSITION_UNITS else "rad"}
+    return _assume_unit(column, unit, _POSITION_UNITS, guesses)
 
 
-def _guess_speed_table(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
-    if unit not in _SPEED_UNITS:
-        guesses.append(_describe_unit_guess(f"'{column}'", unit, "rad/s"))
-    return {"column": column, "unit": unit if unit in _SPEED_UNITS else "rad/s"}
+def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> dict[str, Any]:
+    """Return the table of a column, with the first one of `units` if its unit is not one of them."""
+    if unit not in units:
+        guesses.append(_describe_unit_guess(f"'{column}'", unit, units[0]))
+        unit = units[0]
+    return {"column": column, "unit": unit}
 
 
 def propose_study(

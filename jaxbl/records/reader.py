@@ -30,7 +30,16 @@ from .plausibility import (
 )
 from .resampling import Delay, Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
-from .signal_quality import ChannelStatistics, longest_segment, measure_channel
+from .signal_quality import (
+    ChannelStatistics,
+    count_jumps,
+    find_bandwidth,
+    find_resolution,
+    longest_segment,
+    noise_floor,
+    power_spectrum,
+    saturated_share,
+)
 from .table import ELEMENT_NEEDS, POSITION_CHANNELS, LogTable
 from .time_stamps import Sampling, SegmentedStamps, read_time_stamps, split_at_gaps
 
@@ -156,13 +165,13 @@ def read_record(
     if table.kind == "element" and "theta_e" not in encoders:
         raise file.error(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
     # the sides of an element move on their own, if they move
-    drive = table.kind == "drive"
-    for name in encoders if drive else encoders[:1]:
+    is_drive = table.kind == "drive"
+    for name in encoders if is_drive else encoders[:1]:
         check_position_moves(file, name, channels[name].values)
-    if drive and len(encoders) == 2:
+    has_both_encoders = is_drive and len(encoders) == 2
+    if has_both_encoders:
         note_standstill(file, segmented, channels)
     # these become evenly spaced samples
-    has_both_encoders = drive and len(encoders) == 2
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
     grid, gearing, regular = _resample_and_align(file, table, segmented, channels, gear_ratio, shaft)
     if shaft is not None:
@@ -170,7 +179,7 @@ def read_record(
     # the motion is compared with the drive
     if has_both_encoders:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit)
-    position, is_driven = grid.values[encoders[0]], drive and "u" in channels
+    position, is_driven = grid.values[encoders[0]], is_drive and "u" in channels
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if is_driven else None
     if dynamics is not None:
         check_torque_sign(file, dynamics, grid, position)
@@ -268,7 +277,7 @@ def _resample_and_align(
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
-            f"Resampled {purpose}: every {1e3 * period:.6g} ms in place of {1e3 * segmented.period:.6g} ms; positions by "
+            f"Resampled {purpose}: every {1e3 * period:.6g} ms, in the log every {1e3 * segmented.period:.6g} ms; positions by "
             "cubic splines, torques so that their integral stays the same."
         )
     for name, delay in delays.items():
@@ -376,14 +385,26 @@ def _measure_channel(
     segment = longest_segment(source.segments)
     values, times = source.values[name][segment], source.time[segment]
     period = float(times[-1] - times[0]) / (len(values) - 1)
-    statistics = measure_channel(
-        values,
-        period,
-        [raw.values[rows] for rows in segmented.segments],
-        None if segmented.sampling.even else [segmented.times[rows] for rows in segmented.segments],
+    readings = np.concatenate([raw.values[rows] for rows in segmented.segments])
+    step = find_resolution(readings)
+    is_position = name.startswith("theta")
+    jumps, saturated = 0, raw.saturated
+    if is_position:
+        is_even = segmented.sampling.even
+        jumps = sum(
+            count_jumps(raw.values[rows], step, None if is_even else segmented.times[rows]) for rows in segmented.segments
+        )
+    elif not saturated:
+        saturated = saturated_share(readings, step)
+    statistics = ChannelStatistics(
         unit=raw.unit,
-        is_position=name.startswith("theta"),
-        saturated=raw.saturated,
+        least=float(readings.min()),
+        largest=float(readings.max()),
+        resolution=step,
+        noise=float(np.sqrt(noise_floor(*power_spectrum(values, period)) * 0.5 / period)),
+        bandwidth=find_bandwidth(values, period, differentiate=is_position) if np.ptp(values) else 0.0,
+        saturated=saturated,
+        jumps=jumps,
     )
     note_channel_faults(file, name, statistics, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
     return statistics

@@ -45,45 +45,6 @@ class ChannelStatistics:
     skew_error: float | None = None
 
 
-def measure_channel(
-    values: np.ndarray,
-    period: float,
-    segments: Sequence[np.ndarray],
-    stamps: Sequence[np.ndarray] | None,
-    *,
-    unit: str,
-    is_position: bool,
-    saturated: float,
-) -> ChannelStatistics:
-    """Compute the statistics of a channel.
-
-    Args:
-        values: its longest segment at even spacing, for noise and bandwidth, shape (samples,).
-        period: of `values`, s.
-        segments: readings of each segment as recorded, for all other statistics.
-        stamps: times of each segment if these are uneven, s.
-        unit: rad, m, N m or N.
-        is_position: whether it is a position.
-        saturated: share of samples at the saturation level, if that is specified; else 0.
-    """
-    all_values = np.concatenate(segments)
-    step = find_resolution(all_values)
-    frequency, density = power_spectrum(values, period)
-    jump_count = (
-        sum(map(count_jumps, segments, [step] * len(segments), stamps or [None] * len(segments))) if is_position else 0
-    )
-    return ChannelStatistics(
-        unit=unit,
-        least=float(all_values.min()),
-        largest=float(all_values.max()),
-        resolution=step,
-        noise=float(np.sqrt(noise_floor(frequency, density) * 0.5 / period)),
-        bandwidth=find_bandwidth(values, period, differentiate=is_position) if np.ptp(values) else 0.0,
-        saturated=saturated or (0.0 if is_position else saturated_share(all_values, step)),
-        jumps=jump_count,
-    )
-
-
 def find_resolution(values: np.ndarray) -> float:
     """Return the step of which all differences between values are multiples; 0 if there is none."""
     span = float(np.ptp(values)) if len(values) else 0.0

@@ -7,6 +7,8 @@ from pydantic_core import PydanticCustomError
 
 from jaxbl.validation import Positive, StrictTable, table_error
 
+from .libraries import ColumnName
+
 
 def _check_column(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, str | int) or (isinstance(value, int) and value < 0):
@@ -32,7 +34,7 @@ def _check_sign(value: Any) -> Any:
     return int(value)
 
 
-_Column = Annotated[str | int, BeforeValidator(_check_column)]
+_Column = Annotated[ColumnName, BeforeValidator(_check_column)]
 _Skew = Annotated[float | Literal["estimate"], BeforeValidator(_check_skew)]
 _Sign = Annotated[int, BeforeValidator(_check_sign)]
 
@@ -57,7 +59,7 @@ class _ColumnTable(StrictTable):
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
         return {"anyOf": [{"type": ["string", "integer"]}, handler(schema)], "description": (cls.__doc__ or "").strip()}
 
-    def column_or(self, name: str) -> str | int:
+    def column_or(self, name: str) -> ColumnName:
         """Return the `column` key, or `name` if it is left out."""
         return name if self.column is None else self.column
 
@@ -259,9 +261,9 @@ class LogTable(StrictTable):
             raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
-    def list_columns(self) -> set[str | int]:
+    def list_columns(self) -> set[ColumnName]:
         """Return names and numbers of all columns that may be read."""
-        columns: set[str | int] = {*(self.where or {})}
+        columns: set[ColumnName] = {*(self.where or {})}
         for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
             channel = getattr(self, name)
             columns.add(name if channel is None else channel.column_or(name))
