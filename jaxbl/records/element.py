@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxbl.units import on_a_line
 
-from .least_squares import BLOCKS, fit_with_jackknife, rms
+from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
 from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass
 
 _MAX_SAMPLES = 20_000
@@ -112,8 +112,13 @@ class Element:
             }
             for name, number in self.numbers.items()
         }
-        summary = {"open": list(self.open), "gains": self.gains, "residual": self.residual, "share": self.share}
-        return {"numbers": numbers} | summary
+        return {
+            "numbers": numbers,
+            "open": list(self.open),
+            "gains": self.gains,
+            "residual": self.residual,
+            "share": self.share,
+        }
 
 
 @dataclass(frozen=True)
@@ -353,7 +358,7 @@ def _shape_names(terms: Sequence[str]) -> list[str]:
 
 
 def _fit_sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
+    scale = column_rms(columns) + 1e-300
     return np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
 
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import lost_motion
 from .least_squares import fit_with_jackknife, rms, scale_columns
-from .lost_motion import LostMotion
+from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .rigid_body import smooth_sign
 from .signal_quality import (
     MIN_SAMPLES,
@@ -321,17 +320,17 @@ def _fit_lost_motion(
         if best is None or mean_square < best[0]:
             best = (mean_square, flank, is_clear)
     if best is None:
-        return None if is_wide else lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn)
+        return None if is_wide else fit_lost_motion_by_load(time, twist, position, velocity, turn)
     _, flank, is_clear = best
-    fit = lost_motion.fit_lost_motion_by_direction(twist, terms, flank, is_clear)
+    fit = fit_lost_motion_by_direction(twist, terms, flank, is_clear)
     if is_wide:
         # the wind-up of the shaft is part of this shift, and its share is unknown in so few cycles
-        constant_fit = lost_motion.fit_lost_motion_by_direction(twist, terms[:, :1], flank, is_clear)
+        constant_fit = fit_lost_motion_by_direction(twist, terms[:, :1], flank, is_clear)
         return fit.enclose(constant_fit) if fit and constant_fit else fit
     if fit is None or fit.lost_motion_error > 0.25 * abs(fit.lost_motion):
         # at a constant speed, delays and wind-up look like lost motion: a delay is assumed to be at most a period
         delay = ratio * period * _rms(velocity)
-        fit_without_velocity = lost_motion.fit_lost_motion_by_direction(
+        fit_without_velocity = fit_lost_motion_by_direction(
             twist, np.delete(terms, 1, axis=1), flank, is_clear, other_error=delay
         )
         if fit_without_velocity is not None and (
@@ -341,7 +340,7 @@ def _fit_lost_motion(
     if fit is not None and fit.twist_residual < 0.25 * abs(fit.lost_motion):
         return fit
     # flanks by the direction of motion explain little: the load may change them
-    return lost_motion.fit_lost_motion_by_load(time, twist, position, velocity, turn) or fit
+    return fit_lost_motion_by_load(time, twist, position, velocity, turn) or fit
 
 
 def _rms(values: np.ndarray) -> float:

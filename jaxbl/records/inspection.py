@@ -16,6 +16,8 @@ from .reader import Record, read_log_table, read_record
 from .signal_quality import low_pass
 from .table import POSITION_CHANNELS, LogTable
 
+_Answer = Literal["yes", "weak", "no"]
+
 
 @dataclass(frozen=True)
 class Identifiability:
@@ -28,7 +30,7 @@ class Identifiability:
     """
 
     quantity: str
-    answer: Literal["yes", "weak", "no"]
+    answer: _Answer
     reason: str
 
 
@@ -222,7 +224,7 @@ def _count_reversals(record: Record, speed: np.ndarray) -> int:
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
 
-def _judge_alike(quantities: Iterable[str], answer: Literal["weak", "no"], reason: str) -> list[Identifiability]:
+def _judge_alike(quantities: Iterable[str], answer: _Answer, reason: str) -> list[Identifiability]:
     return [Identifiability(quantity, answer, reason) for quantity in quantities]
 
 
@@ -236,9 +238,9 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
         return _judge_alike(names, "weak", reason)
     if rigid_fit is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
-    moving = np.abs(speed[_is_moving(speed)])
-    slow, fast = np.quantile(moving, [0.05, 0.95])
-    minor_share = min((speed[_is_moving(speed)] > 0).mean(), (speed[_is_moving(speed)] < 0).mean())
+    moving = speed[_is_moving(speed)]
+    slow, fast = np.quantile(np.abs(moving), [0.05, 0.95])
+    minor_share = min((moving > 0).mean(), (moving < 0).mean())
     width = record.statistics.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
     percent = [f"{100 * share:.0f} % of the torque" for share in rigid_fit.shares]
     relative_errors = [
@@ -303,7 +305,7 @@ def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio
     return [
         Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {remark}"),
         _judge_lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
-        _judge_stiffness(record, speed, ratio, noise),
+        Identifiability("stiffness", *_judge_stiffness(record, speed, ratio, noise)),
     ]
 
 
@@ -321,17 +323,17 @@ def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str
     return Identifiability("lost motion", answer, reason)
 
 
-def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Identifiability:
+def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> tuple[_Answer, str]:
     """Judge the stiffness by twist over torque within one direction of motion; `noise` is that of the twist, rms."""
     torque = record.transmitted
     if torque is None:
         if record.torque is None or np.ptp(record.torque) == 0.0:
-            return Identifiability("stiffness", "no", "no varying torque was recorded")
+            return "no", "no varying torque was recorded"
         torque = record.torque
     twist = record.positions["motor"] - ratio * record.positions["load"]
     width = record.statistics.channels["theta_e"].bandwidth
     if width == 0.0:
-        return Identifiability("stiffness", "no", "the motion does not exceed the noise")
+        return "no", "the motion does not exceed the noise"
     targets, rows = [], []
     for s in record.segments:
         signals = np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1)
@@ -340,13 +342,9 @@ def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: flo
         rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
     coefficients, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
     if not np.isfinite(coefficients[0]):
-        return Identifiability("stiffness", "weak", "the log is too short to see how the twist follows the torque")
+        return "weak", "the log is too short to see how the twist follows the torque"
     windup = abs(float(coefficients[0])) * float(np.std(torque))
     unit = record.statistics.channels["theta_e"].unit
     if coefficients[0] < 5.0 * errors[0] or windup < noise:
-        return Identifiability(
-            "stiffness", "weak", f"the twist hardly follows the torque (it winds up {windup:.2g} {unit} rms)"
-        )
-    return Identifiability(
-        "stiffness", "yes", f"the twist follows the torque: {windup:.2g} {unit} rms against a noise of {noise:.2g}"
-    )
+        return "weak", f"the twist hardly follows the torque (it winds up {windup:.2g} {unit} rms)"
+    return "yes", f"the twist follows the torque: {windup:.2g} {unit} rms against a noise of {noise:.2g}"

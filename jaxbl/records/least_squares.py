@@ -11,6 +11,11 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def column_rms(columns: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    return np.sqrt(np.mean(columns**2, axis=0))
+
+
 def scale_columns(columns: np.ndarray) -> np.ndarray:
     """Divide each column by its largest magnitude, so that least squares are well conditioned."""
     return columns / (np.abs(columns).max(axis=0) + 1e-300)
@@ -23,7 +28,7 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
         Coefficients and standard errors (delete-a-block jackknife), shape (terms,); NaN if they are not determined. The
         errors hold for residuals of any correlation in time.
     """
-    scale = np.sqrt(np.mean(regressors**2, axis=0))
+    scale = column_rms(regressors)
     scale[scale == 0.0] = 1.0
     scaled = regressors / scale
     blocks = np.array_split(np.arange(len(target)), BLOCKS)

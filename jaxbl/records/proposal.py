@@ -48,11 +48,11 @@ _TORQUE_UNITS = ("N m", "N", "A", "V", "counts", "mN m", "%", "mA")
 def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
     """Split the name of a column: in lower case without its unit, and the unit as `[log]` calls it, "" for none."""
     name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
+    stem, underscore, end = name.rpartition("_")
     if match := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
         name, unit = name[: match.start()].strip(" _"), unit or match[1]
-    elif "_" in name and name.rsplit("_", 1)[1] in _UNIT_NAMES and name.rsplit("_", 1)[1] not in ("s", "m", "v", "a", "n"):
-        name, end = name.rsplit("_", 1)
-        unit = unit or end
+    elif underscore and end in _UNIT_NAMES and end not in ("s", "m", "v", "a", "n"):
+        name, unit = stem, unit or end
     return name, _UNIT_NAMES.get(unit, unit)
 
 
@@ -123,7 +123,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
         elif channel.startswith("theta"):
             table[channel] = _guess_position_table(column, unit, numbers, guesses)
         # a measured position is better than the integral of a speed
-        elif channel and channel.replace("omega", "theta") not in candidates:
+        elif channel.replace("omega", "theta") not in candidates:
             table[channel] = _assume_unit(column, unit, _SPEED_UNITS, guesses)
     if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
         columns = ", ".join(map(str, file.columns))
@@ -229,12 +229,11 @@ def propose_study(
         for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
             if key in inspection.record.corrections:
                 name, _ = inspection.log.position_source(channel)
-                table[name] = _make_channel_table(table.get(name, name)) | {key: inspection.record.corrections[key]}
+                channel_table = table.get(name, name)
+                if not isinstance(channel_table, dict):
+                    channel_table = {"column": channel_table}
+                table[name] = channel_table | {key: inspection.record.corrections[key]}
     return _make_study(inspection, nominal, table), guesses, inspection
-
-
-def _make_channel_table(column: Any) -> dict[str, Any]:
-    return column if isinstance(column, dict) else {"column": column}
 
 
 def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: float | None) -> NominalDrive:

@@ -277,8 +277,8 @@ def _resample_and_align(
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
-            f"Resampled {purpose}: every {1e3 * period:.6g} ms, in the log every {1e3 * segmented.period:.6g} ms; positions by "
-            "cubic splines, torques so that their integral stays the same."
+            f"Resampled {purpose}: every {1e3 * period:.6g} ms, in the log every {1e3 * segmented.period:.6g} ms; positions "
+            "by cubic splines, torques by means that keep their integral."
         )
     for name, delay in delays.items():
         if any(delay):
@@ -412,11 +412,7 @@ def _measure_channel(
 
 def check_positions(log: Record, other: Record) -> None:
     """Refuse another log of the same machine that lacks a position of the first one."""
-    for side in log.positions:
-        if side not in other.positions:
-            raise InputError(
-                f"{other.path}: has no {side} position, which {log.path} has; logs of one machine should be alike"
-            )
+    _require_channels(other, {f"{side} position" for side in log.positions}, log)
 
 
 _PAUSE_PERIODS = 10
@@ -432,24 +428,21 @@ def join_records(records: Sequence[Record]) -> Record:
     first = records[0]
     if len(records) == 1:
         return first
-    period, times, segments, logs, notes, warnings, rows, end = first.sample_period, [], [], [], [], [], 0, 0.0
+    period, count, end = first.sample_period, 0, 0.0
+    times, segments, logs, notes, warnings = [], [], [], [], []
     for record in records:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
                 f"{record.path}: is sampled every {record.sample_period:.6g} s, {first.path} every {period:.6g} s; "
                 f"set [log] resample = {period:.6g} to read both at the same period"
             )
-        for incomplete, other in ((record, first), (first, record)):
-            if missing := _channel_names(other) - _channel_names(incomplete):
-                name = min(missing)
-                raise InputError(
-                    f"{incomplete.path}: has no {name}, which {other.path} has; logs of one machine should be alike"
-                )
+        _require_channels(record, _channel_names(first), first)
+        _require_channels(first, _channel_names(record), record)
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE_PERIODS * period
-        segments += [slice(rows_of_log.start + rows, rows_of_log.stop + rows) for rows_of_log in record.segments]
-        logs += [(path, slice(rows_of_log.start + rows, rows_of_log.stop + rows)) for path, rows_of_log in record.logs]
-        rows += len(record.time)
+        segments += [slice(segment.start + count, segment.stop + count) for segment in record.segments]
+        logs += [(path, slice(rows.start + count, rows.stop + count)) for path, rows in record.logs]
+        count += len(record.time)
         notes += [f"{record.path.name}: {note}" for note in record.notes]
         warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
     notes.insert(0, f"{len(records)} logs, one after the other: {', '.join(record.path.name for record in records)}.")
@@ -465,6 +458,13 @@ def join_records(records: Sequence[Record]) -> Record:
         intervals=np.concatenate([record.intervals for record in records]),
         logs=tuple(logs),
     )
+
+
+def _require_channels(record: Record, names: set[str], other: Record) -> None:
+    if missing := names - _channel_names(record):
+        raise InputError(
+            f"{record.path}: has no {min(missing)}, which {other.path} has; logs of one machine should be alike"
+        )
 
 
 def _channel_names(record: Record) -> set[str]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .least_squares import fit_with_jackknife, rms
+from .least_squares import column_rms, fit_with_jackknife, rms
 from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, trim_filter_ends
 
 
@@ -97,9 +97,8 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         coefficients, errors = np.zeros(6), np.full(6, np.inf)
     terms = rows[:, :5]
     centred = terms[:, :4] - terms[:, :4].mean(axis=0)
-    term_rms = np.sqrt(np.mean(centred**2, axis=0))
     inflation = np.full(5, np.inf)
-    if np.isfinite(errors).all() and (term_rms > 0.0).all():
+    if np.isfinite(errors).all() and (column_rms(centred) > 0.0).all():
         inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
     residuals = target - rows @ coefficients
     return RigidFit(
@@ -107,7 +106,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         values=coefficients[:5],
         errors=errors[:5],
         inflation=inflation,
-        shares=np.abs(coefficients[:5]) * np.sqrt(np.mean(terms**2, axis=0)) / rms(target),
+        shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(target),
         # a torque that is held for a period acts half a period after its stamp
         skew=float(coefficients[5]) + 0.5 * period,
         skew_error=float(errors[5]),

@@ -91,7 +91,7 @@ def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
 def estimate_white_noise(parts: Sequence[np.ndarray]) -> float:
     """Estimate the standard deviation of white noise on a signal, which may be in several parts.
 
-    Fourth differences hold nothing of what is smooth, and their median nothing of jumps, of which there are few.
+    Fourth differences remove the smooth part of the signal; their median ignores jumps, which are few.
     """
     fourth = np.concatenate([np.diff(part, n=4) for part in parts])
     return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))

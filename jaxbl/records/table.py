@@ -50,7 +50,7 @@ class _ColumnTable(StrictTable):
 
     @model_validator(mode="before")
     @classmethod
-    def _column_alone(cls, data: Any) -> Any:
+    def _expand_column(cls, data: Any) -> Any:
         if isinstance(data, str) or (isinstance(data, int) and not isinstance(data, bool)):
             return {"column": data}
         return data
@@ -73,7 +73,7 @@ class TimeTable(_ColumnTable):
     )
 
     @model_validator(mode="after")
-    def _one_source(self) -> "TimeTable":
+    def _check_source(self) -> "TimeTable":
         if self.period is not None and self.column is not None:
             raise table_error("has both column and period; period is for logs without time stamps")
         return self
@@ -117,7 +117,7 @@ class PositionTable(_ChannelTable):
     )
 
     @model_validator(mode="after")
-    def _counts(self) -> "PositionTable":
+    def _check_counts(self) -> "PositionTable":
         if self.unit == "counts" and self.counts_per_turn is None:
             raise table_error("unit counts needs counts_per_turn")
         if self.unit != "counts" and self.counts_per_turn is not None:
@@ -170,7 +170,7 @@ class TorqueTable(_ChannelTable):
     )
 
     @model_validator(mode="after")
-    def _constant(self) -> "TorqueTable":
+    def _check_factor(self) -> "TorqueTable":
         if self.unit in ("V", "A", "counts") and self.factor is None:
             raise table_error(f"unit {self.unit} needs factor, the torque in N m (or force in N) of one {self.unit}")
         return self
@@ -184,7 +184,7 @@ SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
 """Channel of a position -> that of the speed which may stand in its place."""
 
 ELEMENT_NEEDS = "an element is found from its displacement theta_e and the torque u; both are needed"
-"""Message that refuses a log of a transmission on a test rig."""
+"""Message that refuses an incomplete log of a transmission on a test rig."""
 
 _Scalar = Annotated[bool | int | float | str, BeforeValidator(_check_scalar)]
 
@@ -232,7 +232,7 @@ class LogTable(StrictTable):
     )
 
     @model_validator(mode="after")
-    def _possible(self) -> "LogTable":
+    def _check_channels(self) -> "LogTable":
         if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise table_error(f"start {self.start} should be less than stop {self.stop}")
         absent = self.absent or []
