@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 import tomli_w
 from hypothesis import HealthCheck, given, reject, settings
-from measured import made
+from measured import simulate_log
 from scipy.io import savemat
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
@@ -120,7 +120,7 @@ STUDIES = {
 def hdf5(folder: Path, more) -> Path:
     path = folder / "log.h5"
     with h5py.File(path, "w") as file:
-        for name, values in made(count=400).items():
+        for name, values in simulate_log(count=400).items():
             file[name] = values.to_numpy()
         more(file)
     return path
@@ -150,7 +150,7 @@ def looped(file):
 
 
 def table(folder: Path, name="log.csv", change=lambda frame: None, **columns) -> Path:
-    frame = made(count=4000)
+    frame = simulate_log(count=4000)
     for column, function in columns.items():
         frame[column] = function(frame[column])
     frame = frame if (new := change(frame)) is None else new
@@ -169,7 +169,7 @@ def modelled(folder: Path, model: str) -> tuple[Path, Path]:
 
 
 def matlab(folder: Path) -> Path:
-    columns = {name: values.to_numpy() for name, values in made(count=400).items()}
+    columns = {name: values.to_numpy() for name, values in simulate_log(count=400).items()}
     savemat(folder / "log.mat", columns | {"theta_s": columns["theta_s"] * (1.0 + 1.0j)})
     return folder / "log.mat"
 
@@ -362,7 +362,9 @@ def written(path: Path, columns: dict) -> None:
 @st.composite
 def logs(draw, path: Path) -> tuple[Path, bytes]:
     """A log of some kind with columns that are odd, and the text of a `[log]` table."""
-    columns = {name: values.to_numpy() for name, values in made(count=draw(st.sampled_from([3, 70, 400, 400, 400]))).items()}
+    columns = {
+        name: values.to_numpy() for name, values in simulate_log(count=draw(st.sampled_from([3, 70, 400, 400, 400]))).items()
+    }
     with np.errstate(all="ignore"):
         for _ in range(draw(st.integers(0, 2))):
             name = draw(st.sampled_from(list(columns)))

@@ -22,7 +22,7 @@ def play(positions: np.ndarray, width: float) -> np.ndarray:
     return behind
 
 
-def made(
+def simulate_log(
     times: np.ndarray | None = None,
     *,
     count: int = 4000,

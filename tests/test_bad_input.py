@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 from command_server import run_command, run_python
-from measured import made
+from measured import simulate_log
 from progress_lines import without_progress
 from small_study import ALPHA, listed, rigid
 
@@ -118,7 +118,7 @@ def test_a_command_ends_with_two_and_one_line(tmp_path):
 
 
 def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
-    made().to_csv(tmp_path / "a\x1b[31mb.csv", index=False)
+    simulate_log().to_csv(tmp_path / "a\x1b[31mb.csv", index=False)
     done = run_command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(r"a\x1b[31mb.csv: 4000 samples")
@@ -151,7 +151,7 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
 @pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])
 def test_an_interrupt_before_work_begins(tmp_path, default_interrupt, wait):
     """While modules are loaded; some of them swallow a KeyboardInterrupt."""
-    made().to_csv(tmp_path / "log.csv", index=False)
+    simulate_log().to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid()))
     call = [sys.executable, "-X", "importtime", "-m", "jaxbl", "identify", "log.csv", "--model", "study.toml"]
     with subprocess.Popen(call, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

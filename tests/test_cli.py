@@ -22,7 +22,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from command_server import run_command, run_python, start_command
-from measured import EMPS, made, real
+from measured import EMPS, real, simulate_log
 from passed import PASSED
 from progress_lines import without_progress
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
@@ -590,7 +590,7 @@ def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
-    made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
+    simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
     assert code == 0 and "axis.toml: a first model." in lines
     assert [command for command, _ in steps_in(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
@@ -602,7 +602,7 @@ def test_inspect_writes_a_first_model(call, tmp_path):
 
 
 def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(call, tmp_path):
-    made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
+    simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv")
     folder = tmp_path / "results" / "axis"
     assert code == 0
@@ -621,7 +621,7 @@ def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(cal
 
 
 def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tmp_path):
-    made(count=1000).drop(columns="theta_s").rename(columns={"theta_e": "x"}).to_parquet("axis.parquet")
+    simulate_log(count=1000).drop(columns="theta_s").rename(columns={"theta_e": "x"}).to_parquet("axis.parquet")
     (tmp_path / "log.toml").write_text('[log]\ntheta_e = "x"\n')
     assert call("inspect", "axis.parquet", "--model", "log.toml")[0] == 0
     (tmp_path / "part.toml").write_text('include = "log.toml"\ntitle = "my axis"\n')
@@ -631,7 +631,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     (tmp_path / "wrong.toml").write_text('[log]\ntheta_e = { colum = "x" }\n')
     with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
         call("inspect", "axis.parquet", "--model", "wrong.toml")
-    made(count=1000).to_csv("axis.csv", index=False)
+    simulate_log(count=1000).to_csv("axis.csv", index=False)
     with pytest.raises(InputError, match=r"results/axis: holds results of another log \(.*axis.parquet\)"):
         call("inspect", "axis.csv")
     assert call("inspect", "axis.csv", "--overwrite")[0] == 0

@@ -44,9 +44,9 @@ def write_simulated(folder: Path) -> None:
     simulated_log(f"{SWEEPS}/geared_axis.toml", folder / "geared.parquet", ["t", "u", "theta_e", "theta_s"])
     for seed, name in enumerate(("direct", "direct_1", "direct_2")):
         simulated_log(f"{SWEEPS}/direct_drive.toml", folder / f"{name}.parquet", ["t", "u", "theta_e"], seed)
-    from records.test_element import PERIOD, loaded
+    from records.test_element import PERIOD, simulate_rig
 
-    positions, torques = loaded()
+    positions, torques = simulate_rig()
     times = PERIOD * np.arange(len(positions))
     table = {"t": times, "u": torques, "theta_e": positions}
     pd.DataFrame(table).to_csv(folder / "element.csv", index=False)

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from measured import COULOMB, INERTIA, VISCOUS, made
+from measured import COULOMB, INERTIA, VISCOUS, simulate_log
 from real.derivatives import parts_of, terms_of, torque_error
 from real.mujoco_sysid import sysid
 from real.rivals import stepwise
@@ -19,7 +19,7 @@ CUTOFF = 30.0
 @pytest.fixture(scope="module")
 def record(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "log.csv"
-    made(count=8000, noise=1e-5)[["t", "u", "theta_e"]].to_csv(path, index=False)
+    simulate_log(count=8000, noise=1e-5)[["t", "u", "theta_e"]].to_csv(path, index=False)
     return read_record(path)
 
 

@@ -82,19 +82,19 @@ def test_friction_that_winds_up_a_soft_shaft_is_no_clock(read):
 def test_clocks_that_run_apart_are_found_to_a_tenth_of_a_sample(read, skew, drift, gap):
     frame = axis(skew, gap=gap, drift=drift, seed=3)
     record = read(frame)
-    ends, found = np.array([0.0, 8.0]), record.corrections
-    late = found["skew"] + found["drift"] * ends - skew - drift * ends
-    assert np.abs(late).max() < 0.1e-3
+    ends, corrections = np.array([0.0, 8.0]), record.corrections
+    errors = corrections["skew"] + corrections["drift"] * ends - skew - drift * ends
+    assert np.abs(errors).max() < 0.1e-3
     (warning,) = record.warnings
     assert "The clocks drift apart" in warning
-    said = f"[log] theta_s.skew = {found['skew']:.4g} (at the first stamp) and theta_s.drift = {found['drift']:.4g} corrects"
-    assert said in warning and warning.count("[log]") == 1
-    given = read(frame, {"theta_s": {"skew": found["skew"], "drift": found["drift"]}})
-    np.testing.assert_allclose(given.positions["load"], record.positions["load"], atol=1e-12)
+    keys = f"theta_s.skew = {corrections['skew']:.4g} (at the first stamp) and theta_s.drift = {corrections['drift']:.4g}"
+    assert f"[log] {keys} corrects" in warning and warning.count("[log]") == 1
+    corrected = read(frame, {"theta_s": {"skew": corrections["skew"], "drift": corrections["drift"]}})
+    np.testing.assert_allclose(corrected.positions["load"], record.positions["load"], atol=1e-12)
     # without a model, on request: with the wind-up by friction, here 0.05 ms
-    asked = read(frame, {"theta_s": {"skew": "estimate"}}, None)
-    (said,) = [note for note in asked.notes if "growing by" in note]
-    assert float(said.split("growing by ")[1].split(" us")[0]) == pytest.approx(1e6 * drift, rel=0.03)
+    estimated = read(frame, {"theta_s": {"skew": "estimate"}}, None)
+    (sentence,) = [note for note in estimated.notes if "growing by" in note]
+    assert float(sentence.split("growing by ")[1].split(" us")[0]) == pytest.approx(1e6 * drift, rel=0.03)
 
 
 def test_the_zero_of_an_integral_is_none_and_its_clock_is_its_own(read):
@@ -105,14 +105,14 @@ def test_the_zero_of_an_integral_is_none_and_its_clock_is_its_own(read):
     load = read(frame.drop(columns="theta_s"), {"omega_s": "omega_s"})
     for record, name in ((motor, "theta_s"), (load, "omega_s")):
         assert set(record.corrections) == {"skew"}
-        (warning,) = (one for one in record.warnings if "corrected" in one)
+        (warning,) = (warning for warning in record.warnings if "corrected" in warning)
         assert f"[log] {name}.skew = {record.corrections['skew']:.4g} corrects the same" in warning
-        assert not any(".offset" in one for one in record.warnings)
+        assert not any(".offset" in warning for warning in record.warnings)
         twist = record.positions["motor"] - 20.0 * record.positions["load"]
         assert abs(np.mean(twist)) < 0.05
-    given = read(frame.drop(columns="theta_s"), {"omega_s": {"skew": load.corrections["skew"]}})
-    assert given.corrections == {}
-    np.testing.assert_allclose(given.positions["load"], load.positions["load"], atol=1e-9)
+    corrected = read(frame.drop(columns="theta_s"), {"omega_s": {"skew": load.corrections["skew"]}})
+    assert corrected.corrections == {}
+    np.testing.assert_allclose(corrected.positions["load"], load.positions["load"], atol=1e-9)
 
 
 def test_a_screw_twists_in_radians(read):
@@ -122,7 +122,7 @@ def test_a_screw_twists_in_radians(read):
     frame = frame.iloc[:4000]
     record = read(frame, {"theta_s": {"unit": "mm"}})
     assert record.statistics.channels["theta_s"].unit == "m"
-    (note,) = (one for one in record.notes if one.startswith("Lost motion"))
+    (note,) = (warning for warning in record.notes if warning.startswith("Lost motion"))
     assert " rad (95 %" in note
 
 

@@ -9,7 +9,7 @@ from jaxbl.records.element import fit_element
 PERIOD, STIFFNESS, GAP, CENTRE, FRICTION, TORQUE, LENGTH = 0.01, 500.0, 0.02, 0.005, 0.8, 2.0, 0.01
 
 
-def loaded(count=2400, seed=1, gap=GAP):
+def simulate_rig(count=2400, seed=1, gap=GAP):
     """Displacement (rad) and torque (N m) of a shaft with a gap, hysteresis and dry friction; noise on both."""
     random, fine = np.random.default_rng(seed), 20
     t = PERIOD / fine * np.arange(count * fine)
@@ -25,39 +25,39 @@ def loaded(count=2400, seed=1, gap=GAP):
 
 
 def test_a_gap_hysteresis_and_friction_are_told_apart():
-    x, u = loaded()
-    found = fit_element(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, noise=1e-5, linear=False)
-    assert set(found.terms) == {"gap", "dry friction", "hysteresis"}
+    x, u = simulate_rig()
+    fit = fit_element(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, noise=1e-5, linear=False)
+    assert set(fit.terms) == {"gap", "dry friction", "hysteresis"}
     truth = {
         "stiffness": STIFFNESS, "half_gap": GAP, "centre": CENTRE, "dry_friction": FRICTION, "hysteresis": TORQUE,
         "length": LENGTH, "offset": 0.3,
     }  # fmt: skip
-    assert set(found.numbers) == set(truth)
+    assert set(fit.numbers) == set(truth)
     for name, value in truth.items():
-        one = found.numbers[name]
+        number = fit.numbers[name]
         # 3.5 standard errors of eleven degrees of freedom: one in two hundred
-        assert abs(one.value - value) < 3.5 * one.error, (name, one)
-        assert name == "offset" or abs(one.value / value - 1.0) < 0.05, (name, one)
-    assert found.residual == pytest.approx(0.1, rel=0.1)
-    assert found.numbers["stiffness"].unit == "N m/rad"
-    assert np.isnan(found.torque[:20]).all() and np.nanstd(found.torque - u) < 0.11
+        assert abs(number.value - value) < 3.5 * number.error, (name, number)
+        assert name == "offset" or abs(number.value / value - 1.0) < 0.05, (name, number)
+    assert fit.residual == pytest.approx(0.1, rel=0.1)
+    assert fit.numbers["stiffness"].unit == "N m/rad"
+    assert np.isnan(fit.torque[:20]).all() and np.nanstd(fit.torque - u) < 0.11
 
 
 def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
     random = np.random.default_rng(2)
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(2000))
-    found = fit_element(x, 3.0e4 * x + random.standard_normal(2000), [slice(0, 2000)], PERIOD, noise=0.0, linear=True)
-    assert found.terms == () and found.numbers["stiffness"].unit == "N/m"
-    low, high = found.numbers["stiffness"].interval
+    fit = fit_element(x, 3.0e4 * x + random.standard_normal(2000), [slice(0, 2000)], PERIOD, noise=0.0, linear=True)
+    assert fit.terms == () and fit.numbers["stiffness"].unit == "N/m"
+    low, high = fit.numbers["stiffness"].interval
     assert low < 3.0e4 < high < 1.01 * 3.0e4
     assert fit_element(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, noise=0.0, linear=False) is None
 
 
 def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
-    """Of a long log means are fitted: of a short part behind a gap one or none is left."""
+    """A long log is averaged: a short part behind a gap then has a single sample, or none."""
     monkeypatch.setattr(element, "_MAX_SAMPLES", 500)
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(4003))
     u = 3.0e4 * x + np.random.default_rng(2).standard_normal(4003)
     for parts in ([slice(0, 4000), slice(4000, 4003)], [slice(0, 3), slice(3, 4003)]):
-        found = fit_element(x, u, parts, PERIOD, noise=0.0, linear=True)
-        assert found is not None and found.numbers["stiffness"].value == pytest.approx(3.0e4, rel=0.01)
+        fit = fit_element(x, u, parts, PERIOD, noise=0.0, linear=True)
+        assert fit is not None and fit.numbers["stiffness"].value == pytest.approx(3.0e4, rel=0.01)

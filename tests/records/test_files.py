@@ -20,8 +20,8 @@ from jaxbl.records.libraries import Column, Columns
 T, U = np.arange(5) * 0.1, np.array([1.5, -2.0, 3e-7, 4e12, 0.0])
 
 
-def matlab73(path, **columns):
-    """As MATLAB saves with -v7.3: HDF5 behind a block of text, row vectors turned."""
+def write_matlab73(path, **columns):
+    """Write a file like MATLAB's -v7.3: HDF5 behind a block of text, with row vectors as columns."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in columns.items():
             data = file.create_dataset(name, data=np.atleast_2d(values))
@@ -32,7 +32,7 @@ def matlab73(path, **columns):
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
 
 
-def text(separator, decimal=".", header=True):
+def write_text(separator, decimal=".", header=True):
     def write(path):
         frame = pd.DataFrame({"t": T, "u": U})
         frame.to_csv(path, sep=separator, decimal=decimal, header=header, index=False)
@@ -41,14 +41,14 @@ def text(separator, decimal=".", header=True):
 
 
 WRITERS = {
-    "comma.csv": text(","),
-    "semicolon.csv": text(";"),
-    "german.csv": text(";", ","),
-    "tab.tsv": text("\t"),
-    "german_tab.txt": text("\t", ","),
-    "blank.txt": text(" "),
-    "bare.txt": text(" ", header=False),
-    "bare.csv": text(",", header=False),
+    "comma.csv": write_text(","),
+    "semicolon.csv": write_text(";"),
+    "german.csv": write_text(";", ","),
+    "tab.tsv": write_text("\t"),
+    "german_tab.txt": write_text("\t", ","),
+    "blank.txt": write_text(" "),
+    "bare.txt": write_text(" ", header=False),
+    "bare.csv": write_text(",", header=False),
     "remarks.csv": lambda p: p.write_text(
         "# a remark\n\n" + pd.DataFrame({"t": T, "u": U}).to_csv(index=False).replace("\n0.2", "\n# another\n0.2")
     ),
@@ -61,7 +61,7 @@ WRITERS = {
     ),
     "table.parquet": lambda p: pd.DataFrame({"t": T, "u": U}).to_parquet(p),
     "old.mat": lambda p: savemat(p, {"t": T, "u": U[:, None], "gain": 3.0, "note": "hi"}),
-    "new.mat": lambda p: matlab73(p, t=T, u=U),
+    "new.mat": lambda p: write_matlab73(p, t=T, u=U),
     "rows.json": lambda p: p.write_text(json.dumps(pd.DataFrame({"t": T, "u": U}).to_dict("records"))),
     "entries.json": lambda p: p.write_text(
         json.dumps({"mass": 1.0, "entries": pd.DataFrame({"t": T, "u": U}).to_dict("records")})
@@ -273,13 +273,13 @@ def test_mdf_by_its_library(tmp_path):
     np.testing.assert_allclose(file.load_numbers("slow"), [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
-def wrote_mcap(path):
+def write_mcap_log(path):
     """A topic in JSON at times of recording, another, slower one."""
     axis = [(t, {"u": u, "angles": [t, u], "name": "x"}) for t, u in zip(T.tolist(), U.tolist(), strict=True)]
     write_mcap(path, {"axis": axis, "slow": [(t, {"v": 10.0 * t}) for t in T[[0, 4]].tolist()]})
 
 
-def wrote_bag(path):
+def write_bag(path):
     """Joint states, stamped in their headers, recorded 5 ms late."""
     library = pytest.importorskip("rosbags.rosbag2", reason="the extra logs is not installed")
     from rosbags.typesys import Stores, get_typestore
@@ -299,13 +299,13 @@ def wrote_bag(path):
 
 
 def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
-    wrote_mcap(tmp_path / "log.mcap")
+    write_mcap_log(tmp_path / "log.mcap")
     file = read_log_file(tmp_path / "log.mcap", {"t", "/axis.u", "/slow.v"})
     assert list(file.columns) == ["t", "/axis.u", "/axis.angles[0]", "/axis.angles[1]", "/slow.v"]
     for column, values in {"t": T, "/axis.u": U, "/axis.angles[0]": T, "/slow.v": 10.0 * T}.items():
         np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-7)
     assert file.notes == ["/slow is interpolated to the times of /axis, which has the most messages."]
-    wrote_bag(tmp_path / "bag")
+    write_bag(tmp_path / "bag")
     file = read_log_file(tmp_path / "bag", {"t", "/joint_states.position[0]"})
     for column, values in {"t": T, "/joint_states.position[0]": T, "/joint_states.effort[0]": U}.items():
         np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-9)
@@ -371,31 +371,31 @@ def read_blocks(path):
 
 
 def lazy_blocks(path):
-    found = Columns(
+    columns = Columns(
         {name: Column(lambda i=i: np.fromfile(path).reshape(-1, 2)[:, i], len(T)) for i, name in enumerate("tu")}
     )
-    found.notes.append("Read block by block.")
-    return found
+    columns.notes.append("Read block by block.")
+    return columns
 
 
 @pytest.fixture
-def installed(monkeypatch):
+def install_readers(monkeypatch):
     """Readers as of installed packages, by ending."""
 
-    def install(**found):
+    def install(**readers):
         monkeypatch.setattr(files.READERS, "_members", {})
         monkeypatch.setattr(files.READERS, "_loaded", False)
-        entries = [SimpleNamespace(name=name, value="a:b", load=lambda read=read: read) for name, read in found.items()]
+        entries = [SimpleNamespace(name=name, value="a:b", load=lambda read=read: read) for name, read in readers.items()]
         monkeypatch.setattr("jaxbl.registry.entry_points", lambda group: entries if group == "jaxbl.readers" else [])
 
     return install
 
 
 @pytest.mark.parametrize("read", [read_blocks, lazy_blocks, lambda path: pd.DataFrame(read_blocks(path))])
-def test_readers_of_installed_packages_read_the_files_of_their_ending(read, installed, tmp_path):
+def test_readers_of_install_readers_packages_read_the_files_of_their_ending(read, installed, tmp_path):
     np.stack([T, U], axis=1).tofile(tmp_path / "log.REC")
     assert not files.is_log(tmp_path / "log.REC")
-    installed(rec=read)
+    install_readers(rec=read)
     assert files.is_log(tmp_path / "log.REC") and files.log_suffixes()[-1] == ".rec"
     columns = read_log_file(tmp_path / "log.REC", ("t", "u"))
     for name, values in {"t": T, "u": U}.items():
@@ -404,7 +404,7 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("read", "message"),
     [
         (lambda path: [1.0, 2.0], "the reader of .rec files should give columns of one dimension by name"),
         (lambda path: None, "the reader of .rec files should give columns of one dimension by name"),
@@ -413,16 +413,16 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
         (lambda path: {}["t"], "cannot be read as a log by the reader of .rec files: 't'; write it anew, or as CSV"),
     ],
 )
-def test_what_a_reader_of_a_package_does_wrong_is_one_line(found, said, installed, tmp_path):
+def test_what_a_reader_of_a_package_does_wrong_is_one_line(read, message, install_readers, tmp_path):
     (tmp_path / "log.rec").write_bytes(b"x")
-    installed(rec=found)
+    install_readers(rec=read)
     with pytest.raises(InputError) as error:
         read_log_file(tmp_path / "log.rec")
-    assert str(error.value) == f"{tmp_path / 'log.rec'}: {said}"
+    assert str(error.value) == f"{tmp_path / 'log.rec'}: {message}"
 
 
-def test_readers_cannot_take_the_endings_of_others(installed, caplog):
-    installed(csv=read_blocks, **{".Rec": read_blocks, "rec": 3})
+def test_readers_cannot_take_the_endings_of_others(install_readers, caplog):
+    install_readers(csv=read_blocks, **{".Rec": read_blocks, "rec": 3})
     assert list(files.READERS) == []
     assert [message.partition("left out: ")[2] for message in caplog.messages] == [
         "ValueError: files that end in .csv are read by jaxbl itself",

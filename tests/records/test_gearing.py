@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from measured import GEAR_RATIO, made
+from measured import GEAR_RATIO, simulate_log
 
 from jaxbl.errors import InputError
 from jaxbl.records import inspect, read_record
@@ -37,16 +37,16 @@ def looked_at(tmp_path, frame, gear_ratio, log=None):
 
 
 def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide):
-    found = looked_at(tmp_path, wide, 5.0)
-    gearing = found.record.statistics.gearing
+    inspection = looked_at(tmp_path, wide, 5.0)
+    gearing = inspection.record.statistics.gearing
     assert gearing.is_loose and gearing.skew is None
     assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
-    assert len(found.record.notes) == 1
-    assert found.record.notes[0].startswith("theta_e - 5 theta_s ranges over 0.3")
-    assert found.record.notes[0].endswith("with backlash or wind-up of that size this log hardly confirms gear_ratio.")
+    assert len(inspection.record.notes) == 1
+    assert inspection.record.notes[0].startswith("theta_e - 5 theta_s ranges over 0.3")
+    assert inspection.record.notes[0].endswith("with backlash or wind-up of that size this log hardly confirms gear_ratio.")
     # asymptotically 4 j0 either way, if nothing is known of the wind-up
     assert gearing.lost_motion_interval[0] < 0.14 and gearing.lost_motion_interval[1] > 0.16
-    answers = {j.quantity: j for j in found.identifiability}
+    answers = {j.quantity: j for j in inspection.identifiability}
     assert answers["gear ratio"].answer == answers["lost motion"].answer == "weak"
     assert "gap and wind-up take" in answers["gear ratio"].reason
     # the gap passes for friction in a rigid drive
@@ -69,13 +69,13 @@ def test_what_cannot_be_is_refused_even_then(tmp_path, wide):
 @pytest.mark.parametrize("factor", [0.1, 10.0, -1.0])
 def test_a_wrong_ratio_is_refused(tmp_path, gap, factor):
     with pytest.raises(InputError, match=r"theta_e moves -?(20|19\.9)"):
-        looked_at(tmp_path, made(gap=gap, noise=1e-3), factor * GEAR_RATIO)
+        looked_at(tmp_path, simulate_log(gap=gap, noise=1e-3), factor * GEAR_RATIO)
 
 
 def test_a_gap_of_a_good_part_of_the_motion_leaves_the_ratio(tmp_path):
     for gap in (5.0, 20.0, 40.0):
-        found = looked_at(tmp_path, made(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
-        assert not any("moves" in note or "against" in note for note in found.record.notes), found.record.notes
+        inspection = looked_at(tmp_path, simulate_log(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
+        assert not any("moves" in note or "against" in note for note in inspection.record.notes), inspection.record.notes
 
 
 SLIPS = {
@@ -92,7 +92,7 @@ SLIPS = {
 @pytest.mark.parametrize("slip", SLIPS)
 def test_slips_are_named_where_the_gap_is_as_large_as_the_motion(tmp_path, slip):
     change, message = SLIPS[slip]
-    log = made(gap=15.0, noise=1e-3)
+    log = simulate_log(gap=15.0, noise=1e-3)
     log["theta_e"], log["theta_s"] = change(log["theta_e"], log["theta_s"])
     log.to_csv(tmp_path / "log.csv", index=False)
     with pytest.raises(InputError, match=message):

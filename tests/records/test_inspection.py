@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
-from measured import EMPS, GEAR_RATIO, SERVO, XL330, made, real
+from measured import EMPS, GEAR_RATIO, SERVO, XL330, real, simulate_log
 
 from jaxbl.errors import InputError
 from jaxbl.records import inspect
 
 
-def answers(tmp_path, frame, log=None, gear_ratio=GEAR_RATIO):
+def judge_log(tmp_path, frame, log=None, gear_ratio=GEAR_RATIO):
     frame.to_parquet(tmp_path / "log.parquet")
     return {
         j.quantity: (j.answer, j.reason)
@@ -25,62 +25,65 @@ QUANTITIES = ["inertia", "viscous friction", "Coulomb friction", "constant torqu
 
 
 def test_a_rich_log_identifies_all_but_what_it_does_not_show(tmp_path):
-    found = answers(tmp_path, made(count=6000, gap=0.1, noise=1e-4))
-    assert list(found) == QUANTITIES
+    judgements = judge_log(tmp_path, simulate_log(count=6000, gap=0.1, noise=1e-4))
+    assert list(judgements) == QUANTITIES
     for quantity in QUANTITIES[:2] + QUANTITIES[3:6]:
-        assert found[quantity][0] == "yes", quantity
-    assert re.match(r"theta_e shifts by (0\.09|0\.1)", found["lost motion"][1])
+        assert judgements[quantity][0] == "yes", quantity
+    assert re.match(r"theta_e shifts by (0\.09|0\.1)", judgements["lost motion"][1])
     # the load follows the motor whatever the torque
-    assert found["stiffness"][0] == "weak"
+    assert judgements["stiffness"][0] == "weak"
 
 
 def test_a_gap_whose_flank_is_chosen_by_inertia(tmp_path):
-    frame = made(count=6000)
+    frame = simulate_log(count=6000)
     acceleration = np.gradient(np.gradient(frame["theta_e"]))
     frame["theta_s"] -= 0.05 * np.sign(acceleration) / GEAR_RATIO
     frame.to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
-    gearing = found.record.statistics.gearing
+    inspection = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
+    gearing = inspection.record.statistics.gearing
     assert gearing.lost_motion == pytest.approx(0.1, rel=0.1)
     assert gearing.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
-    assert found.identifiability[5].answer == "yes"
+    assert inspection.identifiability[5].answer == "yes"
 
 
 def test_a_load_that_moves_on_its_own_tells_no_skew(tmp_path):
     t = 1e-3 * np.arange(6000)
-    frame = made(count=6000).assign(theta_s=0.5 * np.sin(5.0 * t) + 0.3 * np.sin(11.0 * t))
+    frame = simulate_log(count=6000).assign(theta_s=0.5 * np.sin(5.0 * t) + 0.3 * np.sin(11.0 * t))
     frame.to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO).record
-    assert any(note.startswith("theta_e and theta_s are hardly related") for note in found.notes)
-    assert found.statistics.channels["theta_s"].skew is None
+    record = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO).record
+    assert any(note.startswith("theta_e and theta_s are hardly related") for note in record.notes)
+    assert record.statistics.channels["theta_s"].skew is None
 
 
 def test_a_compliant_transmission_shows_its_stiffness(tmp_path):
-    frame = made(count=6000, noise=1e-4)
+    frame = simulate_log(count=6000, noise=1e-4)
     frame["theta_s"] -= frame["u"] / 50.0 / GEAR_RATIO
-    assert answers(tmp_path, frame)["stiffness"][0] == "yes"
+    assert judge_log(tmp_path, frame)["stiffness"][0] == "yes"
     frame["sensor"] = frame["u"]
-    found = answers(tmp_path, frame.drop(columns="u"), {"absent": ["u"], "transmitted": "sensor"})
-    assert found["inertia"] == ("no", "no torque was recorded: the log shows kinematics only")
+    judgements = judge_log(tmp_path, frame.drop(columns="u"), {"absent": ["u"], "transmitted": "sensor"})
+    assert judgements["inertia"] == ("no", "no torque was recorded: the log shows kinematics only")
 
 
 def test_one_encoder_says_nothing_of_the_transmission(tmp_path):
     for side, other in (("theta_e", "load"), ("theta_s", "motor")):
-        found = answers(tmp_path, made()[["t", "u", side]])
+        judgements = judge_log(tmp_path, simulate_log()[["t", "u", side]])
         for quantity in ("gear ratio", "lost motion", "stiffness"):
             if side == "theta_e" and quantity != "gear ratio":
                 # moves back and forth with their torque: a model can tell
-                assert found[quantity][0] == "weak"
-                assert "jaxbl identify" in found[quantity][1]
+                assert judgements[quantity][0] == "weak"
+                assert "jaxbl identify" in judgements[quantity][1]
                 continue
-            assert found[quantity] == ("no", f"there is no {other} encoder: the transmission in between is not observed")
-        assert found["inertia"][0] == "yes"
+            assert judgements[quantity] == (
+                "no",
+                f"there is no {other} encoder: the transmission in between is not observed",
+            )
+        assert judgements["inertia"][0] == "yes"
 
 
 def test_free_motion_tells_ratios(tmp_path):
-    found = answers(tmp_path, made().assign(u=0.0))
-    assert found["inertia"][0] == "weak" and "only ratios" in found["inertia"][1]
-    assert found["stiffness"] == ("no", "no varying torque was recorded")
+    judgements = judge_log(tmp_path, simulate_log().assign(u=0.0))
+    assert judgements["inertia"][0] == "weak" and "only ratios" in judgements["inertia"][1]
+    assert judgements["stiffness"] == ("no", "no varying torque was recorded")
 
 
 def test_one_direction_one_speed_and_one_frequency(tmp_path):
@@ -92,24 +95,27 @@ def test_one_direction_one_speed_and_one_frequency(tmp_path):
         u = 0.01 * np.gradient(velocity, t) + 0.05 * velocity + 0.1 * np.sign(velocity)
         return pd.DataFrame({"t": t, "u": u, "theta_e": position, "theta_s": position / GEAR_RATIO})
 
-    found = answers(tmp_path, log(forwards))
-    assert found["constant torque"] == ("weak", "motion in one direction only: hard to separate from Coulomb friction")
-    assert found["Coulomb friction"][0] == "weak"
-    assert found["lost motion"] == ("no", "0 reversals: both flanks of the gap must come into contact")
+    judgements = judge_log(tmp_path, log(forwards))
+    assert judgements["constant torque"] == ("weak", "motion in one direction only: hard to separate from Coulomb friction")
+    assert judgements["Coulomb friction"][0] == "weak"
+    assert judgements["lost motion"] == ("no", "0 reversals: both flanks of the gap must come into contact")
     triangle = 4.0 * np.abs((t / 2.0) % 1.0 - 0.5) + 1e-5 * np.random.default_rng(0).standard_normal(6000)
-    found = answers(tmp_path, log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
+    judgements = judge_log(tmp_path, log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
     for quantity in ("viscous friction", "Coulomb friction"):
-        assert found[quantity][0] == "weak" and "too close to separate viscous from Coulomb friction" in found[quantity][1]
-    found = answers(tmp_path, log(np.sin(6.0 * t)))
-    assert found["inertia"][0] == "weak" and "hard to separate from a spring or gravity" in found["inertia"][1]
+        assert (
+            judgements[quantity][0] == "weak"
+            and "too close to separate viscous from Coulomb friction" in judgements[quantity][1]
+        )
+    judgements = judge_log(tmp_path, log(np.sin(6.0 * t)))
+    assert judgements["inertia"][0] == "weak" and "hard to separate from a spring or gravity" in judgements["inertia"][1]
 
 
 def test_noise_identifies_nothing(tmp_path):
     random = np.random.default_rng(0)
-    frame = made()
+    frame = simulate_log()
     frame["theta_e"], frame["theta_s"] = random.standard_normal(4000), random.standard_normal(4000)
-    found = answers(tmp_path, frame)
-    assert {answer for answer, _ in found.values()} == {"no"}
+    judgements = judge_log(tmp_path, frame)
+    assert {answer for answer, _ in judgements.values()} == {"no"}
 
 
 def odd_signal(random, count):
@@ -137,46 +143,46 @@ def test_any_log_is_inspected_or_refused_in_one_line(tmp_path_factory, seed, cou
     frame = pd.DataFrame({"t": stamps} | {name: odd_signal(random, count) for name in ("u", "theta_e", "theta_s")})
     path = tmp_path_factory.mktemp("odd") / "log.parquet"
     frame.to_parquet(path)
-    found, refusal = None, ""
+    inspection, refusal = None, ""
     try:
-        found = inspect(path, log, gear_ratio=None if seed % 2 else 7.0)
+        inspection = inspect(path, log, gear_ratio=None if seed % 2 else 7.0)
     except InputError as error:
         refusal = str(error)
-    if found is None:
+    if inspection is None:
         assert refusal.startswith(f"{path}: ") and "\n" not in refusal
         return
-    json.dumps(found.to_dict())
-    for segment in found.record.segments:
-        np.testing.assert_allclose(np.diff(found.record.time[segment]), found.record.sample_period, rtol=1e-5)
-    assert all(np.isfinite(values).all() for values in found.record.positions.values())
+    json.dumps(inspection.to_dict())
+    for segment in inspection.record.segments:
+        np.testing.assert_allclose(np.diff(inspection.record.time[segment]), inspection.record.sample_period, rtol=1e-5)
+    assert all(np.isfinite(values).all() for values in inspection.record.positions.values())
 
 
 def test_the_whole_as_plain_data(tmp_path):
-    made(count=2000).drop(index=range(800, 900)).to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet")
-    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    simulate_log(count=2000).drop(index=range(800, 900)).to_parquet(tmp_path / "log.parquet")
+    inspection = inspect(tmp_path / "log.parquet")
+    data = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
     assert data["file"] == str((tmp_path / "log.parquet").resolve())
     assert data["gear_ratio"] == pytest.approx(GEAR_RATIO, rel=1e-4)
     assert len(data["segments"]) == 2 and data["sampling"]["gaps"] == 1
     assert set(data["channels"]) == {"u", "theta_e", "theta_s"}
     assert data["dynamics"]["terms"]["inertia"]["value"] == pytest.approx(0.01, rel=0.05)
     assert len(data["identifiable"]) == 7
-    assert found.twist is not None and np.abs(found.twist).max() < 1e-3
+    assert inspection.twist is not None and np.abs(inspection.twist).max() < 1e-3
 
 
 def test_real_machines(tmp_path):
-    found = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).identifiability}
-    assert [found[q] for q in QUANTITIES] == ["yes"] * 4 + ["no"] + ["weak"] * 2
-    found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    assert [j.answer for j in found.identifiability[:5]] == ["no"] * 4 + ["yes"]
-    assert np.ptp(np.degrees(found.twist)) == pytest.approx(2.9, abs=0.5)
+    inspection = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).identifiability}
+    assert [inspection[q] for q in QUANTITIES] == ["yes"] * 4 + ["no"] + ["weak"] * 2
+    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    assert [j.answer for j in inspection.identifiability[:5]] == ["no"] * 4 + ["yes"]
+    assert np.ptp(np.degrees(inspection.twist)) == pytest.approx(2.9, abs=0.5)
     free = inspect(real("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
     assert free.identifiability[0].answer == "weak"
 
 
 def test_a_measured_transmitted_torque_shows_the_stiffness_without_an_input(tmp_path):
-    frame = made(noise=1e-5)
+    frame = simulate_log(noise=1e-5)
     torque = 0.2 * np.gradient(np.gradient(frame["theta_s"], frame["t"]), frame["t"])
     frame = frame.assign(torque=torque, theta_e=frame["theta_e"] + torque / 50.0).drop(columns="u")
-    found = answers(tmp_path, frame, {"absent": ["u"], "transmitted": "torque"})
-    assert found["stiffness"][0] == "yes", found["stiffness"]
+    judgements = judge_log(tmp_path, frame, {"absent": ["u"], "transmitted": "torque"})
+    assert judgements["stiffness"][0] == "yes", judgements["stiffness"]

@@ -12,8 +12,8 @@ def test_standard_errors_hold_for_coloured_residuals():
         random = np.random.default_rng(seed)
         x = np.sin(0.02 * np.arange(6000) + random.uniform(0.0, 6.0))
         residual = np.convolve(random.standard_normal(6200), np.ones(60) / 60.0, mode="same")[:6000]
-        found, errors = fit_with_jackknife(2.0 * x + residual, np.stack([x, np.ones(6000)], axis=1))
-        normal.append((found[0] - 2.0) / errors[0])
+        estimates, errors = fit_with_jackknife(2.0 * x + residual, np.stack([x, np.ones(6000)], axis=1))
+        normal.append((estimates[0] - 2.0) / errors[0])
     assert 0.6 < np.std(normal) < 1.6
-    found, errors = fit_with_jackknife(x, np.stack([x, x], axis=1))
-    assert np.isnan(found).all() and np.isnan(errors).all()
+    estimates, errors = fit_with_jackknife(x, np.stack([x, x], axis=1))
+    assert np.isnan(estimates).all() and np.isnan(errors).all()

@@ -29,7 +29,7 @@ PERIOD = 1e-3
 NAMES = ["t", "u", "theta_e", "theta_s"]
 
 
-class Given:
+class BlockSource:
     """A source of what it is given, block by block."""
 
     name, fault = "given", ""
@@ -44,92 +44,92 @@ class Given:
         pass
 
 
-def moved(count, start=0.0):
+def make_rows(count, start=0.0):
     time = start + np.arange(count) * PERIOD
     return np.stack([time, np.cos(time), np.sin(5.0 * time), np.sin(3.0 * time)], axis=1)
 
 
-def taken(*blocks, table=None, columns=NAMES):
+def poll_blocks(*blocks, table=None, columns=NAMES):
     """All rows of some blocks, and what was counted."""
-    source = Given(*blocks, columns=columns)
+    source = BlockSource(*blocks, columns=columns)
     stream = Stream(source, table or LogTable(), PERIOD)
-    found = [rows for _ in blocks for rows in stream.poll(0.0)]
-    return found, dict(source.counts)
+    rows_of_blocks = [rows for _ in blocks for rows in stream.poll(0.0)]
+    return rows_of_blocks, dict(source.counts)
 
 
 def test_blocks_of_any_size_give_the_rows_as_they_are():
-    rows = moved(1000)
-    found, counts = taken(rows[:1], rows[1:300], rows[300:301], rows[301:])
-    assert [one.starts_segment for one in found] == [True, False, False, False]
-    assert [one.time for one in found] == pytest.approx([0.0, 0.001, 0.3, 0.301])
-    np.testing.assert_array_equal(np.concatenate([one.torque for one in found]), rows[:, 1])
+    rows = make_rows(1000)
+    parts, counts = poll_blocks(rows[:1], rows[1:300], rows[300:301], rows[301:])
+    assert [part.starts_segment for part in parts] == [True, False, False, False]
+    assert [part.time for part in parts] == pytest.approx([0.0, 0.001, 0.3, 0.301])
+    np.testing.assert_array_equal(np.concatenate([part.torque for part in parts]), rows[:, 1])
     for i, side in enumerate(("motor", "load")):
-        np.testing.assert_array_equal(np.concatenate([one.positions[side] for one in found]), rows[:, 2 + i])
+        np.testing.assert_array_equal(np.concatenate([part.positions[side] for part in parts]), rows[:, 2 + i])
     assert counts == {}
 
 
 @pytest.mark.parametrize("cut", [7, 500, 501])
 def test_lost_samples_are_interpolated_and_counted(cut):
     """Two in a row, wherever blocks end; the input is held."""
-    rows = moved(1000)
-    left = np.delete(rows, [500, 501], axis=0)
-    found, counts = taken(left[:cut], left[cut:])
+    rows = make_rows(1000)
+    kept_rows = np.delete(rows, [500, 501], axis=0)
+    parts, counts = poll_blocks(kept_rows[:cut], kept_rows[cut:])
     assert counts == {LOST: 2}
-    assert not any(one.starts_segment for one in found[1:])
-    torque = np.concatenate([one.torque for one in found])
+    assert not any(part.starts_segment for part in parts[1:])
+    torque = np.concatenate([part.torque for part in parts])
     np.testing.assert_array_equal(torque[500:502], rows[499, 1])
-    motor = np.concatenate([one.positions["motor"] for one in found])
+    motor = np.concatenate([part.positions["motor"] for part in parts])
     np.testing.assert_allclose(motor, rows[:, 2], atol=5e-5)
 
 
 def test_a_gap_in_time_begins_anew():
-    rows = moved(1000)
-    left = np.delete(rows, np.arange(500, 510), axis=0)
-    for blocks in ((left,), (left[:500], left[500:])):
-        found, counts = taken(*blocks)
+    rows = make_rows(1000)
+    kept_rows = np.delete(rows, np.arange(500, 510), axis=0)
+    for blocks in ((kept_rows,), (kept_rows[:500], kept_rows[500:])):
+        parts, counts = poll_blocks(*blocks)
         assert counts == {GAPS: 1}
-        assert [(one.starts_segment, len(one.torque)) for one in found] == [(True, 500), (True, 490)]
-        assert found[1].time == pytest.approx(0.51)
+        assert [(part.starts_segment, len(part.torque)) for part in parts] == [(True, 500), (True, 490)]
+        assert parts[1].time == pytest.approx(0.51)
 
 
 def test_late_repeated_and_unreadable_rows_are_left_out():
-    rows = moved(400)
+    rows = make_rows(400)
     order = np.r_[0:100, 99, 98, 100:400]
     mixed = rows[order]
     mixed[250, 2] = np.nan
     mixed[300, 0] = np.inf
-    found, counts = taken(mixed[:101], mixed[101:])
+    parts, counts = poll_blocks(mixed[:101], mixed[101:])
     assert counts == {DISORDERED: 2, UNREADABLE: 2, LOST: 2}
-    assert sum(len(one.torque) for one in found) == 400
+    assert sum(len(part.torque) for part in parts) == 400
 
 
 def test_a_clock_that_is_set_back_begins_anew():
-    found, counts = taken(np.concatenate([moved(300, start=50.0), moved(200)]))
+    parts, counts = poll_blocks(np.concatenate([make_rows(300, start=50.0), make_rows(200)]))
     assert counts == {RESTARTS: 1}
-    assert [(one.time, len(one.torque), one.starts_segment) for one in found] == [(50.0, 300, True), (0.0, 200, True)]
+    assert [(part.time, len(part.torque), part.starts_segment) for part in parts] == [(50.0, 300, True), (0.0, 200, True)]
 
 
 def test_stamps_may_jitter():
-    rows = moved(2000)
+    rows = make_rows(2000)
     rows[:, 0] += np.random.default_rng(0).uniform(-0.2, 0.2, 2000) * PERIOD
-    found, counts = taken(rows)
+    parts, counts = poll_blocks(rows)
     assert counts == {}
-    np.testing.assert_array_equal(found[0].torque, rows[:, 1])
+    np.testing.assert_array_equal(parts[0].torque, rows[:, 1])
 
 
 @pytest.mark.parametrize("factor", [2.0, 0.5, 1.05, 1e3])
 def test_another_period_than_the_models_is_one_line(factor):
-    rows = moved(300)
+    rows = make_rows(300)
     rows[:, 0] *= factor
     with pytest.raises(InputError, match=r"given: samples are .* ms apart, \[run\] sample_period of the model is 1 ms"):
-        taken(rows)
+        poll_blocks(rows)
 
 
 def test_stamps_rounded_to_more_than_a_period_are_refused():
-    rows = moved(400)
+    rows = make_rows(400)
     rows[:, 0] = np.floor(rows[:, 0] / (4 * PERIOD)) * 4 * PERIOD
     with pytest.raises(InputError, match="most rows have the time stamp of the row before"):
-        taken(rows)
+        poll_blocks(rows)
 
 
 TABLES = {
@@ -175,24 +175,24 @@ def columns(count=2000):
 def test_rows_are_what_the_reader_makes_of_the_whole_log(table, tmp_path):
     log, table = tmp_path / "log.csv", LogTable.model_validate(table)
     columns().to_csv(log, index=False)
-    whole = read_record(log, table)
+    record = read_record(log, table)
     check_stream_table(table, "log")
     stream = Stream(FollowedFile(log), table, PERIOD)
-    found = [rows for _ in range(100) for rows in stream.poll(0.0)]
+    parts = [rows for _ in range(100) for rows in stream.poll(0.0)]
     stream.source.close()
     assert stream.counts == {}
-    np.testing.assert_allclose(np.concatenate([one.torque for one in found]), whole.torque, atol=1e-12)
-    for side, positions in whole.positions.items():
-        np.testing.assert_allclose(np.concatenate([one.positions[side] for one in found]), positions, atol=1e-9)
+    np.testing.assert_allclose(np.concatenate([part.torque for part in parts]), record.torque, atol=1e-12)
+    for side, positions in record.positions.items():
+        np.testing.assert_allclose(np.concatenate([part.positions[side] for part in parts]), positions, atol=1e-9)
 
 
 def test_only_rows_with_a_mode_are_read():
-    rows = np.c_[moved(600), np.ones(600)]
+    rows = np.c_[make_rows(600), np.ones(600)]
     rows[200:300, 4] = 0.0
     table = LogTable.model_validate({"where": {"on": True}})
-    found, counts = taken(rows, table=table, columns=[*NAMES, "on"])
+    parts, counts = poll_blocks(rows, table=table, columns=[*NAMES, "on"])
     assert counts == {GAPS: 1}
-    assert [len(one.torque) for one in found] == [200, 300]
+    assert [len(part.torque) for part in parts] == [200, 300]
 
 
 REFUSED = {
@@ -212,18 +212,18 @@ def test_what_needs_the_whole_log_is_refused(key, table):
 
 def test_a_file_is_followed_from_its_beginning_line_by_line(tmp_path):
     """Written in pieces that end anywhere, with remarks, a line of another form, and a header that comes again."""
-    log, rows = tmp_path / "log.csv", moved(50)
+    log, rows = tmp_path / "log.csv", make_rows(50)
     lines = [",".join(map(repr, row)) for row in rows.tolist()]
     text = "\n".join(["# a remark", ",".join(NAMES), *lines[:20], "1,2", ",".join(NAMES), *lines[20:]]) + "\n"
     log.write_text("")
-    source, found = FollowedFile(log), []
+    source, blocks = FollowedFile(log), []
     with log.open("a") as file:
         for i in range(0, len(text), 37):
             file.write(text[i : i + 37])
             file.flush()
             read = source.poll(0.0)
-            found += [] if read is None else [read[1]]
-    np.testing.assert_array_equal(np.concatenate(found), rows)
+            blocks += [] if read is None else [read[1]]
+    np.testing.assert_array_equal(np.concatenate(blocks), rows)
     assert source.counts == {MALFORMED: 1}
     assert source.fault == "; a line should have 4 cells"
     # cut off and written anew, as programs do that keep files short
@@ -273,7 +273,7 @@ def datagrams():
     """A source, and a function that sends to it."""
     source = Datagrams("udp://127.0.0.1:0", NAMES)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        yield source, lambda *data: [out.sendto(one, ("127.0.0.1", source.port)) for one in data]
+        yield source, lambda *data: [out.sendto(part, ("127.0.0.1", source.port)) for part in data]
     source.close()
 
 

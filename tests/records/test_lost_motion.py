@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from measured import GEAR_RATIO, SERVO, made, real
+from measured import GEAR_RATIO, SERVO, real, simulate_log
 
 from jaxbl.records import inspect, lost_motion
 from jaxbl.records.gearing import fit_gearing
 
 
-def geared(frame, expected=GEAR_RATIO):
+def fit_frame(frame, expected=GEAR_RATIO):
     times, motor, load = (frame[name].to_numpy() for name in ("t", "theta_e", "theta_s"))
     return fit_gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
 
@@ -23,7 +23,7 @@ def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
     to_and_fro = 2.0 * np.abs((t + random.uniform(0.0, 30.0)) / 15.0 % 2.0 - 1.0)
     load = 1.3 * t + 0.3 * np.sin(0.2 * t) if around else to_and_fro
     forwards = np.sign(np.gradient(load))
-    side = np.sign(np.prod([t - at for at in changes], axis=0)) * 0.5
+    side = np.sign(np.prod([t - switch_times for switch_times in changes], axis=0)) * 0.5
     # what repeats with place and direction, and what wanders about a tenth of a second or a place
     errors = 0.01 * np.sin(load + 1.0) + 0.003 * np.sin(7.0 * load) + 0.002 * forwards * np.sin(load)
     wander = np.convolve(random.standard_normal(len(t)), np.ones(10) / 10.0**0.5, "same") * 2e-3
@@ -37,25 +37,25 @@ def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
     [(0.1, {"noise": 1e-2}), (0.5, {"noise": 1e-3, "skew": 1.3e-3}), (0.05, {"noise": 1e-3, "resolution": 5e-3})],
 )
 def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality):
-    found = [geared(made(gap=gap, seed=seed, **quality)) for seed in range(50)]
-    assert all(f.flank == "motion" and f.flank_changes >= 2 for f in found)
-    covered = sum(f.lost_motion_interval[0] <= gap <= f.lost_motion_interval[1] for f in found)
+    fits = [fit_frame(simulate_log(gap=gap, seed=seed, **quality)) for seed in range(50)]
+    assert all(f.flank == "motion" and f.flank_changes >= 2 for f in fits)
+    covered = sum(f.lost_motion_interval[0] <= gap <= f.lost_motion_interval[1] for f in fits)
     assert covered >= 45
     # not by being wide
-    spread = np.std([f.lost_motion for f in found])
-    assert np.mean([f.lost_motion_error for f in found]) < 1.6 * spread + 2e-4 * gap
-    assert np.mean([f.lost_motion for f in found]) == pytest.approx(gap, rel=5e-3)
+    spread = np.std([f.lost_motion for f in fits])
+    assert np.mean([f.lost_motion_error for f in fits]) < 1.6 * spread + 2e-4 * gap
+    assert np.mean([f.lost_motion for f in fits]) == pytest.approx(gap, rel=5e-3)
 
 
 @pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"around": True}])
 def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
-    found = [geared(load_driven(seed, **options), 1.0) for seed in range(30)]
-    assert all(f.flank == "load" and f.flank_changes == len(options.get("changes", (61.0,))) for f in found)
-    covered = sum(f.lost_motion_interval[0] <= 0.02 <= f.lost_motion_interval[1] for f in found)
+    fits = [fit_frame(load_driven(seed, **options), 1.0) for seed in range(30)]
+    assert all(f.flank == "load" and f.flank_changes == len(options.get("changes", (61.0,))) for f in fits)
+    covered = sum(f.lost_motion_interval[0] <= 0.02 <= f.lost_motion_interval[1] for f in fits)
     assert covered >= 27
-    spread = np.std([f.lost_motion for f in found])
-    assert np.mean([f.lost_motion_error for f in found]) < 2.0 * spread
-    times = np.array([f.flank_times for f in found])
+    spread = np.std([f.lost_motion for f in fits])
+    assert np.mean([f.lost_motion_error for f in fits]) < 2.0 * spread
+    times = np.array([f.flank_times for f in fits])
     assert np.abs(times - np.array(options.get("changes", (61.0,)))).max() < 2.0
 
 
@@ -63,9 +63,9 @@ def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
 def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around):
     for seed in range(10):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
-            found = geared(load_driven(seed, around=around, **options), 1.0)
-            assert found.flank == "motion", (seed, options)
-            assert not found.exceeds_noise(1e-4) or found.lost_motion < 0.005
+            fit = fit_frame(load_driven(seed, around=around, **options), 1.0)
+            assert fit.flank == "motion", (seed, options)
+            assert not fit.exceeds_noise(1e-4) or fit.lost_motion < 0.005
 
 
 def test_places_where_the_load_hardly_pulls_do_not_count():
@@ -73,23 +73,24 @@ def test_places_where_the_load_hardly_pulls_do_not_count():
     frame = load_driven(3)
     late = frame["t"] > 61.0
     frame["theta_e"] -= np.where(late & (frame["theta_s"] < 0.5), 0.01, 0.0)
-    found = geared(frame, 1.0)
-    assert found.lost_motion == pytest.approx(0.02, rel=0.05)
-    assert found.lost_motion_range[0] < 0.012 and found.lost_motion_range[1] > 0.019
+    fit = fit_frame(frame, 1.0)
+    assert fit.lost_motion == pytest.approx(0.02, rel=0.05)
+    assert fit.lost_motion_range[0] < 0.012 and fit.lost_motion_range[1] > 0.019
 
 
 def test_it_is_told_with_its_interval(tmp_path):
     load_driven(0).to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", {"absent": ["u"]}, gear_ratio=1.0)
-    why = next(j.reason for j in found.identifiability if j.quantity == "lost motion")
-    assert why.startswith("theta_e shifts by 0.0") and why.endswith("as the load torque changes its sign")
+    inspection = inspect(tmp_path / "log.parquet", {"absent": ["u"]}, gear_ratio=1.0)
+    reason = next(j.reason for j in inspection.identifiability if j.quantity == "lost motion")
+    assert reason.startswith("theta_e shifts by 0.0") and reason.endswith("as the load torque changes its sign")
     assert any(
-        "after the load torque changed its sign, at 6" in note and "slipped coupling" in note for note in found.record.notes
+        "after the load torque changed its sign, at 6" in note and "slipped coupling" in note
+        for note in inspection.record.notes
     )
-    made(gap=0.1, noise=1e-3).to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
-    assert any("changes of the flank by the direction of motion" in note for note in found.record.notes)
-    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))["gearing"]
+    simulate_log(gap=0.1, noise=1e-3).to_parquet(tmp_path / "log.parquet")
+    inspection = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
+    assert any("changes of the flank by the direction of motion" in note for note in inspection.record.notes)
+    data = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))["gearing"]
     assert data["lost_motion"] == pytest.approx(0.1, rel=0.02)
     assert data["lost_motion_interval"][0] < 0.1 < data["lost_motion_interval"][1]
     assert data["flank"] == "motion"
@@ -103,12 +104,12 @@ def test_too_little_tells_nothing():
 
 def test_a_real_servo_whose_load_was_turned_around():
     """Published: the load's direction is reversed at 60 to 66 s, which shifts one encoder by 0.39 to 0.40 degrees."""
-    found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    lost = found.record.statistics.gearing
+    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    lost = inspection.record.statistics.gearing
     low, high = np.degrees(lost.lost_motion_interval)
     assert lost.flank == "load" and len(lost.flank_times) == 1
     assert 60.0 < lost.flank_times[0] < 66.0
     assert np.degrees(lost.lost_motion) == pytest.approx(0.395, abs=0.01)
     assert low < 0.39 and high > 0.40 and high - low < 0.15
-    assert next(j for j in found.identifiability if j.quantity == "lost motion").answer == "yes"
-    assert any(note.startswith("Lost motion at the motor: 0.0069") for note in found.record.notes)
+    assert next(j for j in inspection.identifiability if j.quantity == "lost motion").answer == "yes"
+    assert any(note.startswith("Lost motion at the motor: 0.0069") for note in inspection.record.notes)

@@ -24,16 +24,16 @@ def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns
 
 @pytest.mark.parametrize("gear", [False, True])
 def test_the_difference_of_the_zeros_is_found(gear: bool):
-    found = find_zero_shift(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
-    assert found is not None and found.waves == (5, 10)
-    assert abs(found.value - 0.4) < 4.0 * found.error < 0.04
+    shift = find_zero_shift(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
+    assert shift is not None and shift.waves == (5, 10)
+    assert abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
 
 
 def test_the_smallest_of_equal_places_is_taken():
     # 5 and 10 a turn repeat every 72 degrees
-    found = find_zero_shift(log(1, 0.0), log(2, 3.0))
-    assert found is not None
-    assert abs(found.value - (3.0 - 2.0 * 2.0 * np.pi / 5.0)) < 4.0 * found.error
+    shift = find_zero_shift(log(1, 0.0), log(2, 3.0))
+    assert shift is not None
+    assert abs(shift.value - (3.0 - 2.0 * 2.0 * np.pi / 5.0)) < 4.0 * shift.error
 
 
 @pytest.mark.parametrize(

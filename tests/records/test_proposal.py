@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from measured import INERTIA, VISCOUS, axis, made, real
+from measured import INERTIA, VISCOUS, axis, real, simulate_log
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
@@ -12,7 +12,7 @@ from jaxbl.records.proposal import guess_log_table, propose_study
 
 
 def test_names_and_units_of_columns_are_understood(tmp_path):
-    frame = made()
+    frame = simulate_log()
     columns = {"Time (ms)": 1e3 * frame["t"], "Motor current [mA]": frame["u"], "goal_position": 0.5 * frame["theta_e"],
                "position_deg": np.degrees(frame["theta_e"]), "speed [rpm]": frame["u"]}  # fmt: skip
     type(frame)(columns).to_csv(tmp_path / "log.csv", index=False)
@@ -50,13 +50,13 @@ def test_each_quantity_finds_its_column(names, tmp_path):
     pd.DataFrame({name: 0.01 * np.arange(5) + i for i, name in enumerate(columns)}).to_csv(tmp_path / "log.csv", index=False)
     table, guesses = guess_log_table(tmp_path / "log.csv")
     read_log_table(table)
-    assert {name: one["column"] for name, one in table.items()} == {"t": "t"} | COLUMNS[names]
+    assert {channel: keys["column"] for channel, keys in table.items()} == {"t": "t"} | COLUMNS[names]
     assert (table["u"]["column"] == "torque_cmd") == any("the commanded torque" in guess for guess in guesses)
     assert ("[counts]" in names) == any("put in factor" in guess for guess in guesses)
 
 
 def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
-    """What is proposed reads the log: an integral has no zero that [log] could name."""
+    """The proposed [log] reads the log, although an integral has no zero that it could name."""
     frame = axis(3.04e-3, 0.379)
     speed = np.gradient(frame["theta_e"], frame["t"])
     frame = frame.rename(columns={"theta_s": "load angle"}).drop(columns="theta_e").assign(**{"motor speed": speed})
@@ -68,13 +68,13 @@ def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
 
 
 def test_the_model_that_is_given_stands(tmp_path):
-    made().to_csv(tmp_path / "log.csv", index=False)
-    given = NominalDrive(0.004, 0.02, 2.4, 12.0, 20.0, 1234.5)
-    study, _, _ = propose_study(tmp_path / "log.csv", {}, gear_ratio=20.0, nominal=given)
+    simulate_log().to_csv(tmp_path / "log.csv", index=False)
+    nominal = NominalDrive(0.004, 0.02, 2.4, 12.0, 20.0, 1234.5)
+    study, _, _ = propose_study(tmp_path / "log.csv", {}, gear_ratio=20.0, nominal=nominal)
     assert study["transmission"] == {"law": "linear_shaft", "stiffness": 1234.5}
     assert study["drive"]["load_inertia"] == 2.4 and study["drive"]["gear_ratio"] == 20.0
     with pytest.raises(InputError, match="theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
-        propose_study(tmp_path / "log.csv", {}, gear_ratio=5.0, nominal=given)
+        propose_study(tmp_path / "log.csv", {}, gear_ratio=5.0, nominal=nominal)
     with pytest.raises(InputError, match="--write proposes a drive; a transmission on a test rig has none"):
         propose_study(tmp_path / "log.csv", {"kind": "element"})
 
@@ -90,12 +90,12 @@ def test_friction_that_does_not_show_is_a_placeholder_of_its_own_unit(tmp_path):
 
 
 def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
-    frame = made().drop(columns="theta_s")
+    frame = simulate_log().drop(columns="theta_s")
     frame.assign(t=1e3 * frame["t"], u=-frame["u"]).to_csv(tmp_path / "log.csv", index=False)
-    study, guesses, found = propose_study(tmp_path / "log.csv")
+    study, guesses, inspection = propose_study(tmp_path / "log.csv")
     assert study["log"]["u"]["sign"] == -1 and study["log"]["t"]["unit"] == "ms"
     assert any("u is reversed" in guess for guess in guesses)
-    assert found.record.sample_period == pytest.approx(1e-3)
+    assert inspection.record.sample_period == pytest.approx(1e-3)
     config, _ = read_model(study)
     assert config.drive.motor_inertia == pytest.approx(INERTIA, rel=0.02)
     assert config.drive.motor_viscous == pytest.approx(VISCOUS, rel=0.05)
@@ -103,16 +103,16 @@ def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
 
 def test_two_encoders_with_a_clock_and_a_zero_of_their_own(tmp_path):
     axis(3.04e-3, 0.379).to_csv(tmp_path / "log.csv", index=False)
-    study, _, found = propose_study(tmp_path / "log.csv")
+    study, _, inspection = propose_study(tmp_path / "log.csv")
     config, _ = read_model(study)
     assert config.drive.gear_ratio == 20.0
     assert config.log.theta_e.offset == pytest.approx(-0.379, abs=3e-3)
     assert config.log.theta_s.skew == pytest.approx(3.04e-3, abs=3e-4)
-    assert found.record.warnings[0].startswith("theta_s is 3.")
+    assert inspection.record.warnings[0].startswith("theta_s is 3.")
 
 
 def test_what_cannot_be_guessed_is_refused(tmp_path):
-    frame = made()
+    frame = simulate_log()
     frame.to_csv(tmp_path / "bare.csv", index=False, header=False)
     with pytest.raises(InputError, match="--write goes by the names of columns, and the file has none"):
         propose_study(tmp_path / "bare.csv")

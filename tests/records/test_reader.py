@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
-from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, made, real
+from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, real, simulate_log
 from small_study import small
 
 from jaxbl.errors import InputError
@@ -14,15 +14,15 @@ from jaxbl.records import LogTable, NominalDrive, join_records, read_log_table, 
 from jaxbl.sweeps.trial import run
 
 
-def wrote(tmp_path, frame, name="log.parquet"):
+def write_frame(tmp_path, frame, name="log.parquet"):
     path = tmp_path / name
     frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
     return path
 
 
 def test_a_log_in_si_units_is_read_as_it_stands(tmp_path):
-    frame = made()
-    record = read_record(wrote(tmp_path, frame), gear_ratio=GEAR_RATIO)
+    frame = simulate_log()
+    record = read_record(write_frame(tmp_path, frame), gear_ratio=GEAR_RATIO)
     np.testing.assert_allclose(record.time, frame["t"], atol=1e-12)
     np.testing.assert_array_equal(record.torque, frame["u"])
     np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
@@ -32,17 +32,17 @@ def test_a_log_in_si_units_is_read_as_it_stands(tmp_path):
     assert (record.start, record.closed_loop, record.transmitted, record.notes) == (0.0, None, None, ())
     assert record.statistics.sampling.even
     # the rough regression finds the drive that made the log
-    found = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
-    assert found["inertia"] == pytest.approx(INERTIA, rel=0.01)
-    assert found["viscous"] == pytest.approx(VISCOUS, rel=0.02)
-    assert found["coulomb"] == pytest.approx(COULOMB, rel=0.1)
+    statistics = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
+    assert statistics["inertia"] == pytest.approx(INERTIA, rel=0.01)
+    assert statistics["viscous"] == pytest.approx(VISCOUS, rel=0.02)
+    assert statistics["coulomb"] == pytest.approx(COULOMB, rel=0.1)
     assert abs(record.statistics.channels["u"].skew) < 1e-4
 
 
 def test_what_simulate_leaves_is_a_log(tmp_path):
     changes = {"run.duration": 1.0, "encoders.motor_resolution": 1e-4, "encoders.load_resolution": 1e-5}
     trial = run(small(changes))
-    record = read_record(wrote(tmp_path, trial.trace), trial.config.log, gear_ratio=5.0)
+    record = read_record(write_frame(tmp_path, trial.trace), trial.config.log, gear_ratio=5.0)
     np.testing.assert_array_equal(record.torque, trial.trace["u"])
     assert record.statistics.channels["theta_e"].resolution == pytest.approx(1e-4)
     assert record.statistics.channels["theta_s"].resolution == pytest.approx(1e-5)
@@ -54,18 +54,18 @@ ONE = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "m": 1.0, "mm"
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
-    truth = made(count=400, period=2e-3)
+    truth = simulate_log(count=400, period=2e-3)
     unit = data.draw(st.sampled_from([*ONE, "counts"]))
     sign = data.draw(st.sampled_from([1, -1]))
     factor = data.draw(st.sampled_from([1.0, 0.5, 3.0]))
     counts = data.draw(st.sampled_from([4096.0, 20000.0]))
     log = {"column": "x", "unit": unit, "sign": sign, "factor": factor, "offset": 2.0}
-    one = 2.0 * math.pi / counts if unit == "counts" else ONE[unit]
-    column = (truth["theta_e"].to_numpy() - 2.0) * sign / one / factor
+    unit_size = 2.0 * math.pi / counts if unit == "counts" else ONE[unit]
+    column = (truth["theta_e"].to_numpy() - 2.0) * sign / unit_size / factor
     step = 0.0
     if unit == "counts":
         log["counts_per_turn"] = counts
-        column, step = np.round(column), one * factor
+        column, step = np.round(column), unit_size * factor
         if data.draw(st.booleans()):
             # a counter of 18 bits, and the word logged as unsigned: it wraps around
             log |= {"wrap": 2.0**18, "signed_bits": 18}
@@ -84,12 +84,14 @@ def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
             log.pop("minus")
             column = column - other
     truth = truth.assign(x=column, other=np.arange(len(column)) % 7.0)
-    path = wrote(tmp_path_factory.mktemp("units"), truth)
+    path = write_frame(tmp_path_factory.mktemp("units"), truth)
     absent = ["theta_s"] + (["u"] if unit in ("m", "mm") else [])
     record = read_record(path, {"theta_e": log, "absent": absent})
     motion = record.positions["motor"] - truth["theta_e"].to_numpy()
     # where a wrapped position starts is not known
-    motion -= round(motion[0] / (one * factor * log["wrap"])) * one * factor * log["wrap"] if "wrap" in log else 0.0
+    motion -= (
+        round(motion[0] / (unit_size * factor * log["wrap"])) * unit_size * factor * log["wrap"] if "wrap" in log else 0.0
+    )
     np.testing.assert_allclose(motion, 0.0, atol=0.5 * step + 1e-6)
     assert record.statistics.channels["theta_e"].unit == ("m" if unit in ("m", "mm") else "rad")
 
@@ -100,7 +102,7 @@ def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
     st.booleans(),
 )  # fmt: skip
 def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, sign, offset, words):
-    truth = made(count=400, period=2e-3)
+    truth = simulate_log(count=400, period=2e-3)
     log = {"column": "x", "unit": unit, "factor": factor, "sign": sign, "offset": offset}
     column = (truth["u"].to_numpy() - offset) * sign / factor
     step = 0.0
@@ -110,37 +112,37 @@ def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, s
         if np.abs(truth["u"] - offset).max() > 3.2:
             return
         log["signed_bits"] = 16
-    path = wrote(tmp_path_factory.mktemp("units"), truth.assign(x=column))
+    path = write_frame(tmp_path_factory.mktemp("units"), truth.assign(x=column))
     record = read_record(path, {"u": log})
     np.testing.assert_allclose(record.torque, truth["u"], atol=0.5 * step + 1e-9)
 
 
 def test_linear_axes_measure_force(tmp_path):
-    frame = made().drop(columns="theta_s")
-    record = read_record(wrote(tmp_path, frame), {"theta_e": {"unit": "m"}})
+    frame = simulate_log().drop(columns="theta_s")
+    record = read_record(write_frame(tmp_path, frame), {"theta_e": {"unit": "m"}})
     assert [record.statistics.channels[name].unit for name in ("u", "theta_e")] == ["N", "m"]
     with pytest.raises(
         InputError, match=r"\[log\] u.unit is N m, but the position is in m; on a linear axis it should be N"
     ):
-        read_record(wrote(tmp_path, frame), {"theta_e": {"unit": "m"}, "u": {"unit": "N m"}})
+        read_record(write_frame(tmp_path, frame), {"theta_e": {"unit": "m"}, "u": {"unit": "N m"}})
 
 
 def test_stamps_in_other_units_and_none_at_all(tmp_path):
-    frame = made()
-    for unit, one in {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}.items():
-        path = wrote(tmp_path, frame.assign(t=(frame["t"] + 7.0) * one))
+    frame = simulate_log()
+    for unit, unit_size in {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}.items():
+        path = write_frame(tmp_path, frame.assign(t=(frame["t"] + 7.0) * unit_size))
         record = read_record(path, {"t": {"column": "t", "unit": unit}})
         assert record.start == pytest.approx(7.0)
         np.testing.assert_allclose(record.time, frame["t"], atol=1e-8)
-    record = read_record(wrote(tmp_path, frame.drop(columns="t")), {"t": {"period": 2e-3}})
+    record = read_record(write_frame(tmp_path, frame.drop(columns="t")), {"t": {"period": 2e-3}})
     np.testing.assert_allclose(record.time, 2.0 * frame["t"], atol=1e-9)
 
 
 def test_rounded_stamps_are_an_even_grid(tmp_path):
-    frame = made(period=1.25e-3)
+    frame = simulate_log(period=1.25e-3)
     for step in (1e-3, 5e-3):
         stamps = np.floor(frame["t"] / step + 1e-9) * step
-        record = read_record(wrote(tmp_path, frame.assign(t=stamps)), gear_ratio=GEAR_RATIO)
+        record = read_record(write_frame(tmp_path, frame.assign(t=stamps)), gear_ratio=GEAR_RATIO)
         assert record.statistics.sampling.even and record.statistics.sampling.repeated == 0
         assert record.sample_period == pytest.approx(1.25e-3, rel=1e-4)
         np.testing.assert_array_equal(record.torque, frame["u"])
@@ -152,8 +154,8 @@ def uneven(seed=1, count=4000):
 
 def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
     times = uneven()
-    record = read_record(wrote(tmp_path, made(times)), gear_ratio=GEAR_RATIO)
-    truth = made(times[0] + record.time)
+    record = read_record(write_frame(tmp_path, simulate_log(times)), gear_ratio=GEAR_RATIO)
+    truth = simulate_log(times[0] + record.time)
     assert record.sample_period == record.statistics.sampling.median_period == pytest.approx(np.median(np.diff(times)))
     assert not record.statistics.sampling.even
     assert any(note.startswith("Resampled from uneven stamps: every 1.0") for note in record.notes)
@@ -164,9 +166,9 @@ def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
 
 def test_resampling_keeps_the_impulse_of_a_held_torque(tmp_path):
     times = uneven()
-    frame = made(times)
+    frame = simulate_log(times)
     for period in (None, 5e-4, 3.7e-3):
-        record = read_record(wrote(tmp_path, frame), {"resample": period} if period else None)
+        record = read_record(write_frame(tmp_path, frame), {"resample": period} if period else None)
         assert record.sample_period == (period or record.statistics.sampling.median_period)
         impulse = np.concatenate([[0.0], np.cumsum(frame["u"].to_numpy()[:-1] * np.diff(times))])
         ends = record.time + times[0]
@@ -181,9 +183,9 @@ def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, 
     errors = []
     for period in (8e-3, 4e-3):
         times = period * (np.arange(round(4.0 / period)) + jitter * np.random.default_rng(seed).uniform(-1.0, 1.0))
-        record = read_record(wrote(folder, made(times)), {"resample": period, "absent": ["theta_s"]})
+        record = read_record(write_frame(folder, simulate_log(times)), {"resample": period, "absent": ["theta_s"]})
         inner = slice(20, -20)
-        truth = made(times[0] + record.time)["theta_e"].to_numpy()
+        truth = simulate_log(times[0] + record.time)["theta_e"].to_numpy()
         errors.append(np.abs(record.positions["motor"] - truth)[inner].max())
     # h⁴ (5/384) of the fourth derivative, about 4 (2π 2.1)⁴, and the others'
     assert errors[0] < 4e-5
@@ -191,10 +193,10 @@ def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, 
 
 
 def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
-    frame = made(uneven())
-    kept = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
-    again = pd.concat([kept.iloc[:500], kept.iloc[[499, 499]], kept.iloc[500:]])
-    record = read_record(wrote(tmp_path, again), gear_ratio=GEAR_RATIO)
+    frame = simulate_log(uneven())
+    kept_rows = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
+    again = pd.concat([kept_rows.iloc[:500], kept_rows.iloc[[499, 499]], kept_rows.iloc[500:]])
+    record = read_record(write_frame(tmp_path, again), gear_ratio=GEAR_RATIO)
     sampling = record.statistics.sampling
     assert (sampling.repeated, sampling.gaps, len(record.segments)) == (2, 2, 3)
     assert sampling.longest_interval == pytest.approx(0.21, rel=0.05)
@@ -205,26 +207,26 @@ def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
         np.testing.assert_allclose(np.diff(record.time[segment]), record.sample_period, rtol=1e-9)
     ends = [segment.stop for segment in record.segments]
     assert ends == [*(segment.start for segment in record.segments[1:]), len(record.time)]
-    truth = made(frame["t"].iloc[0] + record.time)
+    truth = simulate_log(frame["t"].iloc[0] + record.time)
     np.testing.assert_allclose(record.positions["motor"], truth["theta_e"], atol=1e-6)
 
 
 def test_gaps_between_even_stamps_leave_the_samples_alone(tmp_path):
-    frame = made().drop(index=range(1000, 1200))
-    record = read_record(wrote(tmp_path, frame))
+    frame = simulate_log().drop(index=range(1000, 1200))
+    record = read_record(write_frame(tmp_path, frame))
     assert record.segments == (slice(0, 1000), slice(1000, 3800))
     np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
     np.testing.assert_allclose(record.time, frame["t"], atol=1e-9)
 
 
 def test_rows_are_chosen_by_value_and_by_time(tmp_path):
-    frame = made()
+    frame = simulate_log()
     on = (frame["t"] > 1.0) & (frame["t"] < 2.0)
     frame = frame.assign(on=on, mode=np.where(on, "run", "stop"), state=on.astype(int))
     for where in ({"on": True}, {"mode": "run"}, {"state": 1}, {"on": True, "mode": "run"}):
-        record = read_record(wrote(tmp_path, frame), {"where": where})
+        record = read_record(write_frame(tmp_path, frame), {"where": where})
         np.testing.assert_array_equal(record.torque, frame["u"][on])
-    record = read_record(wrote(tmp_path, frame), {"where": {"on": False}, "start": 0.5, "stop": 3.0})
+    record = read_record(write_frame(tmp_path, frame), {"where": {"on": False}, "start": 0.5, "stop": 3.0})
     assert len(record.segments) == 2
     np.testing.assert_array_equal(record.torque, frame["u"][~on & (frame["t"] >= 0.5) & (frame["t"] <= 3.0)])
     assert record.start == pytest.approx(0.5)
@@ -243,45 +245,45 @@ def test_rows_are_chosen_by_value_and_by_time(tmp_path):
     ],
 )
 def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew, quality, seed):
-    frame = made(count=6000, skew=skew, seed=seed, **quality)
-    path = wrote(tmp_path, frame)
+    frame = simulate_log(count=6000, skew=skew, seed=seed, **quality)
+    path = write_frame(tmp_path, frame)
     record = read_record(path, gear_ratio=GEAR_RATIO)
-    found = record.statistics.gearing
-    assert abs(found.skew - skew) < 4.0 * found.skew_error
-    assert found.skew_error < 5e-5
-    assert found.lost_motion == pytest.approx(quality.get("gap", 0.0), rel=0.03, abs=2e-3)
-    assert found.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
+    gearing = record.statistics.gearing
+    assert abs(gearing.skew - skew) < 4.0 * gearing.skew_error
+    assert gearing.skew_error < 5e-5
+    assert gearing.lost_motion == pytest.approx(quality.get("gap", 0.0), rel=0.03, abs=2e-3)
+    assert gearing.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
     assert any("lags theta_e" in n or "leads theta_e" in n for n in record.notes) == bool(skew)
     # undone on request
     undone = read_record(path, {"theta_s": {"skew": "estimate"}})
     assert any(note.startswith("theta_s: shifted by its skew") for note in undone.notes)
-    assert abs(undone.statistics.gearing.skew) < 4.0 * found.skew_error
+    assert abs(undone.statistics.gearing.skew) < 4.0 * gearing.skew_error
 
 
 def test_a_given_skew_is_undone(tmp_path):
-    frame = made(skew=2.5e-3)
-    record = read_record(wrote(tmp_path, frame), {"theta_s": {"skew": 2.5e-3}}, gear_ratio=GEAR_RATIO)
+    frame = simulate_log(skew=2.5e-3)
+    record = read_record(write_frame(tmp_path, frame), {"theta_s": {"skew": 2.5e-3}}, gear_ratio=GEAR_RATIO)
     np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], record.positions["motor"], atol=1e-6)
     # an early channel leaves the others their samples
-    record = read_record(wrote(tmp_path, made(skew=-2.5e-3)), {"theta_s": {"skew": -2.5e-3}})
+    record = read_record(write_frame(tmp_path, simulate_log(skew=-2.5e-3)), {"theta_s": {"skew": -2.5e-3}})
     assert record.start == pytest.approx(3e-3)
     np.testing.assert_allclose(record.torque, frame["u"][3:], atol=1e-9)
     np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], frame["theta_e"][3:], atol=1e-6)
     late = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
-    found = read_record(wrote(tmp_path, late)).statistics.channels["u"]
-    assert found.skew == pytest.approx(4e-3, abs=4.0 * found.skew_error + 1e-4)
-    record = read_record(wrote(tmp_path, late), {"u": {"skew": 4e-3}})
+    gearing = read_record(write_frame(tmp_path, late)).statistics.channels["u"]
+    assert gearing.skew == pytest.approx(4e-3, abs=4.0 * gearing.skew_error + 1e-4)
+    record = read_record(write_frame(tmp_path, late), {"u": {"skew": 4e-3}})
     assert abs(record.statistics.channels["u"].skew) < 2e-4
 
 
 def test_resolution_noise_saturation_and_jumps(tmp_path):
     step = 2.0 * math.pi / 4096
-    frame = made(resolution=step, noise=5e-3)
+    frame = simulate_log(resolution=step, noise=5e-3)
     limit = 0.6 * frame["u"].abs().max()
     frame["u"] = frame["u"].clip(-limit, limit)
     frame.loc[1500, "theta_e"] += 100.0 * step
     frame.loc[2500:, "theta_e"] -= 150.0 * step
-    record = read_record(wrote(tmp_path, frame))
+    record = read_record(write_frame(tmp_path, frame))
     motor, torque = record.statistics.channels["theta_e"], record.statistics.channels["u"]
     assert motor.resolution == pytest.approx(step, rel=1e-6)
     load = record.statistics.channels["theta_s"]
@@ -290,13 +292,13 @@ def test_resolution_noise_saturation_and_jumps(tmp_path):
     assert any(note.startswith("theta_e: 2 jumps") for note in record.notes)
     assert torque.saturated == pytest.approx((frame["u"].abs() == limit).mean())
     assert load.jumps == 0
-    declared = read_record(wrote(tmp_path, frame), {"u": {"saturation": float(limit)}})
+    declared = read_record(write_frame(tmp_path, frame), {"u": {"saturation": float(limit)}})
     assert declared.statistics.channels["u"].saturated == torque.saturated
     assert motor.bandwidth == pytest.approx(2.1, abs=1.0)
 
 
 def test_uneven_stamps_are_no_noise_and_no_jumps(tmp_path):
-    record = read_record(wrote(tmp_path, made(uneven(), noise=2e-3)))
+    record = read_record(write_frame(tmp_path, simulate_log(uneven(), noise=2e-3)))
     motor = record.statistics.channels["theta_e"]
     # splines between the readings smooth a little
     assert motor.noise == pytest.approx(2e-3, rel=0.3)
@@ -306,14 +308,20 @@ def test_uneven_stamps_are_no_noise_and_no_jumps(tmp_path):
 def test_no_false_alarms(tmp_path):
     """Clean logs of many kinds are read without a remark."""
     step = 2.0 * math.pi / 2**14
-    for frame in (made(), made(resolution=step), made(noise=1e-2), made(gap=0.1), made(count=500, period=5e-3)):
-        notes = read_record(wrote(tmp_path, frame), gear_ratio=GEAR_RATIO).notes
+    for frame in (
+        simulate_log(),
+        simulate_log(resolution=step),
+        simulate_log(noise=1e-2),
+        simulate_log(gap=0.1),
+        simulate_log(count=500, period=5e-3),
+    ):
+        notes = read_record(write_frame(tmp_path, frame), gear_ratio=GEAR_RATIO).notes
         assert all(note.startswith("Lost motion at the motor: 0.1000") for note in notes) and len(notes) <= 1
     # text with three decimals looks like no encoder
-    assert read_record(wrote(tmp_path, made().round(3), "log.csv"), gear_ratio=GEAR_RATIO).notes == ()
+    assert read_record(write_frame(tmp_path, simulate_log().round(3), "log.csv"), gear_ratio=GEAR_RATIO).notes == ()
 
 
-def changed(**columns):
+def replace_columns(**columns):
     return lambda frame: frame.assign(**{name: change(frame) for name, change in columns.items()})
 
 
@@ -345,7 +353,11 @@ BAD = {
     "nan": (with_cell("theta_s", 4, np.nan), {}, "column 'theta_s', data row 5 is empty or not a number"),
     "text in time": (with_cell("t", 0, "start"), {}, "column 't', data row 1 is 'start'"),
     "back in time": (with_cell("t", 100, 0.05), {}, "column 't', data row 101: time goes back from 0.099 s to 0.05 s"),
-    "no time passes": (changed(t=lambda f: 0.0 * f["t"] + 3.0), {}, "column 't' is 3 s in all rows; stamps should increase"),
+    "no time passes": (
+        replace_columns(t=lambda f: 0.0 * f["t"] + 3.0),
+        {},
+        "column 't' is 3 s in all rows; stamps should increase",
+    ),
     "short": (lambda f: f.iloc[:63], {}, "has 63 rows; a log needs at least 64"),
     "short window": (
         lambda f: f,
@@ -358,33 +370,33 @@ BAD = {
         r"\[log\] where leaves no row: 'mode' is never 'stop'; values: 'run'",
     ),
     "one column twice": (
-        changed(theta_s=lambda f: f["theta_e"]),
+        replace_columns(theta_s=lambda f: f["theta_e"]),
         {},
         "theta_e and theta_s are the same in every row; each needs a column of its own",
     ),
     "all gaps": (
-        changed(t=lambda f: f["t"] + np.floor(f["t"] / 0.02 + 1e-6)),
+        replace_columns(t=lambda f: f["t"] + np.floor(f["t"] / 0.02 + 1e-6)),
         {},
         "gaps leave no 64 samples in a row",
     ),
     "stuck": (
-        changed(theta_s=lambda f: 0.0 * f["t"] + 0.25),
+        replace_columns(theta_s=lambda f: 0.0 * f["t"] + 0.25),
         {},
         r"column 'theta_s' \(theta_s\) is 0.25 in all rows; it should move; absent = \[\"theta_s\"\] leaves it out",
     ),
     "at rest": (
-        changed(theta_e=lambda f: 1e-3 * (np.arange(len(f)) % 900 > 600) + 1e-3 * (np.arange(len(f)) % 7 > 5)),
+        replace_columns(theta_e=lambda f: 1e-3 * (np.arange(len(f)) % 900 > 600) + 1e-3 * (np.arange(len(f)) % 7 > 5)),
         {"absent": ["theta_s"]},
         "theta_e moves by only 2 steps of its resolution 0.001; a log of a drive in motion is needed",
     ),
     "wrapped": (
-        changed(theta_e=lambda f: f["theta_e"] % (2.0 * np.pi)),
+        replace_columns(theta_e=lambda f: f["theta_e"] % (2.0 * np.pi)),
         {},
         r"column 'theta_e' \(theta_e\) jumps by about 6.283185307 at \d+ rows .* wraps around; "
         r"set wrap = 6.283185307 in \[log\] theta_e",
     ),
     "wrapped word": (
-        changed(theta_e=lambda f: np.round(f["theta_e"] * 1e4) % 65536),
+        replace_columns(theta_e=lambda f: np.round(f["theta_e"] * 1e4) % 65536),
         {"theta_e": {"unit": "counts", "counts_per_turn": 62831.0}},
         "set wrap = 65536 in",
     ),
@@ -394,7 +406,7 @@ BAD = {
         r"column 'theta_e' ranges over [\d.]+, more than \[log\] theta_e.wrap = 6",
     ),
     "unsigned": (
-        changed(u=lambda f: np.round(f["u"] * 1000) % 65536),
+        replace_columns(u=lambda f: np.round(f["u"] * 1000) % 65536),
         {"u": {"unit": "counts", "factor": 1e-3}},
         r"whole numbers up to \d+ and none about 32768: signed words of 16 bits, logged as unsigned; "
         r"set signed_bits = 16 in \[log\] u",
@@ -402,30 +414,30 @@ BAD = {
     "no such word": (lambda f: f, {"u": {"signed_bits": 8}}, r"column 'u', data row 1: .* is no word of 8 bits"),
     "beyond saturation": (lambda f: f, {"u": {"saturation": 0.1}}, r"exceeds \[log\] u.saturation = 0.1"),
     "degrees": (
-        changed(theta_e=lambda f: np.round(f["theta_e"] / (2.0 * np.pi) * 8192) * 360.0 / 8192),
+        replace_columns(theta_e=lambda f: np.round(f["theta_e"] / (2.0 * np.pi) * 8192) * 360.0 / 8192),
         {},
         r"column 'theta_e' \(theta_e\) has steps of 0.0439453, a turn of 8192 counts in degrees: it is not in radians; "
         r"set unit = \"deg\" in \[log\] theta_e",
     ),
     "radians": (
-        changed(theta_s=lambda f: np.round(f["theta_s"] / (2.0 * np.pi) * 2**14) * 2.0 * np.pi / 2**14),
+        replace_columns(theta_s=lambda f: np.round(f["theta_s"] / (2.0 * np.pi) * 2**14) * 2.0 * np.pi / 2**14),
         {"theta_s": {"unit": "deg"}},
         r"a turn of 16384 counts in radians: it is not in degrees; set unit = \"rad\"",
     ),
     "counts": (
-        changed(theta_e=lambda f: np.round(f["theta_e"] * 1000)),
+        replace_columns(theta_e=lambda f: np.round(f["theta_e"] * 1000)),
         {},
         r"holds whole numbers only: counts, not radians; set unit = \"counts\" and counts_per_turn in \[log\] theta_e",
     ),
     "continuous degrees": (
-        changed(theta_e=lambda f: np.degrees(f["theta_e"])),
+        replace_columns(theta_e=lambda f: np.degrees(f["theta_e"])),
         {},
         r"theta_e moves 1146 for each 1 of theta_s, where gear_ratio is 20: theta_e is in degrees",
     ),
     "continuous radians": (lambda f: f, {"theta_s": {"unit": "deg"}}, "theta_s is not in degrees; see unit in"),
-    "load in degrees": (changed(theta_s=lambda f: np.degrees(f["theta_s"])), {}, "theta_s is in degrees"),
+    "load in degrees": (replace_columns(theta_s=lambda f: np.degrees(f["theta_s"])), {}, "theta_s is in degrees"),
     "wrong sign of a side": (
-        changed(theta_s=lambda f: -f["theta_s"]),
+        replace_columns(theta_s=lambda f: -f["theta_s"]),
         {},
         "the sign of one of them is wrong; set sign = -1",
     ),
@@ -435,19 +447,27 @@ BAD = {
         r"the sides are swapped; exchange the columns in \[log\] theta_e and theta_s",
     ),
     "swapped and turned": (
-        changed(theta_s=lambda f: -f["theta_s"]),
+        replace_columns(theta_s=lambda f: -f["theta_s"]),
         {"theta_e": "theta_s", "theta_s": "theta_e"},
         "the sides are swapped, and one has the wrong sign",
     ),
-    "at the motor": (changed(theta_s=lambda f: 20.0 * f["theta_s"]), {}, "theta_s is already referred to the motor shaft"),
+    "at the motor": (
+        replace_columns(theta_s=lambda f: 20.0 * f["theta_s"]),
+        {},
+        "theta_s is already referred to the motor shaft",
+    ),
     "wrong ratio": (
-        changed(theta_s=lambda f: 2.0 * f["theta_s"]),
+        replace_columns(theta_s=lambda f: 2.0 * f["theta_s"]),
         {},
         r"theta_e moves 10 for each 1 of theta_s, where gear_ratio is 20: gear_ratio, or a unit in \[log\], is wrong",
     ),
-    "wrong sign of the torque": (changed(u=lambda f: -f["u"]), {}, "the torque has the wrong sign: .*; set sign = -1 in"),
+    "wrong sign of the torque": (
+        replace_columns(u=lambda f: -f["u"]),
+        {},
+        "the torque has the wrong sign: .*; set sign = -1 in",
+    ),
     "estimate without motion": (
-        changed(theta_s=lambda f: 0.01 * np.random.default_rng(0).standard_normal(len(f))),
+        replace_columns(theta_s=lambda f: 0.01 * np.random.default_rng(0).standard_normal(len(f))),
         {"theta_s": {"skew": "estimate"}},
         "theta_s.skew = 'estimate': ",
     ),
@@ -457,9 +477,9 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_logs_are_told_in_one_line(case, tmp_path):
     change, log, message = BAD[case]
-    frame = change(made())
+    frame = change(simulate_log())
     text = any(frame[column].dtype == object for column in ("t", "u", "theta_s") if column in frame)
-    path = wrote(tmp_path, frame, "log.csv" if text else "log.parquet")
+    path = write_frame(tmp_path, frame, "log.csv" if text else "log.parquet")
     with pytest.raises(InputError, match=message) as error:
         read_record(path, log, gear_ratio=GEAR_RATIO)
     assert str(error.value).startswith(f"{path}: ")
@@ -473,16 +493,16 @@ def test_columns_of_unequal_length_are_told(tmp_path):
 
 
 def test_doubts_are_remarks(tmp_path):
-    frame = made()
+    frame = simulate_log()
     # one encoder of another drive
-    odd = frame.assign(theta_s=made(seed=5)["theta_s"])
-    notes = read_record(wrote(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
+    odd = frame.assign(theta_s=simulate_log(seed=5)["theta_s"])
+    notes = read_record(write_frame(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
     assert any(note.startswith("theta_e and theta_s are hardly related") for note in notes)
-    warnings = read_record(wrote(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).warnings
+    warnings = read_record(write_frame(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).warnings
     assert any("if the stamps are not in s, set [log] t.unit" in warning for warning in warnings)
-    warnings = read_record(wrote(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).warnings
+    warnings = read_record(write_frame(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).warnings
     assert any("rpm: check its unit" in warning for warning in warnings)
-    notes = read_record(wrote(tmp_path, frame.assign(u=0.0)), gear_ratio=GEAR_RATIO).notes
+    notes = read_record(write_frame(tmp_path, frame.assign(u=0.0)), gear_ratio=GEAR_RATIO).notes
     assert notes == ("u is 0 in all rows: free motion, which does not show the inertia by itself.",)
 
 
@@ -498,20 +518,20 @@ def test_doubts_are_remarks(tmp_path):
 )
 def test_an_inertia_far_from_the_nominal_one_is_said_first(tmp_path, change, times):
     """Torque in mN m or kN m, degrees for radians, ms for s; three times the nominal may well be."""
-    path = wrote(tmp_path, change(made().drop(columns="theta_s")))
+    path = write_frame(tmp_path, change(simulate_log().drop(columns="theta_s")))
     record = read_record(path, nominal=NominalDrive(INERTIA, VISCOUS))
     warnings = record.warnings
     assert bool(record.contradiction) == (times is not None)
-    said = [warning for warning in warnings if warning.startswith("Doubtful: u moves theta_e as an inertia of")]
-    assert len(said) == (times is not None)
-    assert times is None or f", {times} times the nominal 0.01: check the units" in said[0]
+    doubts = [warning for warning in warnings if warning.startswith("Doubtful: u moves theta_e as an inertia of")]
+    assert len(doubts) == (times is not None)
+    assert times is None or f", {times} times the nominal 0.01: check the units" in doubts[0]
 
 
 @pytest.mark.parametrize(("stiffness", "refused"), [(1e6, True), (1e-3, False)])
 def test_an_inertia_that_a_resonance_hides_is_doubted_and_not_refused(tmp_path, stiffness, refused):
     """A fiftieth of the nominal inertia: above the antiresonance the input supplies little."""
     nominal = NominalDrive(0.3, 0.0, load_inertia=0.3, stiffness=stiffness)
-    record = read_record(wrote(tmp_path, made().drop(columns="theta_s")), nominal=nominal)
+    record = read_record(write_frame(tmp_path, simulate_log().drop(columns="theta_s")), nominal=nominal)
     assert record.warnings[0].startswith("Doubtful: u moves theta_e as an inertia of")
     assert bool(record.contradiction) == refused
 
@@ -521,11 +541,11 @@ def test_a_torque_that_acts_late_is_doubted_and_not_refused(tmp_path):
     t, w = 2e-3 * np.arange(4000), 2.0 * np.pi * np.array([[2.0], [3.3]])
     torque = -np.sum(np.sin(w * (t + 0.04)), axis=0)
     position = np.sum(np.sin(w * t) / w**2, axis=0)
-    record = read_record(wrote(tmp_path, pd.DataFrame({"t": t, "u": torque, "theta_e": position})))
-    said = [one for one in record.warnings if "of the work" in one]
-    assert len(said) == 1 and not record.contradiction, (record.warnings, record.contradiction)
-    assert said[0].endswith("of the work: the load drives it, or u has the wrong sign or acts late.")
-    assert float(said[0].split("returns ")[1].split(" %")[0]) > 50.0
+    record = read_record(write_frame(tmp_path, pd.DataFrame({"t": t, "u": torque, "theta_e": position})))
+    warnings = [warning for warning in record.warnings if "of the work" in warning]
+    assert len(warnings) == 1 and not record.contradiction, (record.warnings, record.contradiction)
+    assert warnings[0].endswith("of the work: the load drives it, or u has the wrong sign or acts late.")
+    assert float(warnings[0].split("returns ")[1].split(" %")[0]) > 50.0
 
 
 def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
@@ -538,11 +558,11 @@ def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
         (1000.0, "Doubtful: friction takes", False),
         (0.01, "Doubtful: u is", True),
     ):
-        record = read_record(wrote(tmp_path, frame.assign(u=factor * frame["u"])), nominal=NominalDrive(1.0, 2.0))
-        said = [one for one in record.warnings if one.startswith("Doubtful")]
-        assert (len(said), bool(record.contradiction)) == (bool(begin), surely), record.warnings
-        assert not begin or said[0].startswith(begin)
-    record = read_record(wrote(tmp_path, frame.assign(u=-frame["u"])), nominal=NominalDrive(1.0, 2.0))
+        record = read_record(write_frame(tmp_path, frame.assign(u=factor * frame["u"])), nominal=NominalDrive(1.0, 2.0))
+        warnings = [warning for warning in record.warnings if warning.startswith("Doubtful")]
+        assert (len(warnings), bool(record.contradiction)) == (bool(begin), surely), record.warnings
+        assert not begin or warnings[0].startswith(begin)
+    record = read_record(write_frame(tmp_path, frame.assign(u=-frame["u"])), nominal=NominalDrive(1.0, 2.0))
     assert record.contradiction.startswith("u falls with the speed as a viscous friction of -2"), record.contradiction
 
 
@@ -551,7 +571,7 @@ def test_a_falling_load_gives_its_energy_back(tmp_path):
     t = 1e-3 * np.arange(3000)
     down = -0.5 * t + 0.02 * np.sin(8.0 * t)
     frame = pd.DataFrame({"t": t, "u": 1.0 + 0.05 * np.sin(5.0 * t), "theta_e": down})
-    assert read_record(wrote(tmp_path, frame)).torque is not None
+    assert read_record(write_frame(tmp_path, frame)).torque is not None
 
 
 TABLES = {
@@ -604,10 +624,10 @@ def test_emps_is_read_as_published():
         assert record.statistics.sampling.even and record.closed_loop
         assert record.notes == ("There is no theta_s (load position) in this log.",)
         # the published fit: 95.109 kg, 203.5 N s/m, 20.394 N, -3.165 N
-        found = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
-        assert found["inertia"] == pytest.approx(95.1, rel=0.03)
-        assert found["viscous"] == pytest.approx(203.5, rel=0.1)
-        assert found["coulomb"] == pytest.approx(20.4, rel=0.15)
+        statistics = dict(zip(record.statistics.dynamics.names, record.statistics.dynamics.values, strict=True))
+        assert statistics["inertia"] == pytest.approx(95.1, rel=0.03)
+        assert statistics["viscous"] == pytest.approx(203.5, rel=0.1)
+        assert statistics["coulomb"] == pytest.approx(20.4, rel=0.15)
         assert abs(record.statistics.channels["u"].skew) < 1e-3
 
 
@@ -650,7 +670,7 @@ def test_servoproject_has_two_encoders_and_no_torque():
 
 @pytest.mark.parametrize("off", [1.1, 0.92])
 def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_path, off):
-    path = wrote(tmp_path, made())
+    path = write_frame(tmp_path, simulate_log())
     with pytest.raises(InputError, match="theta_e moves 20 for each 1 of theta_s"):
         read_record(path, gear_ratio=off * GEAR_RATIO)
     notes = read_record(path, gear_ratio=off * GEAR_RATIO, gear_tolerance=0.15).notes
@@ -663,7 +683,7 @@ def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_pa
 @pytest.fixture
 def logs(tmp_path):
     def write(name, **how):
-        made(**how).to_csv(tmp_path / name, index=False)
+        simulate_log(**how).to_csv(tmp_path / name, index=False)
         return read_record(tmp_path / name)
 
     return write
@@ -671,34 +691,34 @@ def logs(tmp_path):
 
 def test_each_log_is_a_segment_with_its_own_rows(logs):
     first, second = logs("a.csv", count=1500), logs("b.csv", count=2500, seed=1)
-    both = join_records([first, second])
-    assert len(both.time) == 4000
-    assert [(part.start, part.stop) for part in both.segments] == [(0, 1500), (1500, 4000)]
-    assert np.all(np.diff(both.time) > 0.0)
-    assert both.time[1500] > both.time[1499] + 5.0 * both.sample_period
+    joined = join_records([first, second])
+    assert len(joined.time) == 4000
+    assert [(part.start, part.stop) for part in joined.segments] == [(0, 1500), (1500, 4000)]
+    assert np.all(np.diff(joined.time) > 0.0)
+    assert joined.time[1500] > joined.time[1499] + 5.0 * joined.sample_period
     for side in ("motor", "load"):
-        np.testing.assert_array_equal(both.positions[side][1500:], second.positions[side])
-    np.testing.assert_array_equal(both.torque, np.concatenate([first.torque, second.torque]))
-    assert both.notes[0] == "2 logs, one after the other: a.csv, b.csv."
+        np.testing.assert_array_equal(joined.positions[side][1500:], second.positions[side])
+    np.testing.assert_array_equal(joined.torque, np.concatenate([first.torque, second.torque]))
+    assert joined.notes[0] == "2 logs, one after the other: a.csv, b.csv."
     assert join_records([first]) is first
 
 
 def test_logs_that_are_not_alike(logs, tmp_path):
     first, slow = logs("a.csv"), logs("slow.csv", period=2e-3)
     with pytest.raises(
-        InputError, match=r"slow\.csv: is sampled every 0\.002 s, .*a\.csv every 0\.001 s; \[log\] resample = "
+        InputError, match=r"slow\.csv: is sampled every 0\.002 s, .*a\.csv every 0\.001 s; set \[log\] resample = "
     ):
         join_records([first, slow])
-    made().drop(columns="u").to_csv(tmp_path / "free.csv", index=False)
+    simulate_log().drop(columns="u").to_csv(tmp_path / "free.csv", index=False)
     free = read_record(tmp_path / "free.csv", {"absent": ["u"]})
     with pytest.raises(InputError, match=r"free\.csv: has no torque, which .*a\.csv has"):
         join_records([first, free])
 
 
 def test_a_speed_stands_for_a_position(tmp_path):
-    frame = made()
+    frame = simulate_log()
     rpm = np.gradient(frame["theta_e"], frame["t"]) * 30.0 / math.pi
-    path = wrote(tmp_path, frame.assign(speed=-rpm).drop(columns="theta_e"))
+    path = write_frame(tmp_path, frame.assign(speed=-rpm).drop(columns="theta_e"))
     record = read_record(path, {"omega_e": {"column": "speed", "unit": "rpm", "sign": -1}}, gear_ratio=GEAR_RATIO)
     motion = frame["theta_e"] - frame["theta_e"][0]
     np.testing.assert_allclose(record.positions["motor"], motion, atol=2e-3)

@@ -71,8 +71,8 @@ def test_jumps_stand_out_of_the_motion(step):
     motion[5500:] = motion[5500]
     stepped = np.round(motion / step) * step if step else motion
     assert signal_quality.count_jumps(stepped, step) == 0
-    for at, size in ((700, 0.3), (1500, -0.2), (5800, 0.05)):
-        stepped[at] += size
+    for rows, size in ((700, 0.3), (1500, -0.2), (5800, 0.05)):
+        stepped[rows] += size
     stepped[3300:] += 0.2
     assert signal_quality.count_jumps(stepped, step) == 4
 

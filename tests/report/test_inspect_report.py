@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from browser import check, needs_chromium, opened
-from measured import GEAR_RATIO, SERVO, made, real
+from measured import GEAR_RATIO, SERVO, real, simulate_log
 from test_page import Page
 
 from jaxbl.records import inspect
@@ -15,14 +15,14 @@ from jaxbl.report.inspect import draw_inspection, summary, write_inspection_repo
 UNEVEN = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
 BOTH = ["channels", "spectra", "torque_over_velocity", "twist"]
 CASES = {
-    "both encoders": (made(count=6000, gap=0.1, noise=1e-3), {}, BOTH),
-    "uneven, with a gap": (made(UNEVEN).drop(index=range(1000, 1400)), {}, [*BOTH, "intervals"]),
-    "motor alone": (made().drop(columns="theta_s"), {}, BOTH[:3]),
-    "load alone, linear": (made().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH[:3]),
-    "free": (made().assign(u=0.0), {}, ["channels", "spectra", "twist"]),
-    "no torque": (made(), {"absent": ["u"]}, ["channels", "spectra", "twist"]),
-    "sensor": (made(), {"transmitted": "u"}, BOTH),
-    "noise": (made().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH),
+    "both encoders": (simulate_log(count=6000, gap=0.1, noise=1e-3), {}, BOTH),
+    "uneven, with a gap": (simulate_log(UNEVEN).drop(index=range(1000, 1400)), {}, [*BOTH, "intervals"]),
+    "motor alone": (simulate_log().drop(columns="theta_s"), {}, BOTH[:3]),
+    "load alone, linear": (simulate_log().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH[:3]),
+    "free": (simulate_log().assign(u=0.0), {}, ["channels", "spectra", "twist"]),
+    "no torque": (simulate_log(), {"absent": ["u"]}, ["channels", "spectra", "twist"]),
+    "sensor": (simulate_log(), {"transmitted": "u"}, BOTH),
+    "noise": (simulate_log().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH),
 }
 
 
@@ -45,13 +45,13 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
 
 
 def test_a_gap_is_not_drawn_over(tmp_path):
-    made().drop(index=range(1000, 1400)).to_parquet(tmp_path / "log.parquet")
+    simulate_log().drop(index=range(1000, 1400)).to_parquet(tmp_path / "log.parquet")
     channels = draw_inspection(inspect(tmp_path / "log.parquet"))[0]
     assert [len(ax.lines) for ax in channels.figure.axes] == [2, 2, 2, 2]
 
 
 def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
-    frame = made(UNEVEN, noise=1e-3).drop(index=range(1000, 1400))
+    frame = simulate_log(UNEVEN, noise=1e-3).drop(index=range(1000, 1400))
     limit = 0.5 * frame["u"].max()
     frame["u"] = frame["u"].clip(-limit, limit)
     frame.loc[500, "theta_e"] += 3.0
@@ -72,7 +72,7 @@ def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
 
 def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
     (tmp_path / "out").mkdir()
-    made(gap=0.1).rename(columns={"theta_e": "a<b"}).to_parquet(tmp_path / "log.parquet")
+    simulate_log(gap=0.1).rename(columns={"theta_e": "a<b"}).to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", {"theta_e": "a<b"}, gear_ratio=GEAR_RATIO)
     lines = write_inspection_report(found, tmp_path / "out")
     assert lines == summary(found)
@@ -87,7 +87,7 @@ def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
 
 @needs_chromium
 def test_the_page_in_a_browser(tmp_path):
-    made(gap=0.1).to_parquet(tmp_path / "log.parquet")
+    simulate_log(gap=0.1).to_parquet(tmp_path / "log.parquet")
     write_inspection_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
     with opened(tmp_path / "report.html") as (page,):
         check(page, 4)
