@@ -9,19 +9,18 @@ def escape_unprintable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-class InputError(ValueError):
-    """Bad input. The message is one line: what, where (file, key, column, row), and what would be right."""
-
+class _OneLineError(Exception):
     def __init__(self, message: str):
         # keys, values and file names may hold line breaks, and be of any length
         super().__init__(escape_unprintable(shorten(message, _MESSAGE_LENGTH)))
 
 
-class NoResult(RuntimeError):
-    """The input is valid, but there is no answer to give. The message is one line: what fails, where, by how much."""
+class InputError(_OneLineError, ValueError):
+    """Bad input. The message is one line: what, where (file, key, column, row), and what would be right."""
 
-    def __init__(self, message: str):
-        super().__init__(escape_unprintable(shorten(message, _MESSAGE_LENGTH)))
+
+class NoResult(_OneLineError, RuntimeError):
+    """The input is valid, but there is no answer to give. The message is one line: what fails, where, by how much."""
 
 
 def shorten(text: str, limit: int) -> str:

@@ -118,6 +118,11 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         draft.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
+def write_json(path: Path, data: Any, *, allow_nan: bool = True) -> None:
+    """Write data as JSON text without a checksum. Raises as :func:`open_draft`."""
+    write_atomic(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=allow_nan))
+
+
 def create_file(path: Path, content: str) -> bool:
     """Write a file that does not exist yet. Returns False if another process was first. Raises as :func:`open_draft`.
 

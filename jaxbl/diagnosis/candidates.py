@@ -98,11 +98,6 @@ SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 
 
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Candidate]:
     """Effects that a model lacks, variant by variant; `scales` of the log as an effect of a given name sees them."""
     found: list[Candidate] = []

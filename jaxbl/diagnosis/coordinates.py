@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.identification.regression import Kinematics, transmitted
 from jaxbl.identification.segments import Segment
+from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .residuals import Residual, SideResiduals
@@ -51,7 +52,7 @@ def coordinates_of(
     length, omega = ("m", "v") if side in sliding else ("rad", "ω")
     velocity = np.asarray(part.velocity[side])
     deviation = np.asarray(segment.smoothed[side].deviation(1))
-    still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * np.sqrt(np.mean(velocity**2)))
+    still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * rms(velocity))
 
     def position_of(one: str) -> CoordinateValues:
         unit, symbol = ("m", "x") if one in sliding else ("rad", _ANGLES[one])
@@ -123,7 +124,7 @@ def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, Coordin
         twist = _twist(experiment, part.position)
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
         found["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
-    idle = np.abs(torque) < 0.02 * np.sqrt(np.mean(torque**2))
+    idle = np.abs(torque) < 0.02 * rms(torque)
     loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
     found["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
     return found

@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.drive.parameters import parameters
+from jaxbl.drive.parameters import units_of
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
@@ -99,7 +99,7 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObje
 def _finding(
     record: Record, one: Finding, values: Mapping[str, float], errors: Mapping[str, float], where: JsonObject
 ) -> JsonObject:
-    units = {field.name: about.unit for field, about in parameters(EFFECTS[one.effect])}
+    units = units_of(EFFECTS[one.effect])
     numbers = {
         leaf: {
             "value": values.get(f"effects.{one.effect}.{leaf}", value),

@@ -9,6 +9,7 @@ from jaxbl.errors import InputError
 from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
 from jaxbl.identification.segments import led_in
 from jaxbl.records import Record
+from jaxbl.records.least_squares import rms
 
 HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
@@ -53,7 +54,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
 def input_rms(record: Record) -> float:
     """Of the input on all segments of a log, N m."""
     assert record.torque is not None
-    return float(np.sqrt(np.mean(np.concatenate([np.square(record.torque[part]) for part in record.segments]))))
+    return rms(np.concatenate([record.torque[part] for part in record.segments]))
 
 
 def _long(record: Record) -> Record:
@@ -69,12 +70,16 @@ def _long(record: Record) -> Record:
 
 def can_hold_out(record: Record) -> bool:
     """Whether a log is long enough for a quarter of it to be held out."""
-    return HELD_OUT * sum(part.stop - part.start for part in record.segments) >= _LEAST_SAMPLES
+    return HELD_OUT * _count_samples(record) >= _LEAST_SAMPLES
+
+
+def _count_samples(record: Record) -> int:
+    return sum(part.stop - part.start for part in record.segments)
 
 
 def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
-    total = sum(part.stop - part.start for part in record.segments)
+    total = _count_samples(record)
     left = round((1.0 - HELD_OUT) * total)
     if not can_hold_out(record):
         raise InputError(

@@ -33,10 +33,11 @@ from jaxbl.identification.free_parameters import FreeParameter, set_free_paramet
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
+from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 from jaxbl.workers import map_in_threads
 
-from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
 from .evidence import Products
 from .neutral_effects import bucket, corrected, lean, with_torques
 from .whittle import Spectrum, weighted_products
@@ -630,13 +631,8 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     total = np.einsum("s,scd->cd", weight, grams)
     at = np.zeros(total.shape[0])
     at[0] = 1.0
-    at[-states:] = -_response(total, states)[:, 0]
+    at[-states:] = -_response_and_loss(total, states)[0][:, 0]
     return np.einsum("c,scd,d->s", at, grams, at)
-
-
-def _response(gram: np.ndarray, states: int) -> np.ndarray:
-    """What the initial states, which may be all but alike, take off the other columns."""
-    return _response_and_loss(gram, states)[0]
 
 
 def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
@@ -661,4 +657,4 @@ def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:
 
 def _eliminated(gram: np.ndarray, states: int) -> np.ndarray:
     """Products of columns without what the last of them, the initial states, explain."""
-    return _without(gram, states, _response(gram, states))
+    return _without(gram, states, _response_and_loss(gram, states)[0])

@@ -17,6 +17,7 @@ import numpy as np
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, balance
 from jaxbl.identification.segments import Segment
+from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues
@@ -411,7 +412,7 @@ def residual_spectrum(residual: Residual) -> tuple[np.ndarray, np.ndarray, np.nd
     """Frequencies (Hz), power of a residual in each of them, and its noise's; the powers add up to the sum of squares."""
     count = len(residual.time)
     window = np.hanning(count)
-    window = window / np.sqrt(np.mean(window**2))
+    window = window / rms(window)
     frequency = np.fft.rfftfreq(count, residual.period)
     once = np.full(len(frequency), 2.0)
     once[0] = 1.0
@@ -434,7 +435,7 @@ def localise(
     found, drives = {}, [_drives(experiment, one.kinematics) for one in segments]
     for side, pieces in residuals.items():
         driving = np.concatenate([np.asarray(one[side]) for one in drives])
-        found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
+        found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * rms(driving))
     return found
 
 

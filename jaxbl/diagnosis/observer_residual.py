@@ -21,6 +21,7 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
 from jaxbl.observer import AbstractSuperTwisting
+from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards, parzen_window
 from jaxbl.simulate import Experiment, Signals, State, initial_observer_state, initial_state, replay
 
@@ -185,9 +186,9 @@ def compared(
     both = math.sqrt(float(np.mean(mine**2) * np.mean(theirs**2)))
     return {
         "converged": True,
-        "rms": float(np.sqrt(np.mean(mine**2))),
-        "noise": float(np.sqrt(np.mean(np.concatenate(noise) ** 2))),
+        "rms": rms(mine),
+        "noise": rms(np.concatenate(noise)),
         "correlation": float(np.mean(mine * theirs)) / both if both > 0.0 else None,
-        "smoother_rms": float(np.sqrt(np.mean(theirs**2))),
+        "smoother_rms": rms(theirs),
         "bandwidth": bandwidth,
     }

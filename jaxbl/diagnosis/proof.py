@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters
+from jaxbl.drive.parameters import get_leaf, leaf_paths, units_of
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
@@ -77,7 +77,7 @@ def special_case(fitted: FittedModel, name: str, noise: Mapping[str, float] | No
     side's readings, rad, nor is a way known that is shorter than that."""
     cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
     least = {} if noise is None else {"rad": noise.get(place, max(noise.values()))}
-    units = {field.name: about.unit for field, about in parameters(cls)}
+    units = units_of(cls)
     apart = []
     for leaf, role in cls.roles().items():
         path = f"effects.{name}.{leaf}"

@@ -19,6 +19,7 @@ from jaxbl.identification.segments import Segment, reading_noise, windows_of
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment, NamedArrays
 
@@ -299,4 +300,4 @@ def _all_rms(samples: NamedArrays) -> Errors:
 
 def _rms(pieces: Sequence[np.ndarray]) -> float:
     values = np.concatenate([np.ravel(one) for one in pieces])
-    return float(np.sqrt(np.mean(values**2))) if np.isfinite(values).all() else float("inf")
+    return rms(values) if np.isfinite(values).all() else float("inf")

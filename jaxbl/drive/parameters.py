@@ -87,6 +87,11 @@ def config_key(field_name: str) -> str:
     return field_name[:-1] if field_name.endswith("_") and keyword.iskeyword(field_name[:-1]) else field_name
 
 
+def units_of(module: Any) -> dict[str, str]:
+    """Units of the numbers of a module or of its class, by name."""
+    return {field.name: declaration.unit for field, declaration in parameters(module)}
+
+
 def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
     """Find the dotted paths of all numbers that an axis may vary, e.g. `observer.motor.alpha`, with their declarations.
 

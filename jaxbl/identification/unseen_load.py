@@ -27,6 +27,7 @@ from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import AbstractDrive, EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
+from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
@@ -137,8 +138,8 @@ class UnseenLoad:
         self._first = np.array([np.asarray(one.state[0, :2]) for one in motions])
         self._open = np.array([[float(one.deviation(i)[0]) for i in (0, 1)] for one in motions])
         speed = np.concatenate([np.asarray(one.velocity) for one in motions])
-        self._speed = float(np.sqrt(np.mean(speed**2)))
-        self.torque = float(np.sqrt(np.mean(np.concatenate([one.torque for one in segments]) ** 2)))
+        self._speed = rms(speed)
+        self.torque = rms(np.concatenate([one.torque for one in segments]))
 
     @property
     def gap(self) -> int | None:
@@ -649,7 +650,7 @@ class _Search:
         for one, skip in zip(self.model.states(point.theta, point.start, point.smoothness), self.model.skipped, strict=True):
             motion = jax.tree.map(jnp.asarray, (one.position, one.velocity, one.effects))
             met.append(np.asarray(jax.vmap(plant.transmitted_torque)(*motion)[0])[skip:])
-        return bool(np.sqrt(np.mean(np.concatenate(met) ** 2)) < _TOUCH * self.model.torque)
+        return rms(np.concatenate(met)) < _TOUCH * self.model.torque
 
     def _at_most(self, without: Point, worth: float) -> float:
         """The largest half gap that fits about as well as none; the motor's travel where all do."""

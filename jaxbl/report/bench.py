@@ -1,10 +1,9 @@
 """What `jaxbl bench` leaves: table, `bench.json`, a bar chart, and throughput against lanes."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
-from jaxbl.files import write_atomic
+from jaxbl.files import write_json
 from jaxbl.lines import format_table
 from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
@@ -99,6 +98,6 @@ def throughput_lines(result: BenchResult) -> list[str]:
 
 def write_bench_report(result: BenchResult, folder: Path) -> list[str]:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
-    write_atomic(folder / "bench.json", json.dumps(asdict(result), indent=2, ensure_ascii=False))
+    write_json(folder / "bench.json", asdict(result))
     save_all(draw_throughput(result), folder)
     return throughput_lines(result)

@@ -17,14 +17,14 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jaxbl.config import Config, is_boolean, numeric_paths
+from jaxbl.config import Config, is_boolean
 from jaxbl.files import json_with_checksum, write_atomic
 from jaxbl.lines import TERMINAL_WIDTH, format_table
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
 from .figures import COLOURS, MISSING, Drawn, style, subplots, with_unit
-from .maps import cell_edges, hatch_failures, is_log
+from .maps import axis_label, cell_edges, fit_axes, hatch_failures, is_log
 from .page import save_all
 
 _FIGURE = "comparison"
@@ -241,8 +241,8 @@ def _map(figure: Figure, ax: Axes, config: Config, one: MetricChange, frame: pd.
         far = share.to_numpy() > 0.5
         ax.plot(at.loc[~far, x], at.loc[~far, y], ".", ms=3, color=MISSING)
         ax.scatter(at.loc[far, x], at.loc[far, y], c=table.to_numpy(float)[far], cmap=colours, norm=norm, s=14)
-    ax.set(xlabel=_label(config, x), ylabel=_label(config, y))
-    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    ax.set(xlabel=axis_label(config, x), ylabel=axis_label(config, y))
+    fit_axes(ax, edges)
     figure.colorbar(ScalarMappable(norm, colours), ax=ax, pad=0.02, aspect=28)
 
 
@@ -265,19 +265,13 @@ def _line(ax: Axes, config: Config, frame: pd.DataFrame, path: str) -> None:
     for i, name in enumerate(("first", "second")):
         ax.plot(x, frame[name], "-", color=COLOURS[i], label=name)
         ax.plot(x[far], frame.loc[far, name], "o", ms=4, color=COLOURS[i])
-    ax.set(xlabel=_label(config, path))
+    ax.set(xlabel=axis_label(config, path))
     if _drawn_log(config, path, x):
         ax.set_xscale("log")
     drawn = frame[["first", "second"]].to_numpy(float)
     drawn = drawn[np.isfinite(drawn)]
     if len(drawn) and drawn.min() > 0.0 and drawn.max() / drawn.min() > 30.0:
         ax.set_yscale("log")
-
-
-def _label(config: Config, path: str) -> str:
-    """A path with its unit, where this study has it."""
-    known = numeric_paths(config)
-    return with_unit(path, known[path].unit if path in known else "")
 
 
 def _drawn_log(config: Config, path: str, values: np.ndarray) -> bool:

@@ -26,18 +26,8 @@ def write_element_report(found: ElementIdentification, folder: Path) -> list[str
     ]
     tables = [PageTable("Numbers", ["path", "value", "standard error", "95 % from", "to", "unit"], rows)]
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(found.tables)
-    return write_results(
-        folder,
-        "identification",
-        found.summary["title"],
-        found.summary,
-        found.trace,
-        model,
-        lead,
-        draw_element(found),
-        tables,
-        remarks,
-    )
+    title, drawn = found.summary["title"], draw_element(found)
+    return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks)
 
 
 def element_lines(summary: JsonObject) -> list[str]:

@@ -11,7 +11,7 @@ from jaxbl.lines import NextStep
 
 from .figures import SIDES
 from .identify_figures import draw_identification
-from .page import PageTable, write_log_results
+from .page import PageTable, model_text, write_results
 
 
 def write_identification_report(found: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
@@ -26,7 +26,9 @@ def write_identification_report(found: Identification, folder: Path, steps: Sequ
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    return write_log_results(found, folder, "identification", lead, draw_identification(found), tables, remarks, steps)
+    title, model = found.config.title or f"Identification from {found.record.path.name}", model_text(found)
+    drawn = draw_identification(found)
+    return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks, steps)
 
 
 def identification_lines(summary: JsonObject) -> list[str]:

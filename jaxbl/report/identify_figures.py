@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 
-from jaxbl.drive.parameters import parameters
+from jaxbl.drive.parameters import units_of
 from jaxbl.identification.identify import Identification
 
 from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, outline, stacked, style, subplots, with_unit
@@ -344,7 +344,7 @@ def _path(log: LogSignals) -> Drawn:
     figure, axes = stacked(len(names), 2.1)
     late = slice((log.observed.start + log.observed.stop) // 2, log.observed.stop)
     # what a law derives from its own parameters is an angle, as they are
-    units = {field.name: about.unit for field, about in parameters(log.experiment.transmission)}
+    units = units_of(log.experiment.transmission)
     for ax, name in zip(axes, names, strict=True):
         ends, lines = [], []
         for side in log.sides:

@@ -1,13 +1,12 @@
 """Figures, table and report of an inspected log."""
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 
-from jaxbl.files import to_jsonable, write_atomic
+from jaxbl.files import to_jsonable, write_json
 from jaxbl.lines import NextStep, format_descriptions, format_table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
@@ -34,8 +33,7 @@ def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequenc
     Returns the lines for the terminal.
     """
     record = inspection.record
-    text = json.dumps(to_jsonable(inspection.to_dict()), indent=2, ensure_ascii=False)
-    write_atomic(folder / "inspection.json", text)
+    write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
     judgements = [(one.quantity, one.answer, one.reason) for one in inspection.identifiability]
     tables = [
         PageTable("What the log can identify", ["quantity", "", "why"], judgements),

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxbl.identification.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards
 
 from .figures import SIDES
@@ -150,4 +151,4 @@ class LogSignals:
     def rms(self, values: Array) -> float:
         """Root mean square of the finite values of the settled part; NaN if there is none."""
         finite = values[self.settled][np.isfinite(values[self.settled])]
-        return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
+        return rms(finite) if len(finite) else float("nan")

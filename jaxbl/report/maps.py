@@ -6,7 +6,7 @@
 
 import re
 import textwrap
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -136,8 +136,10 @@ def _dots(result: StudyResult, figure: FigureTable) -> pd.Series | None:
     return pd.Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
 
 
-def _label(config: Config, path: str) -> str:
-    return with_unit(path, numeric_paths(config)[path].unit)
+def axis_label(config: Config, path: str) -> str:
+    """A path with its unit, if the study has it as a number."""
+    known = numeric_paths(config)
+    return with_unit(path, known[path].unit if path in known else "")
 
 
 def _with_value(config: Config, path: str, value: Any) -> str:
@@ -317,7 +319,7 @@ def _grid_of_axes(
     for i, ax in enumerate(axes):
         ax.set_visible(i < count)
         ax.tick_params(labelbottom=i + columns >= count)
-        ax.set(xlabel=_label(config, spec.x), ylabel="" if i % columns else ylabel)
+        ax.set(xlabel=axis_label(config, spec.x), ylabel="" if i % columns else ylabel)
     return figure, list(axes[:count])
 
 
@@ -329,7 +331,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
     tables = [panel.table for panel in panels]
     values = np.concatenate([table.to_numpy(float) for table in tables])
     norm = Normalize(0.0, 1.0) if is_boolean(spec.value) else color_norm(values, spec.scale)
-    figure, axes = _grid_of_axes(config, spec, len(panels), (3.5, 3.4), _label(config, spec.y), beside=1.0)
+    figure, axes = _grid_of_axes(config, spec, len(panels), (3.5, 3.4), axis_label(config, spec.y), beside=1.0)
     hatches, curves = [], []
     gridded = config.sweep.design == "grid"
     missing = diverged = 0
@@ -402,7 +404,7 @@ def _map_panel(
         there, gone = dots[shown.notna()], dots[shown.isna()]
         ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
         ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
-    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    fit_axes(ax, edges)
     return xs, ys, handles
 
 
@@ -412,6 +414,11 @@ def _dense(table: pd.Series, filling: Filling | None) -> tuple[np.ndarray, np.nd
         return filling.dense(table)
     grid = table.unstack()
     return grid.columns.to_numpy(float), grid.index.to_numpy(float), grid.to_numpy(float)
+
+
+def fit_axes(ax: Axes, edges: Sequence[np.ndarray]) -> None:
+    """End axes at the outer edges of the cells of a map."""
+    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
 
 
 def hatch_failures(
@@ -514,7 +521,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
             ax.set_yscale("log")
         ax.set(xlim=cell_edges(xs, log)[[0, -1]], title=title)
     if spec.series is not None:
-        axes[-1].legend(title=_label(config, spec.series))
+        axes[-1].legend(title=axis_label(config, spec.series))
     caption = f"{value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 

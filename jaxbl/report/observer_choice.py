@@ -3,7 +3,6 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
 
-import json
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -18,13 +17,13 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from jaxbl.config import Config, numeric_paths
-from jaxbl.files import write_atomic
+from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MISSING, SIDE_COLOURS, Drawn, style, subplots, with_unit
-from .maps import cell_edges
+from .maps import axis_label, cell_edges, fit_axes
 from .page import PageTable, write_report
 
 _KIND_COLOURS = (
@@ -110,10 +109,6 @@ def _varied(config: Config, summary: JsonObject, side: str) -> dict[str, list[An
     return {path: values for path, values in columns.items() if len(values) > 1}
 
 
-def _axis_label(config: Config, path: str) -> str:
-    return with_unit(path, numeric_paths(config)[path].unit)
-
-
 def _place(ax: Axes, which: str, values: Sequence[Any]) -> np.ndarray:
     """Set up an axis for values. Returns where each of them is: on a logarithmic scale where they grow by factors."""
     numbers = all(isinstance(value, int | float) for value in values)
@@ -135,7 +130,7 @@ def _lines(config: Config, summary: JsonObject, side: str) -> Drawn:
         errors = [point["sides"][side]["kinds"][kind]["error"] for point in summary["points"]]
         look: JsonObject = {"color": COLOURS[i % len(COLOURS)], "ls": ("-", "--", ":")[i // len(COLOURS) % 3]}
         ax.plot(xs, [np.nan if one is None else one for one in errors], "o", ms=4, label=kind, **look)
-    ax.set(yscale="log", xlabel=_axis_label(config, path), ylabel=f"{side}: {_error(summary)}", title=side)
+    ax.set(yscale="log", xlabel=axis_label(config, path), ylabel=f"{side}: {_error(summary)}", title=side)
     figure.legend(handles=ax.get_legend_handles_labels()[0], loc="outside right center")
     return Drawn(f"observers_{side}", figure, f"{side}: error of each kind, tuned at each point, {_where(summary)}.")
 
@@ -197,13 +192,13 @@ def _map(config: Config, summary: JsonObject, side: str) -> Drawn:
             dark = colour[j, k] @ (0.299, 0.587, 0.114) < 0.5
             ax.text(at[0][k], at[1][j], text, ha="center", va="center", fontsize=9, color="white" if dark else "black")
         ax.pcolormesh(*edges, colour, edgecolors="white", lw=0.8, rasterized=True)
-        ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+        fit_axes(ax, edges)
         ax.set_title(", ".join(f"{p} = {v:g} {numeric_paths(config)[p].unit}" if not isinstance(v, str) else f"{p} = {v}"
                                for p, v in zip(further, panel, strict=True)), fontsize=9)  # fmt: skip
         if i + columns >= len(panels):
-            ax.set_xlabel(_axis_label(config, x))
+            ax.set_xlabel(axis_label(config, x))
         if not i % columns:
-            ax.set_ylabel(_axis_label(config, y))
+            ax.set_ylabel(axis_label(config, y))
     for ax in axes[len(panels) :]:
         ax.set_visible(False)
     handles: list[Any] = [
@@ -228,7 +223,7 @@ def write_choice_report(choice: ObserverChoice, folder: Path) -> list[str]:
     summary = choice.summary
     if (gains := observer_toml(summary)) is not None:
         write_atomic(folder / "gains.toml", gains)
-    write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
+    write_json(folder / "tuning.json", summary, allow_nan=False)
     title, config = choice.config.title or "Observers", choice.config.to_toml()
     lead = choice_headline(summary)
     return write_report(
@@ -349,6 +344,6 @@ def _tables(config: Config, summary: JsonObject) -> list[PageTable]:
             tied = ", ".join(found["not_told_apart"])
             cells = ["–" if (one := found["kinds"][kind])["ratio"] is None else _ratio(one) for kind in kinds]
             rows.append([*(point["values"][path] for path in axes), best, tied, *cells])
-        columns = [*(_axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
+        columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
         tables.append(PageTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

@@ -16,7 +16,7 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -28,9 +28,8 @@ from .figures import Drawn, save
 from .picture import Picture, picture
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from jaxbl.diagnosis.diagnose import Diagnosis
+    from jaxbl.identification.element import ElementIdentification
     from jaxbl.identification.identify import Identification
 
 
@@ -68,13 +67,12 @@ def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
         return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
 
 
-_TITLES = {"identification": "Identification from", "diagnosis": "Diagnosis of"}
-
-
-def write_log_results(
-    found: "Identification | Diagnosis",
+def write_results(
+    found: "Identification | Diagnosis | ElementIdentification",
     folder: Path,
     name: str,
+    title: str,
+    model: str,
     lead: Sequence[str],
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
@@ -86,32 +84,12 @@ def write_log_results(
     The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
     for the terminal.
     """
-    title = found.config.title or f"{_TITLES[name]} {found.record.path.name}"
-    return write_results(
-        folder, name, title, found.summary, found.trace, _model_text(found), lead, drawn, tables, remarks, steps
-    )
-
-
-def write_results(
-    folder: Path,
-    name: str,
-    title: str,
-    summary: dict[str, Any],
-    trace: "pd.DataFrame",
-    model: str,
-    lead: Sequence[str],
-    drawn: Sequence[Drawn],
-    tables: Sequence[PageTable],
-    remarks: Sequence[str],
-    steps: Sequence[NextStep] = (),
-) -> list[str]:
-    """As :func:`write_log_results`, of anything that has a summary, a trace and a model in TOML."""
     with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
-        trace.to_parquet(draft / "trace.parquet", index=False)
+        found.trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
-        write_atomic(draft / f"{name}.json", json_with_checksum(summary))
+        write_atomic(draft / f"{name}.json", json_with_checksum(found.summary))
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)
@@ -120,7 +98,7 @@ def write_results(
     return lines
 
 
-def _model_text(found: "Identification | Diagnosis") -> str:
+def model_text(found: "Identification | Diagnosis") -> str:
     """The fitted study as TOML; for want of an excitation with the torque of `trace.parquet` beside it, at its period."""
     from jaxbl.identification.logs import run_of
 

@@ -12,6 +12,7 @@ from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, residua
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, SideResiduals, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
+from jaxbl.records.least_squares import rms
 
 from . import figures
 from .figures import COLOURS, FAINT, MISSING, SIDE_COLOURS, Drawn, legend, outline, stacked, style, subplots, with_unit
@@ -104,7 +105,7 @@ def _over_coordinates(
     figure, axes = subplots(3.2 * len(shown) + 0.6, 3.5, columns=len(shown), sharey=True)
     lows = [narrowed(part, found.bandwidth) for part in parts]
     torque = np.concatenate([low.torque for low, _ in lows])
-    noise = float(np.sqrt(np.mean(np.concatenate([low.deviation for low, _ in lows]) ** 2)))
+    noise = rms(np.concatenate([low.deviation for low, _ in lows]))
     every = max(len(torque) // _CLOUD, 1)
     best = max(shown, key=lambda one: one.explained)
     for ax, one in zip(axes, shown, strict=True):

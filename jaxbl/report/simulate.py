@@ -1,13 +1,12 @@
 """What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17, 28 and 29 of the paper."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from jaxbl.drive.parameters import parameters
-from jaxbl.files import write_atomic, write_table
+from jaxbl.drive.parameters import units_of
+from jaxbl.files import write_json, write_table
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
@@ -24,7 +23,7 @@ _POINTS = 6000
 def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
     # the summary first: it is what makes the folder this study's
-    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
+    write_json(folder / "summary.json", trial.summary)
     write_table(folder / "trace.parquet", trial.trace)
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
@@ -116,7 +115,7 @@ def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
 def _identified(trial: Trial, trace: pd.DataFrame, last: pd.DataFrame, sides: list[str]) -> Drawn:
     names = list(trial.summary["identified"])
     # what a law derives from its own parameters is an angle, as they are
-    units = {field.name: about.unit for field, about in parameters(trial.config.build().transmission)}
+    units = units_of(trial.config.build().transmission)
     figure, axes = stacked(len(names), 2.0, width=7.0)
     for ax, name in zip(axes, names, strict=True):
         true = trial.summary["identified"][name]["true"]

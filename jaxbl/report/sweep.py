@@ -3,7 +3,6 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product
@@ -13,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, numeric_paths
-from jaxbl.files import write_atomic
+from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.lines import NextStep
 from jaxbl.sweeps.metrics import SIDE_METRICS
@@ -41,7 +40,7 @@ def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextSt
     drawn = draw(result, laws)
     survey = _Survey(result)
     if laws:
-        write_atomic(folder / "laws.json", json.dumps([law.to_dict() for law in laws], indent=2, ensure_ascii=False))
+        write_json(folder / "laws.json", [law.to_dict() for law in laws])
     else:
         (folder / "laws.json").unlink(missing_ok=True)
     lead = [*_headline(result, survey), *_law_lines(laws)]

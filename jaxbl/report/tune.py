@@ -1,6 +1,5 @@
 """What `jaxbl tune` leaves to be read: the objective over the gains, error over convergence time, comparisons."""
 
-import json
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from jaxbl.files import write_atomic
+from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -24,7 +23,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from .certificate import certificate_lines, certificate_tables, draw_certificates, refuted, write_certificates
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .gain_plane import conditions_line, name_gains, name_ratio
-from .maps import cell_edges, color_norm, condition_curves, hatch_failures
+from .maps import cell_edges, color_norm, condition_curves, fit_axes, hatch_failures
 from .page import PageTable, write_report
 
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
@@ -67,7 +66,8 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     figure, (ax,) = subplots(7.2, 6.0, beside=True)
     ax.grid(False)
     ax.set_facecolor(MISSING)
-    ax.set(xscale="log", yscale="log", xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    ax.set(xscale="log", yscale="log")
+    fit_axes(ax, edges)
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
     handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible, "constraints not met")]
     lines = {name: _binding_line(ax, edges, tables, name, constraints[name]) for name in binding}
@@ -80,7 +80,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
         ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
         handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
     gains = summary["gains"][side]
-    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    fit_axes(ax, edges)
     for name, marker, row in _others(tuning, side):
         handles.append(mark(ax, (row["alpha"], row["lambda"]), marker, name, 8))
     handles.append(mark(ax, (gains["alpha"], gains["lambda"]), "*", "tuned", 15))
@@ -325,7 +325,7 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     lead = [*certified, *tune_headline(summary)] if refuted(summary) else [*tune_headline(summary), *certified]
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_certificates(summary, folder)
-    write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
+    write_json(folder / "tuning.json", summary, allow_nan=False)
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
