@@ -1,9 +1,8 @@
 """Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,7 +27,6 @@ from .options import (
 from .outcome import Outcome
 
 if TYPE_CHECKING:
-    from jaxbl.identification.logs import LogTask
     from jaxbl.monitoring.watch import Watch, WatchTask
     from jaxbl.records import LogTable
 
@@ -121,6 +119,7 @@ def identify(
         if next_experiment is not None:
             raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
+    from jaxbl.files import run_or_read
     from jaxbl.identification.identify import read_identification_task, run_identification
     from jaxbl.report.identify import identification_lines, write_identification_report
 
@@ -129,53 +128,25 @@ def identify(
         from jaxbl.diagnosis.next_experiment import check_gap_sought
 
         check_gap_sought(task)
-    work = _LogWork(
-        "identification.json", run_identification, write_identification_report, identification_lines, after_identification
-    )
+    folder = folder_of(log[0], out)
     log_call = LogCall(log, model, holdout, next_experiment)
-    return _work_on_log(context, work, task, log_call, folder_of(log[0], out), overwrite, max_torque, max_travel)
-
-
-class _LogWork(NamedTuple):
-    """What a command does with a log: the name of its summary, and its functions."""
-
-    summary: str
-    run: Callable[..., Any]
-    write: Callable[..., object]
-    list_lines: Callable[[JsonObject], list[str]]
-    propose: Callable[..., list[NextStep]]
-
-
-def _work_on_log(
-    context: typer.Context,
-    work: _LogWork,
-    task: "LogTask",
-    log_call: LogCall,
-    folder: Path,
-    overwrite: bool,
-    max_torque: float | None,
-    max_travel: float | None,
-) -> Outcome:
-    """Do what a command does with a log, and write the next experiment if that is asked for."""
-    from jaxbl.files import run_or_read
 
     def steps(summary: JsonObject) -> list[NextStep]:
-        return work.propose(task, summary, repeat_call(context, folder), folder, log_call)
+        return after_identification(task, summary, repeat_call(context, folder), folder, log_call)
 
-    with run_with_progress(context, log_call.model, folder, unit="steps", keeps_results=False) as progress:
+    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
-            folder / work.summary,
-            lambda task: work.run(task, progress),
-            lambda result, folder: work.write(result, folder, steps(result.summary)),
+            folder / "identification.json",
+            lambda task: run_identification(task, progress),
+            lambda result, folder: write_identification_report(result, folder, steps(result.summary)),
             overwrite=overwrite,
         )
-    lines = work.list_lines(summary)
-    if log_call.next_experiment is not None:
-        from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
+    lines = identification_lines(summary)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment
 
-        write = write_gap_experiment if "backlash" in summary else write_next_experiment
-        lines += write(folder, summary, task.record, log_call.next_experiment, max_torque, max_travel)
+        lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
     return Outcome(lines, folder, summary=summary, steps=steps(summary))
 
 
@@ -235,12 +206,31 @@ def diagnose(
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
+    from jaxbl.files import run_or_read
     from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
-    work = _LogWork("diagnosis.json", run_diagnosis, write_diagnosis_report, diagnosis_lines, after_diagnosis)
+    folder = folder_of(log[0], out)
     log_call = LogCall(log, model, holdout, next_experiment)
-    return _work_on_log(context, work, task, log_call, folder_of(log[0], out), overwrite, max_torque, max_travel)
+
+    def steps(summary: JsonObject) -> list[NextStep]:
+        return after_diagnosis(task, summary, repeat_call(context, folder), folder, log_call)
+
+    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
+        summary = run_or_read(
+            task,
+            folder / "diagnosis.json",
+            lambda task: run_diagnosis(task, progress),
+            lambda result, folder: write_diagnosis_report(result, folder, steps(result.summary)),
+            overwrite=overwrite,
+        )
+    lines = diagnosis_lines(summary)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
+
+        write = write_gap_experiment if "backlash" in summary else write_next_experiment
+        lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
+    return Outcome(lines, folder, summary=summary, steps=steps(summary))
 
 
 def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:
