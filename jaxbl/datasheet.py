@@ -178,6 +178,9 @@ _END = (
     Item("frequency", "lowest frequency of the test input", {"Hz": 1.0}, "0.5 Hz", "0.5 Hz"),
 )
 _ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "0 rad", is_above=False)
+_MOTOR_VISCOUS = Item(
+    "motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False
+)
 _NOISE = Item("encoder_noise", "rms noise of the motor's encoder", _ANGLE, "5 arcsec", "0 rad", is_above=False)
 _RATED = (
     Item("torque", "rated torque of the motor", _TORQUE, "1.3 N m"),
@@ -189,7 +192,7 @@ KINDS = {
         "a motor, a gear, and a load that turns",
         (
             Item("motor_inertia", "inertia of the rotor", _INERTIA, "0.48 kg cm²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
+            _MOTOR_VISCOUS,
             Item(
                 "motor_friction", "dry friction at the motor, with the gear's", _TORQUE, "15 mN m", "0 N m", is_above=False
             ),
@@ -209,7 +212,7 @@ KINDS = {
         "a motor, a ball screw (or a rack, a belt), and a carriage",
         (
             Item("motor_inertia", "inertia of rotor, coupling and screw", _INERTIA, "1.2 kg cm²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
+            _MOTOR_VISCOUS,
             Item("motor_friction", "dry friction at the motor, with the nut's", _TORQUE, "0.1 N m", "0 N m", is_above=False),
             *_RATED,
             Item("lead", "travel of the carriage for one turn of the motor", _LEAD, "10 mm", key="gear_ratio"),
@@ -228,7 +231,7 @@ KINDS = {
         "a motor that turns its load without a gear",
         (
             Item("motor_inertia", "inertia of rotor and load", _INERTIA, "0.05 kg m²"),
-            Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False),
+            _MOTOR_VISCOUS,
             Item("motor_friction", "dry friction, with what else disturbs", _TORQUE, "0.2 N m"),
             *_RATED,
             _ENCODER,

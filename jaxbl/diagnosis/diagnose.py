@@ -4,8 +4,8 @@ Where model and log disagree, which effect is missing, the model with it, and th
 the fit has seen.
 """
 
-import dataclasses
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -56,7 +56,7 @@ _HIDDEN = 0.3
 """Share of the input: where a torque of that size would not have been seen, noise hides everything."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Diagnosis:
     """What a log says that a model lacks.
 
@@ -282,7 +282,7 @@ class _Proved(NamedTuple):
             return self
         controls = proof.controls(self.search, fitted, after, self.found.wrong)
         # a complete model has the same numbers by both
-        found = dataclasses.replace(self.found, verdict="unknown_effect")
+        found = replace(self.found, verdict="unknown_effect")
         return _Proved(self.search, found, accepted._replace(fitted=fitted, after=after, by_torque=z), controls)
 
 
@@ -348,7 +348,7 @@ def _renamed(search: EffectSearch, found: Explanation, accepted: Accepted, name:
     renamed = search.adopted(found, numbers, accepted.fitted.theta[: len(search.free)], findings)
     # a rival stands beside the same effects
     if found.wrong is not None and name == found.model.names[-1] and found.wrong.names[-1] != plain:
-        return dataclasses.replace(renamed, wrong=found.wrong)
+        return replace(renamed, wrong=found.wrong)
     return renamed
 
 

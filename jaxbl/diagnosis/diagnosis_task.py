@@ -1,6 +1,6 @@
 """A diagnosis as a task: study, log, and what is held out of it; and which logs are refused."""
 
-import dataclasses
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ _ALIKE = 4.0
 """Factor between the inertias that two logs of one machine may show."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class DiagnosisTask(LogTask):
     """A study and its log, part of which may be held out.
 
@@ -65,7 +65,7 @@ def _long(record: Record) -> Record:
             f"{record.path}: its longest part has {max(part.stop - part.start for part in record.segments)} samples; "
             f"at least {_LEAST_SAMPLES} are needed"
         )
-    return dataclasses.replace(record, segments=parts)
+    return replace(record, segments=parts)
 
 
 def can_hold_out(record: Record) -> bool:
@@ -97,9 +97,7 @@ def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     cut = {name: None if (one := getattr(record, name)) is None else one[:row] for name in ("time", "torque", "transmitted")}
     positions = {side: values[:row] for side, values in record.positions.items()}
     # times count from the log's first sample in both: a disturbance may be periodic in time
-    return dataclasses.replace(record, **cut, positions=positions, segments=first), dataclasses.replace(
-        record, segments=last
-    )
+    return replace(record, **cut, positions=positions, segments=first), replace(record, segments=last)
 
 
 def _check_machine(record: Record, other: Record) -> None:

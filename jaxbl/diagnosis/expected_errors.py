@@ -7,8 +7,8 @@ since noise of accelerations hides what is slow.
 Reference: A. Gelman et al., Bayesian Data Analysis (2013), 6.3.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,10 +88,10 @@ def expected_errors(
     for _ in range(_DRAWS):
         model = _moved(fitted, root @ random.standard_normal(len(root)))
         segments = [_disturbed(one, noise, random) for one in log.segments]
-        drawn.append(apart(dataclasses.replace(log, segments=segments).compare(model)))
+        drawn.append(apart(replace(log, segments=segments).compare(model)))
     least = LEAST * driving
-    segments = [dataclasses.replace(one, torque=one.torque + least) for one in log.segments]
-    small = apart(dataclasses.replace(log, segments=segments).compare(fitted.experiment))
+    segments = [replace(one, torque=one.torque + least) for one in log.segments]
+    small = apart(replace(log, segments=segments).compare(fitted.experiment))
     for side in fitted.experiment.sides:
         ratio = float(fitted.experiment.drive.ratio(side))
         small[f"torque_{side}"] = (least * ratio) ** 2
@@ -129,7 +129,7 @@ def _moved(fitted: FittedModel, change: np.ndarray) -> Experiment:
 def _disturbed(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:
     """A segment with other noise of its input, smoothed as the input was."""
     torque = segment.torque + noise.possible * random.standard_normal(len(segment))
-    return dataclasses.replace(segment, torque=smoothed_input(torque, noise.unfelt) if noise.unfelt > 0.0 else torque)
+    return replace(segment, torque=smoothed_input(torque, noise.unfelt) if noise.unfelt > 0.0 else torque)
 
 
 def _quantile(squares: Sequence[float] | np.ndarray, chance: float) -> float:

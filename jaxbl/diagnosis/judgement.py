@@ -1,7 +1,7 @@
 """What a diagnosis may say: what the search found, as far as held-out data, controls and the model's own numbers allow."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +85,7 @@ def judged(
     little = bool(fitted.names) and is_little(share)
     verdict = "unknown_effect" if left or far or chance or powerless or little or contradicting else found.verdict
     remainder = found.verdict == "unknown_effect"
-    said = dataclasses.replace(found, verdict=verdict, findings=findings)
+    said = replace(found, verdict=verdict, findings=findings)
     return Judgement(said, left, far, chance, remainder, powerless, little, contradicting)
 
 
@@ -96,7 +96,7 @@ def _no_surer(finding: Finding, fitted: FittedModel, gain: float) -> Finding:
     paths = [f"effects.{finding.effect}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
     chance = min(float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0, float(ndtr(gain)))
-    return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
+    return finding if finding.confidence <= chance else replace(finding, confidence=chance)
 
 
 def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
@@ -106,7 +106,7 @@ def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
         return finding
     half = 0.5 * finding.confidence
     others = ((plain, half), *(one for one in finding.alternatives if one[0] != plain))
-    return dataclasses.replace(finding, confidence=half, alternatives=tuple(sorted(others, key=lambda pair: -pair[1])))
+    return replace(finding, confidence=half, alternatives=tuple(sorted(others, key=lambda pair: -pair[1])))
 
 
 def _nats(model: Model, wrong: Model, z: float) -> float:
@@ -141,7 +141,7 @@ def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | 
     chance = both / (1.0 + float(np.exp(nats)))
     alternatives = ((last.effect, both - chance), *(one for one in last.alternatives if one[0] != rival))
     now = Finding(rival, chance, found.wrong.numbers[rival], alternatives)
-    return dataclasses.replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
+    return replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
 
 
 def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
@@ -162,7 +162,7 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
     total = 1.0 - before + weight
     chances = {name: chance / total for name, chance in (chances | {rival: weight}).items()}
     others = sorted((name for name in chances if name != rival or weight > LEAST_CHANCE), key=lambda name: -chances[name])
-    return dataclasses.replace(
+    return replace(
         finding,
         confidence=finding.confidence / total,
         alternatives=tuple((name, float(chances[name])) for name in others),

@@ -6,9 +6,9 @@ of the means of blocks of time, if that is larger, so that a slow disturbance th
 finding. How much of the power a function of one coordinate explains is counted on blocks of time that it was not made from.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import jax
@@ -45,7 +45,7 @@ _PEAKS, _NARROW, _AROUND = 5, 10.0, 20
 """Peaks at most; power of one over the median of its neighbours; neighbours on each side."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Region:
     """A bin of a coordinate.
 
@@ -73,7 +73,7 @@ class Region:
     mean_z: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Coordinate:
     """A residual over one coordinate.
 
@@ -92,7 +92,7 @@ class Coordinate:
     explained: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Band:
     """Power in a band of frequencies.
 
@@ -108,7 +108,7 @@ class Band:
     excess_z: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class SpectralPeak:
     """A narrow peak of the spectrum.
 
@@ -127,7 +127,7 @@ class SpectralPeak:
     in_motion: bool
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Localised:
     """Where one side lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
 

@@ -4,8 +4,8 @@ Positions by short windows and by one free run, each from the best initial state
 error of the model. Torques by the equations of motion at the smoothed motion, behind one low-pass for all models.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -74,7 +74,7 @@ class Comparison(NamedTuple):
     gain: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ReferenceLog:
     """A log that models are compared with.
 
@@ -164,7 +164,7 @@ class ReferenceLog:
         torques = residual_torques(experiment, self.segments)
         for side, table in (added or {}).items():
             pieces = zip(torques[side], self._rows(), strict=True)
-            torques[side] = [dataclasses.replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
+            torques[side] = [replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
         samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
         return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain))
 
@@ -215,7 +215,7 @@ class ReferenceLog:
         experiment, longest = at_period(experiment, self.period), max(map(len, self.segments))
         spare = max(longest.bit_length() - 4, 0)
         length = longest >> spare << spare
-        one = dataclasses.replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
+        one = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
         errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN, {}))
         smoothed = one.segments[0].smoothed
         deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}

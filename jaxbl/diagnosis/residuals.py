@@ -8,8 +8,8 @@ Sign: the torque that is missing from the model, J a less all modelled torques; 
 :func:`jaxbl.identification.regression.balance`.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ _LARGEST = 2**18
 """Frequencies of a response at most, which bounds memory."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Residual:
     """Torque that a model lacks on a side, along a part of a record without gaps.
 
@@ -63,7 +63,7 @@ SideResiduals = dict[str, list[Residual]]
 """Residuals of each side, segment by segment."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class _Response:
     """A smoother away from the ends, over frequencies from 0 to half the sampling rate, in units of noise and period.
 
@@ -308,7 +308,7 @@ def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     impulse[size // 2] = 1.0
     passed = np.fft.irfft(spectrum * np.abs(np.fft.rfft(gaussian_filter1d(impulse, width))) ** 2)
     share = max(passed[0], np.finfo(float).tiny)
-    low = dataclasses.replace(
+    low = replace(
         residual,
         time=residual.time[at],
         torque=gaussian_filter1d(residual.torque, width)[at],

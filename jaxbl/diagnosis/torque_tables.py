@@ -6,8 +6,8 @@ model with them predicts better if they are kept: that is decided on held-out da
 Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996).
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -36,7 +36,7 @@ _LEAST = 5
 _TURN = 2.0 * np.pi
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Table:
     """Torque over one coordinate.
 
@@ -53,7 +53,7 @@ class Table:
     errors: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Tabulation:
     """A model with tables, which predicts held-out data better than without.
 
@@ -75,7 +75,7 @@ class Tabulation:
 
     def said(self) -> JsonObject:
         """As JSON."""
-        tables = {side: [dataclasses.asdict(one) for one in tables] for side, tables in self.tables.items()}
+        tables = {side: [asdict(one) for one in tables] for side, tables in self.tables.items()}
         return {"tables": tables, "z": self.z, "holdout_rmse": self.after.errors}
 
 
@@ -175,7 +175,7 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class _Fit:
     """Penalised least squares: values, their standard errors, and mean squared errors of each block left out."""
 

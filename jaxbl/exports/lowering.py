@@ -5,6 +5,7 @@ What depends on constants alone is computed here, each operation rounded once in
 twice, and what nothing reads, is left out. No other change is made that could alter a number.
 """
 
+import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -353,7 +354,9 @@ class _Lowering:
         dtype = np.dtype(dtype)
         if all(isinstance(value, Constant) for value in operands):
             with np.errstate(all="ignore"):
-                value = np.asarray(_EVALUATIONS[name](dtype, *(constant.value[()] for constant in operands)), dtype)  # type: ignore[union-attr]
+                numbers: list[Any] = [constant.value[()] for constant in operands]  # type: ignore[union-attr]
+                typed = _TYPED_EVALUATIONS.get(name)
+                value = np.asarray(typed(dtype, *numbers) if typed else _EVALUATIONS[name](*numbers), dtype)
             return Constant(value, paths=_find_paths(operands))
         if (simpler := self._simplify(name, dtype, operands)) is not None:
             return simpler
@@ -432,47 +435,33 @@ _READABLE_EQUATIONS = {*_INFIX, "neg", "abs", "sqrt", "square", "integer_pow", "
 """Equations with a formula that a reader understands."""
 
 
-def _evaluate_power_of_two(dtype: np.dtype, n: Any) -> Any:
-    return np.ldexp(dtype.type(1), int(n))
-
-
 def _evaluate_conversion(dtype: np.dtype, a: Any) -> Any:
     return np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a
 
 
 _EVALUATIONS: dict[str, Callable[..., Any]] = {
-    "add": lambda _, a, b: a + b,
-    "sub": lambda _, a, b: a - b,
-    "mul": lambda _, a, b: a * b,
-    "div": lambda _, a, b: a / b if a.dtype.kind == "f" else np.trunc(a / b),
-    "rem": lambda _, a, b: np.fmod(a, b),
-    "neg": lambda _, a: -a,
-    "abs": lambda _, a: np.abs(a),
-    "sqrt": lambda _, a: np.sqrt(a),
-    "floor": lambda _, a: np.floor(a),
-    "ceil": lambda _, a: np.ceil(a),
-    "round_even": lambda _, a: np.rint(a),
-    "round_away": lambda _, a: np.copysign(np.floor(np.abs(a)) + (np.abs(a) - np.floor(np.abs(a)) >= 0.5), a),
-    "max": lambda _, a, b: np.maximum(a, b),
-    "min": lambda _, a, b: np.minimum(a, b),
-    "lt": lambda _, a, b: a < b,
-    "le": lambda _, a, b: a <= b,
-    "gt": lambda _, a, b: a > b,
-    "ge": lambda _, a, b: a >= b,
-    "eq": lambda _, a, b: a == b,
-    "ne": lambda _, a, b: a != b,
-    "and": lambda _, a, b: a & b,
-    "or": lambda _, a, b: a | b,
-    "xor": lambda _, a, b: a ^ b,
-    "not": lambda _, a: ~a,
-    "shift_left": lambda _, a, b: a << b,
-    "shift_right_logical": lambda dtype, a, b: a.view(f"u{dtype.itemsize}") >> b.view(f"u{dtype.itemsize}"),
-    "select": lambda _, condition, yes, no: yes if condition else no,
-    "convert": _evaluate_conversion,
-    "bitcast": lambda dtype, a: np.asarray(a).view(dtype),
-    "power_of_two": _evaluate_power_of_two,
+    **{name: getattr(operator, name) for name in ("add", "sub", "mul", "neg", "lt", "le", "gt", "ge", "eq", "ne", "xor")},
+    **{name: getattr(np, name) for name in ("abs", "sqrt", "floor", "ceil")},
+    "div": lambda a, b: a / b if a.dtype.kind == "f" else np.trunc(a / b),
+    "rem": np.fmod,
+    "round_even": np.rint,
+    "round_away": lambda a: np.copysign(np.floor(np.abs(a)) + (np.abs(a) - np.floor(np.abs(a)) >= 0.5), a),
+    "max": np.maximum,
+    "min": np.minimum,
+    "and": operator.and_,
+    "or": operator.or_,
+    "not": operator.invert,
+    "shift_left": operator.lshift,
+    "select": lambda condition, yes, no: yes if condition else no,
 }
 """How an operation is computed for constants, by the name of the :class:`Operation`."""
+_TYPED_EVALUATIONS: dict[str, Callable[..., Any]] = {
+    "shift_right_logical": lambda dtype, a, b: a.view(f"u{dtype.itemsize}") >> b.view(f"u{dtype.itemsize}"),
+    "convert": _evaluate_conversion,
+    "bitcast": lambda dtype, a: np.asarray(a).view(dtype),
+    "power_of_two": lambda dtype, n: np.ldexp(dtype.type(1), int(n)),
+}
+"""The same for operations that depend on the type of their result, which comes first."""
 
 
 # rules: what a primitive becomes

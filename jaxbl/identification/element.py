@@ -1,9 +1,9 @@
 """A transmission alone on a test rig, from its log: what `jaxbl identify` does where `[log] kind` is `element`."""
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ _EFFECTS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ElementTask:
     """A log of a transmission on a test rig, and how it was read: everything that decides the result.
 
@@ -58,7 +58,7 @@ class ElementTask:
         return total.hexdigest()[:16]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ElementIdentification:
     """What a log says of a transmission on a test rig.
 

@@ -3,10 +3,10 @@
 # arrays of numpy go where those of jax are asked for
 # pyright: reportArgumentType=false
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from .segments import Segment
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class LogTask:
     """A study and its log, and what is asked of them: everything that decides the result.
 
@@ -112,7 +112,7 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
         if not isinstance(log, Record) and given != record.corrections:
             again = _read_one(_corrected(config, given), log, gear_tolerance)
             # the reader counts what [log] gives as no correction of its own
-            records[i] = dataclasses.replace(again, corrections=given)
+            records[i] = replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
     others = [_from_zero_of(first, one, config) for one in others]
     return join_records([first, *others] if like is None else others)
@@ -176,7 +176,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     positions = {
         side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
     }
-    return dataclasses.replace(record, positions=positions, warnings=(*record.warnings, warning))
+    return replace(record, positions=positions, warnings=(*record.warnings, warning))
 
 
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:
@@ -212,7 +212,7 @@ def _checked(config: Config, record: Record) -> Record:
                 "show only together with the motor's torque or current: log that, too"
             )
         first = "No load position (theta_s): load, gap and frictions are found from the motor's encoder and u alone."
-        record = dataclasses.replace(record, warnings=tuple(dict.fromkeys((*record.warnings, first))))
+        record = replace(record, warnings=tuple(dict.fromkeys((*record.warnings, first))))
     step = config.run.sample_period / config.run.substeps
     if record.sample_period > _MOST_STEPS * step:
         raise InputError(
@@ -231,7 +231,7 @@ def _checked(config: Config, record: Record) -> Record:
                 "[uncertainty] exact ('drive.motor_inertia'), or record u; jaxbl inspect says what the encoders show"
             )
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
-        record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
+        record = replace(record, torque=np.zeros(len(record.time)), notes=notes)
     return record
 
 
@@ -252,11 +252,11 @@ def on_record(config: Config, record: Record) -> Experiment:
     the input is the record's."""
     run = run_of(config, record)
     experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
-    return dataclasses.replace(
+    return replace(
         experiment,
         # along a log nothing asks for these; programs are compiled for one
         excitation=as_arrays(Sine(0.0, 1.0), float),
-        run=dataclasses.replace(
+        run=replace(
             experiment.run, sample_period=np.asarray(run["sample_period"], float), steps=1, substeps=run["substeps"]
         ),
     )

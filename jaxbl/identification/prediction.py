@@ -7,7 +7,7 @@ brings all noise of a reading into the next prediction, and noise in a predictio
 References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-R. Li, T. Kirubarajan (2001), 6.5.
 """
 
-import dataclasses
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -42,7 +42,7 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
 @jit
 def _sizes(experiment: Experiment, windows: Windows, gain: dict[str, Float[Array, " 2"]]) -> Float[Array, " sides"]:
     """Rms prediction error of each side in rad under a gain; several one by one take as long as at once."""
-    residual, _ = projected_residual(experiment, dataclasses.replace(windows, gain=gain))
+    residual, _ = projected_residual(experiment, replace(windows, gain=gain))
     return jnp.stack([windows.noise[side] for side in experiment.sides]) * jnp.sqrt(jnp.mean(residual**2, axis=(0, 1)))
 
 
@@ -51,7 +51,7 @@ def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[s
     period = float(experiment.run.sample_period)
     count = len(windows.time)
     # of an earlier choice
-    windows = dataclasses.replace(windows, gain=None)
+    windows = replace(windows, gain=None)
     few = windows.only(np.unique(np.linspace(0, count - 1, min(count, _MOST_WINDOWS)).astype(int)))
 
     def gains_of(smoothness: dict[str, float]) -> dict[str, Any]:
@@ -68,4 +68,4 @@ def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[s
         chosen = best([chosen | {side: float(chosen[side] * x)} for x in _FINE])
     gain = gains_of(chosen)
     size = _sizes(experiment, windows, gain)
-    return dataclasses.replace(windows, gain=gain, noise=dict(zip(experiment.sides, size, strict=True))), chosen
+    return replace(windows, gain=gain, noise=dict(zip(experiment.sides, size, strict=True))), chosen

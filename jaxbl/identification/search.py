@@ -1,8 +1,8 @@
 """From a record to numbers: several starts on short windows, the whole record from the best, and what it does not show."""
 
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +37,7 @@ def is_noise(residual: Mapping[str, float]) -> bool:
     return residual["rms"] < NOISE_ALONE * residual["noise"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Fitted:
     """A fit to all of a log.
 
@@ -65,7 +65,7 @@ class Fitted:
         return self.windows.torque.shape[1]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Found(Fitted):
     """The fit that was kept, of the numbers that the log shows.
 
@@ -210,4 +210,4 @@ def _between(best: Fitted, other: Fitted) -> Fitted:
         wide = width.covariance + jnp.asarray(np.outer(change, change))
         more = jnp.sqrt(jnp.diag(wide) / jnp.diag(width.covariance))
         width = width._replace(covariance=wide, inflation=width.inflation * more)
-    return dataclasses.replace(best, spread=width, between=change)
+    return replace(best, spread=width, between=change)

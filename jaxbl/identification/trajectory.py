@@ -8,8 +8,8 @@ References: G. Golub, V. Pereyra, Separable nonlinear least squares, Inverse Pro
 H. G. Bock, Recent advances in parameter identification techniques for ODE (1983).
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -79,7 +79,7 @@ class Windows(eqx.Module):
         """With windows of no weight at the end, so that compiled programs serve records of several lengths."""
         own = len(self.time)
         which = np.minimum(np.arange(count), own - 1)
-        return dataclasses.replace(self.only(which), weight=(np.arange(count) < own).astype(float))
+        return replace(self.only(which), weight=(np.arange(count) < own).astype(float))
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
@@ -115,7 +115,7 @@ class Fit(eqx.Module):
     def only(self, which: np.ndarray) -> "Fit":
         """Some of the numbers; the others were held."""
         theta, jacobian = (jnp.asarray(np.asarray(x)[..., which]) for x in (self.theta, self.jacobian))
-        return dataclasses.replace(self, theta=theta, jacobian=jacobian)
+        return replace(self, theta=theta, jacobian=jacobian)
 
 
 @eqx.filter_jit
@@ -380,7 +380,7 @@ def fit(
 
     def reduced(theta: Array, guess: PlantState) -> _Point:
         at = jnp.where(moving > 0.0, theta, given)
-        return _reduced(experiment, free, dataclasses.replace(windows, start=guess), at, moving)
+        return _reduced(experiment, free, replace(windows, start=guess), at, moving)
 
     count = windows.torque.size * len(windows.measured)
 

@@ -12,8 +12,8 @@ References: L. Ljung, System Identification (1999), 7.2; M. Nordin, P.-O. Gutman
 backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap).
 """
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -194,7 +194,7 @@ class UnseenLoad:
         # numbers may grow on the way
         fastest = np.sqrt(2.0 * float(plant.transmission.stiffness) * inverse)
         steps = int(np.clip(np.ceil(self.period * fastest / _RESOLVED), 1, self.experiment.run.substeps))
-        run = dataclasses.replace(self.experiment.run, substeps=steps)
+        run = replace(self.experiment.run, substeps=steps)
         experiment = eqx.tree_at(lambda e: e.run, self.experiment, run)
         return UnseenLoad(experiment, self.free, self.width, self.segments, self.rest)
 
@@ -408,10 +408,7 @@ class UnseenLoad:
         found = []
         for seed in range(_DRAWS):
             random = np.random.default_rng(seed)
-            segments = [
-                dataclasses.replace(one, torque=one.torque + noise * random.standard_normal(len(one)))
-                for one in self.segments
-            ]
+            segments = [replace(one, torque=one.torque + noise * random.standard_normal(len(one))) for one in self.segments]
             model = UnseenLoad(self.experiment, self.free, self.width, segments, self.rest)
             found.append(model.solve(model.at(point.theta, point.start, point.smoothness), _FEW, held))
         return found
@@ -514,9 +511,7 @@ class Gap(NamedTuple):
 
 def _stepped(experiment: Experiment, factor: int) -> Experiment:
     """With so many times the plant steps."""
-    return eqx.tree_at(
-        lambda e: e.run, experiment, dataclasses.replace(experiment.run, substeps=factor * experiment.run.substeps)
-    )
+    return eqx.tree_at(lambda e: e.run, experiment, replace(experiment.run, substeps=factor * experiment.run.substeps))
 
 
 def is_gap(one: FreeParameter) -> bool:

@@ -2,11 +2,11 @@
 when the gap has grown beyond a stated size.
 """
 
-import dataclasses
 import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -55,7 +55,7 @@ Values = JsonObject
 """What is known at a time; keys are the columns of `watch.csv`."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class WatchTask:
     """A study, and the log or stream that is watched.
 
@@ -80,7 +80,7 @@ class WatchTask:
     units: dict[str, dict[str, str]]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Watch:
     """The result of a watch.
 
