@@ -30,6 +30,8 @@ UNROLL_SUBSTEPS = False
 
 NamedArrays = dict[str, np.ndarray]
 """Arrays by the name of a side, a metric or a number."""
+TracedArrays = dict[str, Array]
+"""The same inside a traced function."""
 Number = Any  # a number of one lane: Float[Array, ""] inside a step
 
 
@@ -296,14 +298,14 @@ class Reducer(NamedTuple):
 
     init: Callable[[Experiment], Any]
     update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
-    result: Callable[[Experiment, Any, State], dict[str, Array]]
+    result: Callable[[Experiment, Any, State], TracedArrays]
     done: Callable[[Experiment, Any, State], Array] | None = None
 
 
 Reducers = tuple[Reducer, ...]
 
 
-def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
+def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> TracedArrays:
     """Draw standard normal noise for each side, shape (samples,), which depends on seed and sample index alone.
 
     Runs with the same seed have common random numbers. The draws are float32 in all runs, so that both precisions see the
@@ -359,10 +361,10 @@ def end_block(experiment: Experiment, carry: Carry) -> Carry:
     return eqx.tree_at(lambda state: state.identifier, state, identifier), totals
 
 
-def compute_metrics(experiment: Experiment, reducers: Reducers, carry: Carry) -> dict[str, Array]:
+def compute_metrics(experiment: Experiment, reducers: Reducers, carry: Carry) -> TracedArrays:
     """Compute the metrics of all reducers from the last carry, by name."""
     state, totals = carry
-    metrics: dict[str, Array] = {}
+    metrics: TracedArrays = {}
     for reducer, total in zip(reducers, totals, strict=True):
         metrics |= reducer.result(experiment, total, state)
     return metrics
@@ -383,7 +385,7 @@ def scan(
     reducers: Reducers = (),
     record: Callable[[State, Signals], Any] | None = None,
     stride: int = 1,
-) -> tuple[dict[str, Array], Any]:
+) -> tuple[TracedArrays, Any]:
     """Simulate one experiment.
 
     Args:
@@ -400,7 +402,7 @@ def scan(
         >>> _, velocity = scan(experiment, 0, record=lambda state, signals: signals.motor.velocity_estimate)
     """
 
-    def draw_noise(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
+    def draw_noise(indices: Int[Array, " samples"]) -> tuple[TracedArrays, ...]:
         return (unit_noise(seed, indices, experiment.sides),)
 
     return _scan(experiment, initial_carry(experiment, reducers), experiment.run.steps, draw_noise, reducers, record, stride)
@@ -415,7 +417,7 @@ def replay(
     stride: int = 1,
     state: State | None = None,
     added_accelerations: dict[str, Float[Array, " samples"]] | None = None,
-) -> tuple[dict[str, Array], Any]:
+) -> tuple[TracedArrays, Any]:
     """Run observers, filter and identifier on a record, which takes the place of the plant.
 
     Args:
@@ -450,7 +452,7 @@ def _scan(
     reducers: Reducers,
     record: Callable[[State, Signals], Any] | None,
     stride: int,
-) -> tuple[dict[str, Array], Any]:
+) -> tuple[TracedArrays, Any]:
     """Loop over time, block by block; `sample_inputs(indices)` returns the inputs of :func:`advance_sample` for a block."""
 
     def run_sample(carry: Carry, inputs: tuple[Array, tuple[Any, ...]]) -> tuple[Carry, Any]:
@@ -473,7 +475,7 @@ def _scan(
     return compute_metrics(experiment, reducers, carry), trace
 
 
-def correct_by_readings(state: PlantState, readings: dict[str, Array], gain: dict[str, Any]) -> PlantState:
+def correct_by_readings(state: PlantState, readings: TracedArrays, gain: dict[str, Any]) -> PlantState:
     """Correct positions and velocities by `gain` (1, and 1/s) times the prediction error of each side's reading (rad)."""
     errors = {side: readings[side] - state.position[side] for side in gain}
     return PlantState(
@@ -507,7 +509,7 @@ def plant_trajectory(
     """
     plant, run = experiment.plant, experiment.run
 
-    def predict_sample(state: PlantState, inputs: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
+    def predict_sample(state: PlantState, inputs: tuple[Array, Array, TracedArrays]) -> tuple[PlantState, PlantState]:
         index, torque, readings = inputs
         t = time + index.astype(torque.dtype) * run.sample_period
         return move_plant(plant, run, correct_by_readings(state, readings, gain or {}), torque, t), state

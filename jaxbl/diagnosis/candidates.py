@@ -22,6 +22,9 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Path, Samples, SideSamples, effect_path, remembers_input
 from jaxbl.simulate import Experiment, with_effects
 
+EffectNumbers = Mapping[str, Numbers]
+"""Numbers of effects, by the name of each."""
+
 
 class Part(eqx.Module):
     """A part of a record without gaps, and the model along it.

@@ -12,13 +12,14 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config, with_values
-from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
+from .candidates import EffectNumbers
 from .diagnosis_task import input_rms
 from .effect_search import Explanation, Finding, Model
 from .expected_errors import LEVEL, Expected
@@ -96,9 +97,7 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObje
     }
 
 
-def _finding(
-    record: Record, one: Finding, values: Mapping[str, float], errors: Mapping[str, float], where: JsonObject
-) -> JsonObject:
+def _finding(record: Record, one: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
     units = units_of(EFFECTS[one.effect])
     numbers = {
         leaf: {
@@ -196,8 +195,8 @@ def observers_say(
 
 def extended_study(
     config: Config,
-    numbers: Mapping[str, Mapping[str, float]],
-    values: Mapping[str, float],
+    numbers: EffectNumbers,
+    values: Numbers,
     tables: Sequence[JsonObject] = (),
 ) -> Config:
     """The study with effects more, some of them tables of torques, and with these numbers."""

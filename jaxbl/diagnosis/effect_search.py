@@ -21,7 +21,7 @@ from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
-from .candidates import SHARE, Candidate, Numbers, variants_of
+from .candidates import SHARE, Candidate, EffectNumbers, Numbers, variants_of
 from .evidence import Evidence, evidence_of
 from .free_functions import functions_of
 from .linearised_model import DIVERGED, Linear, Predictor
@@ -134,7 +134,7 @@ class Explanation:
     nominal: Model
     wrong: Model | None
     rest: dict[str, tuple[float, float]]
-    general: Mapping[str, Numbers] = dataclasses.field(default_factory=dict)
+    general: EffectNumbers = dataclasses.field(default_factory=dict)
 
 
 class _Scored(NamedTuple):
@@ -214,7 +214,7 @@ class EffectSearch:
         self._models: dict[tuple, Model] = {}
         self._refitted: tuple[tuple, Refined] | None = None
 
-    def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Refined:
+    def refitted(self, values: EffectNumbers, theta: np.ndarray) -> Refined:
         """The model with some effects, with the numbers of least prediction errors (:mod:`.refit`), its own first."""
         key = _key(values, theta)
         if self._refitted is None or self._refitted[0] != key:
@@ -235,7 +235,7 @@ class EffectSearch:
         """Size of the input, N m."""
         return float(np.std(np.concatenate([one.torque for one in self.segments])))
 
-    def linear(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Linear:
+    def linear(self, values: EffectNumbers, theta: np.ndarray) -> Linear:
         """The model with some effects along the record."""
         key = _key(values, theta)
         if key not in self._recent:
@@ -249,7 +249,7 @@ class EffectSearch:
             self._recent[key] = Linear(experiment, (*self.free, *added), at, prior, self.segments, bound)
         return self._recent[key]
 
-    def refit(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:
+    def refit(self, values: EffectNumbers, theta: np.ndarray, predictor: Predictor) -> Model:
         """Put effects into the model and refit everything."""
         key = _key(values, theta), tuple(predictor.smoothness), predictor.deviation.tobytes()
         if key not in self._models:
@@ -258,7 +258,7 @@ class EffectSearch:
             self._models[key] = self._fitted(values, theta, predictor)
         return self._models[key]
 
-    def _fitted(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:
+    def _fitted(self, values: EffectNumbers, theta: np.ndarray, predictor: Predictor) -> Model:
         values = {name: dict(numbers) for name, numbers in values.items()}
         best: _Point | None = None
         change = np.zeros(0)
@@ -382,7 +382,7 @@ class EffectSearch:
         return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest, found.general)
 
     def adopted(
-        self, found: Explanation, numbers: Mapping[str, Numbers], theta: np.ndarray, findings: Sequence[Finding]
+        self, found: Explanation, numbers: EffectNumbers, theta: np.ndarray, findings: Sequence[Finding]
     ) -> Explanation:
         """An explanation with other effects and numbers; free functions are fitted anew to what remains."""
         values = {name: dict(one) for name, one in numbers.items()}
@@ -417,7 +417,7 @@ class EffectSearch:
             model = self._needless(name, model.numbers, model.theta, model.linear.predictor(smoothness)) or model
         return model
 
-    def _needless(self, name: str, numbers: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model | None:
+    def _needless(self, name: str, numbers: EffectNumbers, theta: np.ndarray, predictor: Predictor) -> Model | None:
         """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and
         these do not become something else to stand for it: friction over a long way is a spring."""
         full = self.refit(numbers, theta, predictor)
@@ -658,7 +658,7 @@ def _most(rest: Mapping[str, tuple[float, float]]) -> float:
     return max((gain for gain, share in rest.values() if share > LEAST), default=0.0)
 
 
-def _key(values: Mapping[str, Numbers], theta: np.ndarray) -> tuple:
+def _key(values: EffectNumbers, theta: np.ndarray) -> tuple:
     return (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
 
 
@@ -690,7 +690,7 @@ def _owner(one: FreeParameter) -> tuple[str, str]:
     return name, leaf
 
 
-def with_numbers(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
+def with_numbers(experiment: Experiment, values: EffectNumbers) -> Experiment:
     """A model with all effects (:func:`.neutral_effects.complete`), some of them with these numbers."""
     return set_leaves(
         complete(experiment, values),

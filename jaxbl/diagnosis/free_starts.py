@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
 from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.simulate import Experiment, NamedArrays
@@ -42,20 +43,20 @@ class _Model(NamedTuple):
     windows: Windows
     varying: NamedArrays
 
-    def states(self, starts: np.ndarray, which: np.ndarray) -> list[np.ndarray]:
+    def states(self, starts: np.ndarray, which: np.ndarray) -> Arrays:
         """Along some windows, from starts of shape (windows, states)."""
         start = jax.tree.structure(self.windows.start).unflatten(list(starts.T))
         torque, time = self.windows.torque[which], self.windows.time[which]
         varying = {path: values[which] for path, values in self.varying.items()}
         return jax.tree.leaves(simulate_plants(self.experiment, start, torque, time, varying=varying))  # type: ignore[arg-type]
 
-    def residual(self, states: list[np.ndarray], which: np.ndarray) -> np.ndarray:
+    def residual(self, states: Arrays, which: np.ndarray) -> np.ndarray:
         w = self.windows
         found = jax.tree.structure(w.start).unflatten(states)
         sides = [(w.measured[side][which] - found.position[side]) / w.noise[side] for side in self.experiment.sides]
         return np.stack(sides, axis=-1)
 
-    def slope(self, states: list[np.ndarray], which: np.ndarray) -> np.ndarray:
+    def slope(self, states: Arrays, which: np.ndarray) -> np.ndarray:
         """Derivative of the residual by the initial states, shape (windows, samples, sides, states)."""
         w, shape = self.windows, jax.tree.structure(self.windows.start)
         count, (runs, samples) = len(states), states[0].shape

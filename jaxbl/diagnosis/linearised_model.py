@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused import Leaves
+from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
@@ -138,7 +138,7 @@ class _Columns:
         self.width = 1 + self.own.shape[2] + forces.width + self.states
         self.recursion = LinearPredictor.of(self.states, self.readings.shape[1], self.width)
 
-    def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, list[np.ndarray]]]:
+    def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, Arrays]]:
         """Rows of some samples after the others, and the prediction errors there under each gain, rad, shape
         (sides, samples, columns)."""
         begun = np.zeros((self.states, self.width))
@@ -238,7 +238,7 @@ class Predictor:
         coefficients: of all columns, part by part; 1 first.
     """
 
-    def __init__(self, linear: "Linear", smoothness: list[float], grams: list[np.ndarray]):
+    def __init__(self, linear: "Linear", smoothness: list[float], grams: Arrays):
         self.smoothness, self.count = smoothness, linear.count
         own_states = linear.states - 2 * len(linear.sides)
         self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
@@ -407,7 +407,7 @@ class Linear:
         (found,) = self._predictors([list(smoothness)], [forces_of((), one) for one in self.signals])
         return found
 
-    def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+    def errors(self, smoothness: Sequence[float]) -> Arrays:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
         none = [forces_of((), one) for one in self.signals]
@@ -483,7 +483,7 @@ class Linear:
                 break
         return found
 
-    def left(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+    def left(self, smoothness: Sequence[float]) -> Arrays:
         """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
         (samples, sides)."""
         errors, predictor = self.errors(smoothness), self.predictor(smoothness)

@@ -14,7 +14,7 @@ import pandas as pd
 from scipy.special import expit
 
 from jaxbl.config import Config
-from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.errors import InputError
 from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
@@ -163,13 +163,13 @@ def _own(search: _Search) -> list[FreeParameter]:
     return [one for i, one in enumerate(search.model.free) if i not in search.effects.values()]
 
 
-def _numbers(alone: Alone, name: str) -> dict[str, float]:
+def _numbers(alone: Alone, name: str) -> Numbers:
     """Numbers of an effect, by name."""
     start = f"effects.{name}."
     return {path.removeprefix(start): value for path, value in alone.values.items() if path.startswith(start)}
 
 
-def _needed(search: _Search, point: Point, out: list[str]) -> tuple[Point, dict[str, float]]:
+def _needed(search: _Search, point: Point, out: list[str]) -> tuple[Point, Numbers]:
     """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains."""
     while True:
         tried = {}

@@ -23,7 +23,7 @@ from jaxbl.identification.segments import Segment
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards, parzen_window
-from jaxbl.simulate import Experiment, Signals, State, initial_observer_state, initial_state, replay
+from jaxbl.simulate import Experiment, Signals, State, TracedArrays, initial_observer_state, initial_state, replay
 
 from .neutral_effects import complete
 from .residuals import Residual, beyond_nominal, narrowed
@@ -105,14 +105,14 @@ def _held(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
 
 @jit
 def _controls(
-    experiment: Experiment, torque: Array, readings: dict[str, Array], known: dict[str, Array], part: Kinematics
+    experiment: Experiment, torque: Array, readings: TracedArrays, known: TracedArrays, part: Kinematics
 ) -> dict[str, Float[Array, "runs samples"]]:
     """Filtered equivalent control of each side, rad/s^2, for several readings of one motion."""
 
     def keep(state: State, signals: Signals) -> dict[str, Any]:
         return {side: signals.side(side).equivalent_control for side in experiment.sides}
 
-    def one(measured: dict[str, Array]) -> dict[str, Array]:
+    def one(measured: TracedArrays) -> TracedArrays:
         begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
         motion = {side: (part.position[side][0], part.velocity[side][0]) for side in experiment.sides}
         at = {side: initial_observer_state(experiment, side, *found) for side, found in motion.items()}

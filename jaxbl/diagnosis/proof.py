@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf, leaf_paths, units_of
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
+from .candidates import EffectNumbers
 from .diagnosis_task import input_rms
 from .effect_search import FAR, FLOOR, EffectSearch, Explanation, Model
 from .linearised_model import Linear
@@ -60,12 +61,12 @@ class FittedModel(NamedTuple):
         return self.linear.share(name)
 
     @property
-    def numbers(self) -> dict[str, dict[str, float]]:
+    def numbers(self) -> dict[str, Numbers]:
         """All numbers of the effects, those that were not free among them."""
         effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
         return {name: {leaf: float(get_leaf(one, leaf)) for leaf in leaf_paths(one)} for name, one in effects.items()}
 
-    def errors(self) -> dict[str, float]:
+    def errors(self) -> Numbers:
         """Standard errors of the values."""
         deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {one.path: float(one.slope(self.theta[i])) * deviation[i] for i, one in enumerate(self.free)}
@@ -97,12 +98,12 @@ def _least_gain(name: str) -> float:
     return SURE if EFFECTS[name].in_time else SEEN
 
 
-def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> dict[str, float]:
+def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> Numbers:
     """Values of free numbers, by path; theta may have others behind them."""
     return {one.path: float(one.value(theta[i])) for i, one in enumerate(free)}
 
 
-def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
+def fit_model(search: EffectSearch, numbers: EffectNumbers, theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
     found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
     return FittedModel(
@@ -144,7 +145,7 @@ class Accepted(NamedTuple):
     fitted: FittedModel
     after: Comparison
     withdrawn: list[str]
-    gains: dict[str, float]
+    gains: Numbers
     by_torque: float = 0.0
 
 

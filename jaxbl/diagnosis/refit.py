@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.identification.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.identification.intervals import spread_of
@@ -50,7 +51,7 @@ class Refined(NamedTuple):
     covariance: np.ndarray
     white: np.ndarray
     smoothness: list[float]
-    start: list[np.ndarray]
+    start: Arrays
     linear: Linear
 
     @property
@@ -63,7 +64,7 @@ class _Point(NamedTuple):
     """Numbers and initial states tried: the model there, and minus twice the log-likelihood."""
 
     theta: np.ndarray
-    start: list[np.ndarray]
+    start: Arrays
     linear: Linear
     predictor: Predictor
     cost: float
@@ -77,13 +78,13 @@ class _Refiner:
     ):
         self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
 
-    def start(self) -> list[np.ndarray]:
+    def start(self) -> Arrays:
         """Positions and velocities at the first sample of each segment, as they were smoothed."""
         sides = self.experiment.sides
         first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
         return [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
 
-    def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> _Point:
+    def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
         """Prediction errors along the path of the predictor."""
         path = self._path(theta, start, smoothness)
         linear = Linear(self.experiment, self.free, theta, self.width, path)
@@ -91,7 +92,7 @@ class _Refiner:
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
 
-    def _path(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> list[Segment]:
+    def _path(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> list[Segment]:
         """The segments with the filtered motion of a model in place of the smoothed one."""
         sides = self.experiment.sides
         experiment = set_free_parameters(self.experiment, self.free, theta)

@@ -14,11 +14,13 @@ from functools import cache
 from typing import Any
 
 import jax
+import numpy as np
 
 SCAN_MESSAGE = "The fused loop does not support %s; the slower scan is used."
 """Message for the user; takes what is not supported."""
 
 
+Arrays = list[np.ndarray]
 Leaves = list[Any]
 """Leaves of a tree: numbers or arrays, traced or not."""
 

@@ -24,7 +24,7 @@ from jaxbl.simulate import (
     initial_carry,
 )
 
-from . import Leaves
+from . import Arrays, Leaves
 from .dependence import Dependence, LoopHooks, find_carry_dependences, split_by_lane
 from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
 from .noise import host_device
@@ -55,8 +55,8 @@ class SharedInputs(NamedTuple):
     length: int
     sample_inputs: AddressedArrays
     block_inputs: AddressedArrays
-    final_inputs: list[np.ndarray] | None
-    shared_metrics: list[np.ndarray]
+    final_inputs: Arrays | None
+    shared_metrics: Arrays
 
     @property
     def nbytes(self) -> int:
@@ -165,7 +165,7 @@ class LaneSimulator(abc.ABC):
         if room >= 0:
             self._cached_inputs[seed] = computed
 
-    def pad_lanes(self, values: NamedArrays) -> list[np.ndarray]:
+    def pad_lanes(self, values: NamedArrays) -> Arrays:
         """Return the values of the lanes, `(padded lanes,)` for each path in order, padded by repeating the last lane."""
         columns = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
         for path, column in zip(self._paths, columns, strict=True):
@@ -189,9 +189,7 @@ class LaneSimulator(abc.ABC):
             yield SharedInputs(length, sample_inputs, block_inputs, final_inputs, shared_metrics)
 
     @abc.abstractmethod
-    def _simulate(
-        self, values: list[np.ndarray], spans: Iterator[SharedInputs]
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _simulate(self, values: Arrays, spans: Iterator[SharedInputs]) -> tuple[Arrays, Arrays]:
         """Simulate the lanes over all spans; return metrics of lanes `(padded lanes,)` and metrics that they share `()`."""
 
 
@@ -281,9 +279,9 @@ class _ThreadLanes:
         self._lanes = np.arange(values.shape[1])
         self._values_and_carry = np.empty((len(values) + carry_count, values.shape[1]), values.dtype)
         self._values_and_carry[: len(values)] = values
-        self._prepared: tuple[list[np.ndarray], list[np.ndarray], LoopArrays] | None = None
+        self._prepared: tuple[Arrays, Arrays, LoopArrays] | None = None
         self._done: list[tuple[np.ndarray, np.ndarray]] = []
-        self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
+        self._results: list[tuple[np.ndarray, Arrays]] = []
 
     def simulate_span(self, inputs: SharedInputs) -> None:
         """Simulate the lanes over a span; a call of the loop takes several blocks if the lanes are few."""
@@ -311,7 +309,7 @@ class _ThreadLanes:
             self._loop(arrays, 0, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
             self._results.append((self._lanes, results))
 
-    def prepare_arrays(self, inputs: SharedInputs) -> tuple[list[np.ndarray], list[np.ndarray], LoopArrays]:
+    def prepare_arrays(self, inputs: SharedInputs) -> tuple[Arrays, Arrays, LoopArrays]:
         """Make the arrays of the loop for a span.
 
         Returns:
@@ -331,7 +329,7 @@ class _ThreadLanes:
         return self._prepared
 
     @property
-    def results(self) -> list[np.ndarray]:
+    def results(self) -> Arrays:
         """Results of all lanes, an array `(metrics, lanes)` for each type of number."""
         if not self._done:
             return self._results[0][1]
@@ -398,7 +396,7 @@ class DeviceSimulator(LaneSimulator):
         return [np.asarray(metric) for metric in metrics], all_spans[-1].shared_metrics
 
     @staticmethod
-    def join_spans(spans: Iterable[SharedInputs]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    def join_spans(spans: Iterable[SharedInputs]) -> tuple[Arrays, Arrays, Arrays]:
         """Join the shared inputs of all spans: arrays for samples and for blocks, and the inputs of the metrics."""
         all_spans = list(spans)
         samples = zip(*(inputs.sample_inputs.arrays for inputs in all_spans), strict=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbl.workers import map_in_threads
 
-from . import Leaves, program_cache
+from . import Arrays, Leaves, program_cache
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 _NEGLIGIBLE = 1e-60
@@ -45,7 +45,7 @@ class LinearPredictor:
         transition: np.ndarray,
         forcing: np.ndarray,
         readings: np.ndarray,
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    ) -> tuple[Arrays, Arrays]:
         """Take columns along some samples, once for each gain.
 
         Args:

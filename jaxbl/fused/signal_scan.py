@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import Leaves, program_cache
+from . import Arrays, Leaves, program_cache
 
 SampleFunction = Callable[[Leaves, Leaves, Leaves], tuple[Leaves, Leaves]]
 """From values, carry and a sample's inputs to the next carry and the sample's outputs."""
@@ -17,7 +17,7 @@ _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
 def scan_signal(
     sample: SampleFunction, values: Sequence[np.ndarray], carry: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
+) -> Arrays:
     """Scan a function along a signal for several lanes; by XLA where it cannot be compiled otherwise.
 
     Args:

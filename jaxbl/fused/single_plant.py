@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, NamedArrays, correct_by_readings, move_plant
+from jaxbl.simulate import Experiment, NamedArrays, TracedArrays, correct_by_readings, move_plant
 from jaxbl.workers import map_in_threads
 
 from . import Leaves, Unsupported, program_cache
@@ -226,8 +226,8 @@ def _simulate_by_xla(
     start: PlantState,
     torque: jax.Array,
     time: jax.Array,
-    measured: dict[str, jax.Array],
-    varying: dict[str, jax.Array],
+    measured: TracedArrays,
+    varying: TracedArrays,
 ) -> PlantState:
     def sample(state: PlantState, sample_inputs: Any) -> tuple[PlantState, PlantState]:
         index, torque, readings, numbers = sample_inputs
@@ -246,7 +246,7 @@ def _derivatives_by_xla(
     states: PlantState,
     torque: jax.Array,
     time: jax.Array,
-    varying: dict[str, jax.Array],
+    varying: TracedArrays,
     tangent: tuple[Experiment, PlantState, jax.Array],
 ) -> tuple[PlantState, PlantState]:
     def differentiate(state: PlantState, torque: jax.Array, time: jax.Array, numbers: Any) -> tuple[PlantState, PlantState]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment, NamedArrays, Signals, State, replay
+from jaxbl.simulate import Experiment, NamedArrays, Signals, State, TracedArrays, replay
 
 from .compilation import jit
 from .regression import model_torques
@@ -56,7 +56,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
 
 
 @jit
-def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def _replayed(experiment: Experiment, torque: jax.Array, measured: TracedArrays) -> TracedArrays:
     def keep(state: State, signals: Signals) -> JsonObject:
         row: JsonObject = {}
         if signals.twist is not None:

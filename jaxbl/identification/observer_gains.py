@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import Experiment, Signals, State, replay
+from jaxbl.simulate import Experiment, Signals, State, TracedArrays, replay
 
 from .compilation import jit
 from .regression import Kinematics
@@ -51,15 +51,13 @@ class ChosenGains(NamedTuple):
 
 
 @jit
-def _misses(
-    experiment: Experiment, kinematics: Kinematics, tried: dict[str, Array], readings: dict[str, Array]
-) -> dict[str, Array]:
+def _misses(experiment: Experiment, kinematics: Kinematics, tried: TracedArrays, readings: TracedArrays) -> TracedArrays:
     """Rms difference of each observer's velocity to the smoothed one, for several gains."""
 
     def velocity(state: State, signals: Signals) -> dict[str, Any]:
         return {side: signals.side(side).velocity_estimate for side in experiment.sides}
 
-    def one(values: dict[str, Array]) -> dict[str, Array]:
+    def one(values: TracedArrays) -> TracedArrays:
         _, found = replay(set_leaves(experiment, values), kinematics.torque, readings, record=velocity)
         settled = slice(len(kinematics.time) // 4, None)
         return {

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import solve_discrete_are
 
+from jaxbl.drive.effects import Numbers
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
@@ -46,7 +47,7 @@ def _sizes(experiment: Experiment, windows: Windows, gain: dict[str, Float[Array
     return jnp.stack([windows.noise[side] for side in experiment.sides]) * jnp.sqrt(jnp.mean(residual**2, axis=(0, 1)))
 
 
-def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[str, float]]:
+def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, Numbers]:
     """The windows with the gain whose prediction errors are least, and their size as noise; each side's q h^3 / sigma^2."""
     period = float(experiment.run.sample_period)
     count = len(windows.time)
@@ -54,10 +55,10 @@ def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[s
     windows = replace(windows, gain=None)
     few = windows.only(np.unique(np.linspace(0, count - 1, min(count, _MOST_WINDOWS)).astype(int)))
 
-    def gains_of(smoothness: dict[str, float]) -> dict[str, Any]:
+    def gains_of(smoothness: Numbers) -> dict[str, Any]:
         return {side: kalman_gain(value, period) for side, value in smoothness.items()}
 
-    def best(candidates: list[dict[str, float]]) -> dict[str, float]:
+    def best(candidates: list[Numbers]) -> Numbers:
         sizes = np.array([_sizes(experiment, few, gains_of(one)) for one in candidates])
         with np.errstate(divide="ignore"):
             total = np.sum(np.log(sizes), axis=1)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbl.fused import Leaves
+from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
 _SMOOTHNESS = 1e-14, 1e4
@@ -138,7 +138,7 @@ def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     return [a, a + b, 0.5 * a + b + c, *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
 
 
-def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> list[np.ndarray]:
+def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> Arrays:
     """What a function of a sample keeps along a signal, or along several side by side; numbers are one lane."""
     found = scan_signal(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
     return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
@@ -198,7 +198,7 @@ def _unit(position: Any) -> Any:
     return np.maximum(guess, 1e-9 * np.ptp(position) + np.finfo(position.dtype).tiny)
 
 
-def _passes(scaled: Any, smoothness: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _passes(scaled: Any, smoothness: Any) -> tuple[Arrays, Arrays]:
     """What the filter and the backward pass keep along a position, or along several side by side, from the first one on."""
     zero = 0.0 * scaled[0]
     forward = _along(_predicted, [smoothness + zero], _first(scaled, smoothness), [scaled])

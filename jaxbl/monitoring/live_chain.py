@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.identification.compilation import jit
-from jaxbl.simulate import Experiment, NamedArrays, Sample, State, initial_state, step
+from jaxbl.simulate import Experiment, NamedArrays, Sample, State, TracedArrays, initial_state, step
 
 BLOCKS = (256, 2048, 16_384)
 """Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""
@@ -16,11 +16,11 @@ BLOCKS = (256, 2048, 16_384)
 
 @jit
 def _run_block(
-    experiment: Experiment, state: State, torque: jax.Array, measured: dict[str, jax.Array], count: jax.Array
-) -> tuple[State, dict[str, jax.Array]]:
+    experiment: Experiment, state: State, torque: jax.Array, measured: TracedArrays, count: jax.Array
+) -> tuple[State, TracedArrays]:
     """Take `count` samples of a padded block. Returns the state after them, and signals of each sample."""
 
-    def sample(state: State, inputs: tuple[Any, ...]) -> tuple[State, dict[str, jax.Array]]:
+    def sample(state: State, inputs: tuple[Any, ...]) -> tuple[State, TracedArrays]:
         index, torque, measured = inputs
         # time matters to excitation and identifier alone
         new, signals = step(experiment, state, Sample(jnp.zeros_like(torque), input=torque, measured=measured))
