@@ -20,7 +20,7 @@ from jaxbl.throughput.run import (
     _select_runnable,
     make_entries,
 )
-from jaxbl.throughput.workload import RANGES, Workload
+from jaxbl.throughput.workload import RANGES, SIDES, Workload
 from jaxbl.workers import count_cores
 
 STEPS = 1500
