@@ -67,6 +67,7 @@ CHAIN_METRICS = Reducer(
     lambda experiment: dict.fromkeys(SIDES, jnp.zeros_like(experiment.run.sample_period)), _update_sums, _metrics
 )
 """Rms velocity error over the last quarter (rad/s), and what is identified (N m/rad, rad), of both sides."""
+METRIC_NAMES = tuple(f"{side}.{name}" for side in SIDES for name in ("velocity_rmse", "stiffness", "dead_zone"))
 
 
 class Workload(NamedTuple):

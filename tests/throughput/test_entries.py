@@ -20,11 +20,10 @@ from jaxbl.throughput.run import (
     _select_runnable,
     make_entries,
 )
-from jaxbl.throughput.workload import RANGES, SIDES, Workload
+from jaxbl.throughput.workload import METRIC_NAMES, RANGES, Workload
 from jaxbl.workers import count_cores
 
 STEPS = 1500
-METRIC_NAMES = [f"{side}.{name}" for side in SIDES for name in ("velocity_rmse", "stiffness", "dead_zone")]
 
 
 @pytest.fixture(scope="module")
