@@ -2,14 +2,24 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test goldens lint docs size versions clean
+.PHONY: demo test test-fast test-long goldens lint docs size versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl demo
 
 # one worker a core: more threads of linear algebra would only wait for one another
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
 test: .venv/installed-dev
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+# without tests that take a second or more, and those that call a browser or a compiler
+test-fast: .venv/installed-dev
+	$(PYTEST) -m "not slow and not program"
+
+# hundreds of kills, damages and random inputs, a million steps: a quarter of an hour and more
+test-long: .venv/installed-dev
+	$(PYTEST) -m long --long
 
 # results of the tree beside those of the base commit, and what moved: make goldens ONLY="export_code tune"
 goldens: .venv/installed-dev

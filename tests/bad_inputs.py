@@ -1,7 +1,8 @@
 """Inputs that nobody should give, and what becomes of them: a script, so that its process has limits of its own.
 
-`python bad_inputs.py listed|toml|logs FOLDER` reads inputs and writes what was said of each as JSON. It ends with an error
-where one takes over 10 s of processor time, waits for long, takes over 2 GB, or ends in anything but a result or one line.
+`python bad_inputs.py listed|toml|logs FOLDER COUNT` reads inputs (COUNT of those that are generated) and writes what was
+said of each as JSON. It ends with an error where one takes over 10 s of processor time, waits for long, takes over 2 GB, or
+ends in anything but a result or one line.
 """
 
 import copy
@@ -423,7 +424,7 @@ def main(what: str, folder: Path) -> None:
                     said[f"{prefix} {name}"] = checked(log, *(found if isinstance(found, tuple) else (found,)))
     else:
         path, model = folder / "study.toml", folder / "model.toml"
-        generated = settings(max_examples=500, database=None, derandomize=True, deadline=None,
+        generated = settings(max_examples=int(sys.argv[3]), database=None, derandomize=True, deadline=None,
                              suppress_health_check=list(HealthCheck))  # fmt: skip
 
         @generated

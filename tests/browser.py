@@ -11,9 +11,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import sync_playwright
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_chromium = pytest.mark.skipif(
-    CHROMIUM is None, reason="pages are opened in Chromium, which is not here (Debian: apt-get install chromium)"
-)
+needs_chromium = pytest.mark.program(CHROMIUM or "chromium")
 
 
 @functools.cache

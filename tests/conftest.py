@@ -24,7 +24,7 @@ from progress_lines import without_progress
 
 from jaxbl.workers import clear_programs_if_needed, collect_garbage_rarely
 
-pytest_plugins = ["shared_results"]
+pytest_plugins = ["shared_results", "suite"]
 
 collect_garbage_rarely()
 jax.config.update("jax_enable_x64", True)

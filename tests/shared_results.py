@@ -1,16 +1,7 @@
 """Results that several files of tests read, made once a worker. A test that writes into a folder of them takes a copy."""
 
-from collections import Counter
-
 import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with many slow tests first, each as a whole: workers end together."""
-    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
-
 
 GAINS = [listed(LAMBDA, 0.05, 5.0, 12.0), listed(ALPHA, 1.8, 8.0)]
 INPUTS = [listed("excitation.amplitude", 0.02, 0.1, zip="input"), listed("excitation.frequency", 2.0, 5.0, zip="input")]

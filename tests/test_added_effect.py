@@ -18,8 +18,6 @@ ROOT = Path(__file__).parents[1]
 NAME = "motor.hysteretic_friction"
 TORQUE, LENGTH = 0.06, 0.2
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):

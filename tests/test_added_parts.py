@@ -107,7 +107,6 @@ STUDY = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
     parts = {"transmissions": {"cubic_shaft": "CubicShaft"}, "excitations": {"triangle": "Triangle"}}
     parts["metrics"] = {

@@ -80,7 +80,6 @@ def test_help_does_not_wait_for_jax(tmp_path):
         assert command in shown.stdout
 
 
-@pytest.mark.slow
 def test_a_sweep_and_its_second_call(tmp_path):
     """As a user sees it: what is printed, what is left, no progress bar in a pipe, no work done twice."""
     write(tmp_path, rigid(axes=AXES, sweep={"seeds": 2}))
@@ -371,7 +370,6 @@ def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
 
 
-@pytest.mark.slow
 def test_verify_leaves_a_verdict_counterexamples_figures_and_report(call, tmp_path, monkeypatch):
     plane = {"start": 1.1, "stop": 5.0, "num": 4}
     write(tmp_path, rigid(axes=GAINS, verify={"alpha_ratio": plane, "lambda_ratio": plane, "damping": []}))
@@ -419,7 +417,6 @@ def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_pat
     assert code == 0 and lines[-1] == "results/study/report.html"
 
 
-@pytest.mark.slow
 def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatch):
     write(tmp_path, tunable())
     code, lines, _ = call("tune", "study.toml")
@@ -575,7 +572,6 @@ def shorten_study(study):
         axis |= {"num": 2} if "num" in axis else {"values": axis["values"][:2]}
 
 
-@pytest.mark.slow
 def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
     # in a process of their own, where float64 is on only inside the engine
     for name in SHIPPED:
@@ -711,7 +707,6 @@ AXIS = rigid(
 )
 
 
-@pytest.mark.slow
 def test_a_log_is_identified(call, tmp_path):
     write(tmp_path, AXIS, "axis.toml")
     assert call("simulate", "axis.toml", "--out", "made")[0] == 0
@@ -761,7 +756,6 @@ def test_an_interrupted_identification_says_how_to_start_again(axis, call, tmp_p
     assert left(tmp_path / "results") == []
 
 
-@pytest.mark.slow
 def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis, call, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("jaxbl.report.page.html", interrupt)
@@ -981,7 +975,6 @@ def steps_in(lines):
     return [(command.strip(), question.strip()) for command, question in zip(rows[::2], rows[1::2], strict=True)]
 
 
-@pytest.mark.slow
 def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
     study = write(tmp_path, tunable() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
     monkeypatch.setattr(setup, "_find_shipped_study", lambda name: study)

@@ -299,7 +299,6 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     assert read_config(tmp_path / "axis.toml").drive.motor_inertia == 8.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_simulate_sweep_and_tune_run_what_is_written(kind, call):
     numbers = {"screw": words("screw", SCREW), "direct": words("direct", DIRECT), "linear": words("linear", LINEAR)}

@@ -245,7 +245,6 @@ def test_demo_is_this_command():
     assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that

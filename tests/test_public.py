@@ -101,14 +101,14 @@ def test_the_check_for_circles_sees_late_imports(tmp_path, late):
     assert {"package.first", "package.second"} == set(find_import_circle(tmp_path, "package"))
 
 
-@pytest.mark.parametrize(
-    "file", [f for f in FILES if f.parent != ROOT / "jaxbl" or f.stem not in ("__init__", "__main__")], ids=lambda f: f.stem
-)
-def test_imports_run_downward(file):
-    part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
-    for name in (name for name in list_imports(file) if name.startswith("jaxbl.")):
-        target = name.split(".")[1]
-        assert target == part or target in BELOW[part], f"{part} imports {name}"
+def test_imports_run_downward():
+    faults = []
+    for file in FILES:
+        part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
+        if part not in ("__init__", "__main__"):
+            targets = [name.split(".")[1] for name in list_imports(file) if name.startswith("jaxbl.")]
+            faults += [f"{file}: {part} imports {name}" for name in targets if name != part and name not in BELOW[part]]
+    assert not faults, "\n".join(faults)
 
 
 def test_the_import_check_sees_imports():
@@ -118,17 +118,20 @@ def test_the_import_check_sees_imports():
 
 def globals_of(code):
     """Names that functions take from their module."""
-    yield from (one.argval for one in dis.get_instructions(code) if one.opname == "LOAD_GLOBAL")
+    yield from (instruction.argval for instruction in dis.get_instructions(code) if instruction.opname == "LOAD_GLOBAL")
     for inner in filter(inspect.iscode, code.co_consts):
         yield from globals_of(inner)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_every_name_is_defined(name):
+def test_every_name_is_defined():
     """Linters are told to pass over undefined names, since shapes of arrays are written as strings."""
-    module = importlib.import_module(name)
-    code = compile(Path(module.__file__).read_text(encoding="utf-8"), name, "exec")
-    assert {used for used in globals_of(code) if not hasattr(module, used) and not hasattr(builtins, used)} == set()
+    faults = set()
+    for name in MODULES:
+        module = importlib.import_module(name)
+        code = compile(Path(module.__file__).read_text(encoding="utf-8"), name, "exec")
+        used = set(globals_of(code))
+        faults |= {f"{name}: {word}" for word in used if not hasattr(module, word) and not hasattr(builtins, word)}
+    assert not faults, "\n".join(sorted(faults))
 
 
 def test_the_check_of_names_sees_them():
@@ -136,45 +139,46 @@ def test_the_check_of_names_sees_them():
     assert set(globals_of(code)) == {"missing", "range"}
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_every_public_module_class_and_function_has_a_docstring(name):
-    module = importlib.import_module(name)
-    assert module.__doc__, name
-    for member, value in vars(module).items():
-        if not member.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value)) and value.__module__ == name:
-            assert value.__doc__, f"{name}.{member}"
+def test_every_public_module_class_and_function_has_a_docstring():
+    faults = []
+    for name in MODULES:
+        module = importlib.import_module(name)
+        faults += [name] * (not module.__doc__)
+        for member, value in vars(module).items():
+            documented = (inspect.isclass(value) or inspect.isfunction(value)) and value.__module__ == name
+            if documented and not member.startswith("_") and not value.__doc__:
+                faults.append(f"{name}.{member}")
+    assert not faults, "\n".join(faults)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_cross_references_lead_somewhere(name):
-    module = importlib.import_module(name)
-    package = name if hasattr(module, "__path__") else name.rpartition(".")[0]
-    for reference in re.findall(
-        r":(?:mod|func|class|meth|data):`([^`]+)`", Path(module.__file__).read_text(encoding="utf-8")
-    ):
-        path = package + reference if reference.startswith(".") else reference
-        if path.startswith("jaxbl."):
-            assert resolved(path), reference
-        else:
-            first = path.partition(".")[0]
-            assert hasattr(module, first) or any(hasattr(one, first) for one in classes_of(module)), reference
+def test_cross_references_lead_somewhere():
+    faults = []
+    for name in MODULES:
+        module = importlib.import_module(name)
+        source = Path(module.__file__).read_text(encoding="utf-8")
+        references = re.findall(r":(?:mod|func|class|meth|data):`([^`]+)`", source)
+        faults += [f"{name}: {reference}" for reference in references if not leads_somewhere(reference, module)]
+    assert not faults, "\n".join(faults)
 
 
-def resolved(path):
-    """Whether a dotted path names a module or something in one."""
+def leads_somewhere(reference, module):
+    """True if a reference in a module names a module, something in one, or a name of this one or of its classes."""
+    package = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
+    path = package + reference if reference.startswith(".") else reference
+    if not path.startswith("jaxbl."):
+        first = path.partition(".")[0]
+        classes = [
+            value for value in vars(module).values() if inspect.isclass(value) and value.__module__ == module.__name__
+        ]
+        return any(hasattr(owner, first) for owner in (module, *classes))
     parts = path.split(".")
     for i in range(len(parts), 0, -1):
         if ".".join(parts[:i]) in MODULES:
-            found = importlib.import_module(".".join(parts[:i]))
+            target = importlib.import_module(".".join(parts[:i]))
             for part in parts[i:]:
-                found = getattr(found, part, None)
-            return found is not None
+                target = getattr(target, part, None)
+            return target is not None
     return False
-
-
-def classes_of(module):
-    """Classes that a module defines."""
-    return [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == module.__name__]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "sweeps").glob("*.toml")), ids=lambda f: f.stem)

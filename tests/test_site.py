@@ -18,8 +18,6 @@ from progress_lines import without_progress
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "_build" / "html"
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def pages():

@@ -58,7 +58,7 @@ class GainSearch:
     Args:
         scenarios: the drives that the gains must serve.
         table: what is asked of the gains.
-        pilot: results of the pilot run by side (:func:`.pilot.pilot`).
+        pilot: results of the pilot run by side (:func:`.pilot.run_pilot`).
         stages: runs each stage as a study of its own.
 
     Attributes:

@@ -44,7 +44,6 @@ def found(logs):
     return diagnose(logs / "axis.csv", model())
 
 
-@pytest.mark.slow
 def test_the_missing_effect_is_named_with_its_number(found):
     summary = found.summary
     assert summary["verdict"] == "explained"
@@ -172,7 +171,6 @@ def test_the_page_in_a_browser(found, tmp_path):
         assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
 
 
-@pytest.mark.slow
 def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_path):
     """As written, with the record of the first log for its excitation."""
     write_diagnosis_report(found, tmp_path)
@@ -212,7 +210,6 @@ def test_new_numbers_are_better_all_in_all():
     assert not better(1.0, np.inf) and not better(np.inf, np.inf) and not better(0.0, 1.0)
 
 
-@pytest.mark.slow
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
     real = explain.refined
@@ -265,7 +262,6 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
     np.testing.assert_allclose(columns["u"], best.torque, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     """At 5 Hz and under that noise dry friction of 1 % of the torque looks viscous; a slower motion tells them apart."""
     friction = {"kind": "motor.coulomb_friction", "torque": 0.004}

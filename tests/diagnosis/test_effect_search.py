@@ -28,7 +28,6 @@ def search(log, study):
     return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("i", "duration"), list(enumerate([2.0, 4.0, 4.0, 4.0])))
 def test_a_hidden_effect_is_named_with_its_numbers(i, duration, tmp_path):
     """Of 2000 samples each, by the same programs."""
@@ -46,7 +45,6 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, duration, tmp_path):
             assert abs(found.findings[0].numbers[key]) == pytest.approx(abs(value), abs=open_to)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("i", range(2))
 def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
     found = explained(cases(SEED, 2, "none", 4.0)[i], tmp_path)
@@ -54,14 +52,12 @@ def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
     assert found.findings == ()
 
 
-@pytest.mark.slow
 def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
     found = explained(cases(SEED, 1, "unknown", 2.0)[0], tmp_path)
     assert found.verdict == "unknown_effect"
     assert max(gain for gain, _ in found.rest.values()) > CLEAR
 
 
-@pytest.mark.slow
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     """Free functions have knots where there are no samples."""
     log = logged()
@@ -85,7 +81,6 @@ HIDDEN = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", HIDDEN)
 def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
     driven(logged().u, [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")

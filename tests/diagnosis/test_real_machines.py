@@ -36,7 +36,6 @@ def explained(log, study):
     return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 
 
-@pytest.mark.slow
 def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     """Published: M 95.1 kg, F_v 203.5 N s/m, F_c 20.39 N, and F_v 166.7 N s/m forwards, 240.4 backwards; force error 66 %
     with the mass alone, 4.7 % with all of these."""
@@ -62,14 +61,12 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     assert all(rest[name] < summary["gap"]["holdout_rmse_after"][name] for name in ("theta_e", "torque_motor"))
 
 
-@pytest.mark.slow
 def test_emps_an_effect_that_is_taken_out_is_named_again():
     found = explained(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET))
     assert found.findings[0].effect == COULOMB["kind"]
     assert found.findings[0].numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
 
 
-@pytest.mark.slow
 def test_xl330_gravity_and_then_dry_friction_are_named():
     """A pendulum released, neither gravity nor friction in the model."""
     study = rigid(

@@ -1,7 +1,6 @@
 """Exported C compiled for this machine and called from Python; tests are skipped where a compiler is missing."""
 
 import ctypes
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
@@ -15,18 +14,7 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-W
 UNCONTRACTED = ("-ffp-contract=off",)
 _CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctypes.c_int32, "bool": ctypes.c_bool}
 
-_PACKAGES = {"arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi", "cc": "gcc"}
-
-
-def needs(*programs):
-    """Skips a test where a program is missing."""
-    missing = [one for one in programs if shutil.which(one) is None]
-    packages = " ".join(_PACKAGES.get(one, one) for one in missing)
-    reason = f"compiles, runs or checks exported code by {', '.join(missing)} (Debian: apt-get install {packages})"
-    return pytest.mark.skipif(bool(missing), reason=reason)
-
-
-COMPILERS = [pytest.param(one, marks=needs(one)) for one in ("gcc", "clang")]
+COMPILERS = [pytest.param(compiler, marks=pytest.mark.program(compiler)) for compiler in ("gcc", "clang")]
 
 
 def ran(*command, cwd=None, **options):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, needs, ran, samples
+from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, ran, samples
 from small_study import small
 from strict import Strict
 
@@ -73,7 +73,7 @@ def strictly(data, precision, inputs):
     return np.array(rows, dtype)
 
 
-@needs("gcc")
+@pytest.mark.program("gcc")
 @pytest.mark.parametrize("kind", OBSERVERS)
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_every_kind_is_the_traced_step_bit_for_bit(code, kind, precision):
@@ -84,15 +84,14 @@ def test_every_kind_is_the_traced_step_bit_for_bit(code, kind, precision):
     assert (bits(found) == bits(expected)).all()
 
 
-@pytest.mark.slow
-@needs("gcc")
-def test_a_million_steps_are_the_traced_step_bit_for_bit(code):
-    inputs = samples(1_000_000, 2)
+@pytest.mark.program("gcc")
+def test_many_steps_are_the_traced_step_bit_for_bit(code, repeats):
+    inputs = samples(repeats(100_000, 1_000_000), 2)
     _, native = code("double")
     assert (bits(outputs(native, inputs)) == bits(strictly(study(), "double", inputs))).all()
 
 
-@needs("gcc")
+@pytest.mark.program("gcc")
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("law", ["sigmoid_backlash", "dead_zone", "linear_shaft", None])
 def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
@@ -126,7 +125,7 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
         assert np.sqrt(np.mean((own - other) ** 2)) <= tolerance * np.sqrt(np.mean(other**2)), name
 
 
-@needs("gcc")
+@pytest.mark.program("gcc")
 def test_the_example_filter_reads_and_writes_csv(tmp_path):
     jaxbl.export(study(), tmp_path, name="drive")
     ran("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)

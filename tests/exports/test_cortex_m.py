@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from native import STRICT, UNCONTRACTED, Native, needs, ran, samples
+from native import STRICT, UNCONTRACTED, Native, ran, samples
 from test_c import outputs, study
 
 import jaxbl
@@ -42,7 +42,7 @@ _CORE = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", 
 _MACHINE = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native")
 
 
-@needs("arm-none-eabi-gcc", "qemu-system-arm", "gcc")
+@pytest.mark.program("arm-none-eabi-gcc", "qemu-system-arm", "gcc")
 @pytest.mark.parametrize("kind", ["super_twisting", "kalman", "differentiator_3"])
 def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     jaxbl.export(study(kind), tmp_path, precision="float", name="drive")
@@ -61,14 +61,13 @@ def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     assert (found.view(np.uint32) == np.ascontiguousarray(expected).view(np.uint32)).all()
 
 
-@needs("arm-none-eabi-gcc")
+@pytest.mark.program("arm-none-eabi-gcc")
 def test_a_cortex_m4s_compiler_has_nothing_to_say(tmp_path):
     jaxbl.export(study("differentiator_5"), tmp_path, precision="float", name="drive")
     ran("arm-none-eabi-gcc", *STRICT, *_CORE[:-1], "-c", "drive.c", "-o", "drive.o", cwd=tmp_path)
 
 
-@pytest.mark.slow
-@needs("cppcheck")
+@pytest.mark.program("cppcheck")
 @pytest.mark.parametrize(("kind", "precision"), [("super_twisting", "double"), ("differentiator_1", "float")])
 def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
     (tmp_path / "wrong.c").write_text("int f(int a) { if (a) return 1; else return 2; }\n")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_values import ENCODERS, VALUES
-from native import COMPILERS, STRICT, bits, needs, ran
+from native import COMPILERS, STRICT, bits, ran
 from small_study import rigid, small
 from strict import Strict
 
@@ -27,7 +27,7 @@ from fmpy.fmi1 import FMICallException  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
-COMPILED = needs("cc")
+COMPILED = pytest.mark.program("cc")
 TOLERANCE = 1e-9
 """Of each output's range: XLA and the fused loop round otherwise than the code."""
 
@@ -176,9 +176,7 @@ class Instance:
 
 
 @COMPILED
-@pytest.mark.parametrize(
-    "data", [pytest.param(data, id=name, marks=[pytest.mark.slow] * (name == ALL)) for name, data in STUDIES.items()]
-)
+@pytest.mark.parametrize("data", STUDIES.values(), ids=STUDIES)
 def test_the_free_run_is_that_of_the_simulation(tmp_path, data):
     trace = jaxbl.run(data).trace
     for fmi in (3, 2) if data["effects"] == [] else (3,):
@@ -240,7 +238,7 @@ def wine(tmp_path_factory):
 
 @COMPILED
 @VERSIONS
-@needs("x86_64-w64-mingw32-gcc", "wine")
+@pytest.mark.program("x86_64-w64-mingw32-gcc", "wine")
 @pytest.mark.usefixtures("windows_too")
 def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     """By a program for Windows under Wine; a step of part of a period is refused with the same words."""
@@ -509,7 +507,7 @@ def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, mac
     assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {why}.")
 
 
-@needs("x86_64-w64-mingw32-gcc")
+@pytest.mark.program("x86_64-w64-mingw32-gcc")
 @pytest.mark.usefixtures("windows_too")
 def test_with_a_compiler_for_windows_alone_it_says_which_binary_is_missing(tmp_path, monkeypatch):
     only(monkeypatch, "x86_64-w64-mingw32-gcc")
@@ -593,7 +591,7 @@ int main(void)
 
 
 @VERSIONS
-@needs("gcc")
+@pytest.mark.program("gcc")
 def test_many_are_linked_into_one_program_by_a_prefix(tmp_path, fmi):
     names = "axis", "table"
     for name in names:
@@ -608,7 +606,7 @@ def test_many_are_linked_into_one_program_by_a_prefix(tmp_path, fmi):
     ran("./both", cwd=tmp_path)
 
 
-@needs("gcc")
+@pytest.mark.program("gcc")
 def test_odd_calls_do_nothing_undefined(tmp_path):
     """No memory that is another's or lost, no overflow; a line in the log for each call that is refused."""
     path, _ = written(study("actuator.", "motor.pre", "load.flex", transmission=GAP), tmp_path)
@@ -620,7 +618,7 @@ def test_odd_calls_do_nothing_undefined(tmp_path):
 
 
 @VERSIONS
-@needs("cc", "cmake")
+@pytest.mark.program("cc", "cmake")
 def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_path, monkeypatch, fmi):
     """FMPy by CMake, which reads which files these are."""
     build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install 'jaxbl[fmu]')")

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
-from native import STRICT, UNCONTRACTED, needs, ran
+from native import STRICT, UNCONTRACTED, ran
 from small_study import swung
 
 from jaxbl.cli import app, main
@@ -25,7 +25,7 @@ def command(*words):
     main(lambda: app([*map(str, words)], standalone_mode=False))
 
 
-@needs("gcc")
+@pytest.mark.program("gcc")
 def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     # at ten times the noise the load's observer amplifies XLA's joined products to 1e-7 of the torque's rms
     data = swung(2.0, tune=TUNE, encoders={"noise": 1e-5})

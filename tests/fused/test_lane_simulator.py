@@ -81,7 +81,6 @@ def parts(half, precision):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "law", "options"),
     [
@@ -119,7 +118,6 @@ def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
         np.testing.assert_array_equal(figure, every[name], err_msg=name)
 
 
-@pytest.mark.slow
 def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))

@@ -279,7 +279,6 @@ def real():
     return sweep(data)
 
 
-@pytest.mark.slow
 def test_slopes_of_a_real_sweep_are_theory_s(real):
     laws = {(fitted_law.figure, fitted_law.series[WORDS]): fitted_law for fitted_law in jaxbl.accuracy_laws(real)}
     for key, fitted_law in laws.items():
@@ -291,7 +290,6 @@ def test_slopes_of_a_real_sweep_are_theory_s(real):
             assert fitted_law.standard_error < 0.05
 
 
-@pytest.mark.slow
 def test_report_of_laws(real, tmp_path):
     lines = write_sweep_report(real, tmp_path)
     assert "Accuracy laws: 7 of 8 have a slope within 0.1 of theory." in lines

@@ -192,7 +192,6 @@ def free():
     return tune(study())
 
 
-@pytest.mark.slow
 def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     tuned = free
     found, gains = tuned.summary["certificates"]["motor"], tuned.summary["gains"]["motor"]
@@ -216,7 +215,6 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     assert 0.0 < error[late].max() <= found["accuracy"]
 
 
-@pytest.mark.slow
 def test_a_finished_certificate_is_read_again(tmp_path, monkeypatch):
     first = tune(study(), tmp_path)
     monkeypatch.setattr(certificate, "certify", None)
@@ -227,7 +225,6 @@ def test_a_finished_certificate_is_read_again(tmp_path, monkeypatch):
     assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
 
 
-@pytest.mark.slow
 def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
     limit = 0.9 * free.summary["certificates"]["motor"]["final_accuracy"]
     kept = tune(study(accuracy=limit))
@@ -246,7 +243,6 @@ def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
     assert any(f"the gains keep what was asked for; {len(better)} gains with less error" in line for line in lines)
 
 
-@pytest.mark.slow
 def test_limits_that_no_gains_keep_are_said_to_be_missed(tmp_path, free):
     tuned = tune(study(accuracy=1e-6))
     assert tuned.summary["gains"] == free.summary["gains"]

@@ -78,7 +78,6 @@ def test_a_start_beside_its_place_counts_by_its_energy():
     assert found["tenth_predicted"] == pytest.approx(found["tenth_simulated"], rel=0.1)
 
 
-@pytest.mark.slow
 def test_a_larger_start_ends_in_a_limit_cycle():
     """Friction of this size under 2 Hz is no slow disturbance: only the simulation shows that."""
     found = moved(-0.01)

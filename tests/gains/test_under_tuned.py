@@ -181,7 +181,6 @@ def test_least_frequency_of_a_cycle():
     assert least_cycle_frequency(1.0, 1.8, 1.56, 3.0) == np.inf
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("alpha", "ratio"), [(1.15, 0.757), (2.0, 0.926)])
 def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
     """Below it errors of any size and phase go to zero; above it not."""
@@ -203,7 +202,6 @@ def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
 TABLE_1 = {"motor": {"lambda": 0.005, "alpha": 1.8}, "load": {"lambda": 0.5, "alpha": 0.4}}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "frequency"), [(0.9, 2.0), (0.6, 1.43)])
 def test_gains_of_table_1_end_in_the_cycle_on_the_papers_drive_at_a_higher_frequency(amplitude, frequency):
     excitation = {"kind": "sine", "amplitude": amplitude, "frequency": frequency}

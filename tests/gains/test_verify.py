@@ -65,7 +65,6 @@ def entries(summary, level):
     return found
 
 
-@pytest.mark.slow
 def test_normalised_level_counted_again(verified):
     verdict, _ = verified
     found, plane = entries(verdict.summary, "normalised"), verdict.error_map
@@ -351,7 +350,6 @@ def test_runs_repeated_for_their_cause_keep_their_noise():
     assert set(rows["seed"]) <= {5, 6}
 
 
-@pytest.mark.slow
 def test_claimed_bound_that_misses_friction_at_rest(tmp_path):
     """A torque below break-away moves nothing: no acceleration, but friction acts all the same."""
     study = rigid(

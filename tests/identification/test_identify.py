@@ -63,7 +63,6 @@ def found(log):
     return identify(log, NOMINAL)
 
 
-@pytest.mark.slow
 def test_numbers_are_those_of_the_machine_within_their_errors(found):
     parameters = found.summary["parameters"]
     assert list(parameters) == list(TRUTH)
@@ -121,7 +120,6 @@ def test_report_has_every_number_and_figure(found, tmp_path):
     assert all(path in page for path in TRUTH)
 
 
-@pytest.mark.slow
 def test_a_direction_that_the_log_does_not_show_is_refused(log):
     """Torque, inertias, frictions and stiffness scaled alike."""
     effects = [*FRICTION, {"kind": "actuator.gain_error", "relative": 0.0}]
@@ -166,7 +164,6 @@ def everything(measured):
     return identify(measured / "log0.csv", study, holdout=measured / "log1.csv", profile=True)
 
 
-@pytest.mark.slow
 def test_a_measured_torque_is_regressed_directly(everything):
     regression = everything.summary["method"]["regression"]
     assert regression["measured_transmitted_torque"]
@@ -220,7 +217,6 @@ def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp
     assert "with the measured transmitted torque" in page
 
 
-@pytest.mark.slow
 def test_several_logs_are_one_record(measured, found, tmp_path):
     """Halves of two logs say as much as one whole log."""
     study = geared(identify={"starts": 1, "window": 0.5})
@@ -276,7 +272,6 @@ def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart(tmp_pa
     assert fit["starts_agreeing"] == 4
 
 
-@pytest.mark.slow
 def test_emps_agrees_with_what_was_published():
     """A real axis in closed loop, by a rigid model; values of Janot, Gautier, Brunot (2019)."""
     study = rigid(
@@ -304,7 +299,6 @@ def test_emps_agrees_with_what_was_published():
     assert found["holdout"]["torque"]["motor"]["relative"] < 0.054
 
 
-@pytest.mark.slow
 def test_xl330_pendulum_swings_freely():
     """Gravity and friction from two free swings with uneven stamps; better than the published 0.018 rad rms."""
     study = rigid(

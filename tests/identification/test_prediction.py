@@ -64,7 +64,6 @@ def windows_of(torque, readings, samples):
     return cut(torque, readings, PERIOD, start, {"motor": 1e-4}, samples)
 
 
-@pytest.mark.slow
 def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
     experiment, free = experiment_and_free()
     errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}

@@ -135,7 +135,6 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "steps"])
 def test_intervals_cover_the_truth_as_often_as_they_say(kind):
     *_, found = fitted(kind)
@@ -150,7 +149,6 @@ def test_intervals_cover_the_truth_as_often_as_they_say(kind):
     assert np.all(np.abs(np.mean(theta, axis=0)) < 4.0 * np.std(theta, axis=0) / np.sqrt(200.0))
 
 
-@pytest.mark.slow
 def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
     """Noise of 1e-4 rad: half gap (4 j_0) within 0.5 % by the fit every time; 40 realisations each, hard gap by SciPy."""
     noise, period = {"motor": 1e-4, "load": 2e-5}, 1e-3
@@ -182,7 +180,6 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
         assert 3.0 * rms[5] < size[side]["half_gap"] < 0.05, (size, rms)
 
 
-@pytest.mark.slow
 def test_scales_that_one_record_cannot_part_are_refused():
     """Torque gain, inertia and friction scaled alike give the same motion."""
     effects = [{"kind": "actuator.gain_error", "relative": 0.0}, {"kind": "motor.coulomb_friction", "torque": 0.01}]

@@ -228,7 +228,6 @@ def test_a_smooth_signal_never_leaves_the_sliding_set_again(order, dtype, h):
     assert np.abs(estimate.velocity - np.cos(t))[late].max() <= bound
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_errors_grow_with_the_noise_as_theory_says(order):
     """Levant (2003): the error of derivative i grows with the noise to the power (n + 1 - i) / (n + 1); within 0.05.

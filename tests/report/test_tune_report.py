@@ -41,7 +41,6 @@ def folder(tuned, tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
 def test_gains_can_be_included_and_run(folder, tuned):
     text = (folder / "gains.toml").read_text(encoding="utf-8")
     # exact numbers, and what they are for

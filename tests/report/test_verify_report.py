@@ -14,7 +14,6 @@ def checked(verified, tmp_path_factory):
     return verdict, folder, write_verify_report(verdict, folder)
 
 
-@pytest.mark.slow
 def test_figures(checked):
     verdict, _, _ = checked
     drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
@@ -63,7 +62,6 @@ def test_page_and_lines(checked):
     assert len(list((folder / "figures").glob("*.png"))) == 7
 
 
-@pytest.mark.slow
 def test_tuning_rules_in_figure_page_and_lines(checked):
     verdict, folder, lines = checked
     rules = verdict.summary["rules"]

@@ -51,7 +51,6 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
     assert not list(tmp_path.rglob(".*"))
 
 
-@pytest.mark.slow
 def test_processes_of_this_machine_give_the_same_table(tmp_path):
     sweep(thirty(), tmp_path / "alone")
     other = thirty(sweep={"seeds": 2, "chunk": 256})

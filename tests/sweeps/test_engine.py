@@ -307,7 +307,6 @@ def test_structural_axes_end_to_end(tmp_path):
 # ---------------------------------------------------------------- precision
 
 
-@pytest.mark.slow
 def test_float32_and_float64_agree_on_what_converges_in_the_demo():
     """In at least 99.5 % of the demo's runs, of one of its seeds.
 

@@ -19,8 +19,6 @@ from small_study import ALPHA, LAMBDA  # isort: skip
 from jaxbl.errors import NoResult
 from jaxbl.sweeps.sweep import share, sweep
 
-pytestmark = pytest.mark.slow
-
 # a process that has loaded everything and started nothing: its children begin at once
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed"])
@@ -85,11 +83,11 @@ def check(folder, expected):
     assert not list(folder.rglob(".*")) and not (folder / "damaged").exists()
 
 
-def test_killed_at_twenty_random_moments(tmp_path, alone):
+def test_killed_at_random_moments(tmp_path, alone, repeats):
     expected, seconds = alone
     rng = random.Random(0)
     kills = rounds = 0
-    while kills < 20:
+    while kills < repeats(6, 200):
         folder, rounds, before = tmp_path / f"{rounds}", rounds + 1, {}
         while True:
             process = begun(_sweep, folder)

@@ -418,7 +418,6 @@ def masks(data, frame, whole):
     return mask, whole.sort_values(config.paths)["motor.converged"].to_numpy().reshape(shape)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_the_boundary_of_the_full_grid_at_257(precision):
     changes = {"run.precision": precision, "observer.discretisation": "implicit", "run.velocity_tolerance": 0.05}
@@ -497,7 +496,6 @@ def test_a_number_as_metric_and_one_axis():
     assert (np.diff(np.log(place))[far] < 1.01 * np.log(100.0) / 128).all()
 
 
-@pytest.mark.slow
 def test_groups_and_listed_axes_are_refined_each_by_itself():
     structure = listed("run.sample_period", 1e-3, 2e-3)
     noise = listed(NOISE, 0.0, 1e-4)

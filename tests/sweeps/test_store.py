@@ -212,11 +212,11 @@ def flipped(folder, random):
     return path
 
 
-def test_flipped_bits_are_noticed_and_healed(copy, finished):
+def test_flipped_bits_are_noticed_and_healed(copy, finished, repeats):
     """None gives other numbers in silence, and one more sweep makes all well."""
-    random, noticed = Random(7), 0
+    random, noticed, flips = Random(7), 0, repeats(20, 1000)
     before = files(copy)
-    for _ in range(60):
+    for _ in range(flips):
         path = flipped(copy, random)
         with suppress(InputError):
             pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
@@ -227,7 +227,7 @@ def test_flipped_bits_are_noticed_and_healed(copy, finished):
         healed = files(copy)
         assert healed.keys() == before.keys()
         assert {name for name in healed if healed[name] != before[name]} <= {"manifest.json"}, path
-    assert noticed > 30
+    assert noticed > flips / 2
 
 
 def test_parts_that_changed_places_are_computed_anew(copy, finished, computed):
