@@ -1,9 +1,9 @@
-"""How well a velocity can be known at all from sampled positions with bounded noise.
+"""Bounds of the accuracy with which a velocity can be known from sampled positions with bounded noise.
 
 A signal f with |f''| <= L (rad/s^2) is read every T (s) with a noise of at most N (rad). No causal differentiator can have a
-smaller worst-case error of f' at a sample than :func:`least_worst_error`, and a difference quotient over the right number of
-periods has just that. One that has to be as good as any without noise, and so cannot count on N, has at least
-:func:`least_exact_error`; :func:`adaptive_quotient` reaches it from N = L T^2 / 2 on. All numbers are in SI units.
+smaller worst-case error of f' at a sample than :func:`least_worst_error`. A difference quotient over the right number of
+periods has exactly this error. A differentiator that does not know N, and is to have the least error without noise, has at
+least :func:`least_exact_error`; :func:`adaptive_quotient` reaches it for N >= L T^2 / 2. All numbers are in SI units.
 
 References: R. Seeber, H. Haimovich, Optimal robust exact differentiation via linear adaptive techniques, Automatica 148
 (2023), for the question, for the continuous bound of exact differentiators, 2 sqrt(2 N L), and for a quotient over a time
@@ -35,8 +35,8 @@ class WorstSignal(NamedTuple):
 
 
 def _check_bounds(noise: float, slope: float, period: float) -> None:
-    for name, value, least in (("noise", noise, 0.0), ("slope", slope, 0.0), ("period", period, 0.0)):
-        if not (math.isfinite(value) and value >= least):
+    for name, value in (("noise", noise), ("slope", slope), ("period", period)):
+        if not (math.isfinite(value) and value >= 0.0):
             raise InputError(f"{name}: the bound of a differentiation error needs a finite {name} >= 0, not {value}")
 
 

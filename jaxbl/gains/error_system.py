@@ -51,7 +51,8 @@ class ErrorSystemMap:
 
 
 @jax.jit
-def _peak_ratios(lambda_: Any, alpha: Any) -> Any:
+def normalised_peak_ratios(lambda_: Any, alpha: Any) -> Any:
+    """Return the simulated ratio of successive peaks at f_plus = 1, and that of the closed form."""
     f_plus = jnp.ones_like(lambda_)
     return half_cycle(lambda_, alpha, f_plus).ratio, peak_ratio(lambda_, alpha, f_plus)
 
@@ -70,7 +71,7 @@ def simulate_error_system(config: Config, stages: Stages) -> ErrorSystemMap:
     dampings = [0.0, *settings.damping]
 
     def compute_map() -> pd.DataFrame:
-        ratio, closed = apply_elementwise(_peak_ratios, cells, stages.devices)
+        ratio, closed = apply_elementwise(normalised_peak_ratios, cells, stages.devices)
         return pd.DataFrame({"lambda_ratio": cells[0], "alpha_ratio": cells[1], "ratio": ratio, "closed_form": closed})
 
     def compute_boundaries() -> pd.DataFrame:

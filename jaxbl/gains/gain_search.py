@@ -16,7 +16,7 @@ from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import no_disturbance_error
 
 from .pilot import Scenarios
-from .stages import Stages
+from .stages import Stages, stage_tables
 
 Gains = dict[str, tuple[float, float]]
 """lambda (rad^0.5/s) and alpha (rad/s^2) of each side."""
@@ -211,17 +211,12 @@ class GainSearch:
     def _run_study(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
         """Run one stage. Its axes are the scenarios' columns and `axes`: columns by label, which advance together."""
         config = self.scenarios.config
-        data = config.to_dict()
-        for key in ("notes", "figures", "tune", "uncertainty", "axes"):
-            data.pop(key, None)
-        data["title"] = f"{config.title} ({name})" if config.title else name
+        seeds, first_seed, excitation = config.sweep.seeds, config.sweep.first_seed, None
+        if held_out:
+            first_seed, excitation = first_seed + seeds, self.table.holdout
+        data = stage_tables(config, name, seeds=seeds, first_seed=first_seed, excitation=excitation)
         for side in self.sides:
             data["observer"][side]["velocity_error"] = self.pilot[side]["velocity_error"]
-        seeds, chunk = config.sweep.seeds, config.sweep.chunk
-        data["sweep"] = {"seeds": seeds, "first_seed": config.sweep.first_seed + (seeds if held_out else 0)}
-        data["sweep"] |= {} if chunk is None else {"chunk": chunk}
-        if held_out and self.table.holdout is not None:
-            data["excitation"] = self.table.holdout.model_dump(by_alias=True, exclude_none=True)
         data["axes"] = [
             {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
             for label, columns in ({"scenario": self.scenarios.columns} | axes).items()

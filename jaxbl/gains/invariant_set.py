@@ -1,4 +1,4 @@
-"""Sets that the error of a super-twisting observer cannot leave, computed: what a certificate rests on.
+"""Sets that the error of a super-twisting observer cannot leave: the proofs behind certificates.
 
 Error of the observer (:mod:`jaxbl.observer.super_twisting`) at a sample, before the measurement: position e and velocity g,
 in units of f⁺ T² and f⁺ T. Noise n and missing acceleration w, |n| <= N and |w(t)| <= 1, are chosen by an adversary. With
@@ -25,18 +25,18 @@ from jaxtyping import Float
 from jaxbl.errors import NoResult
 
 _COARSE_ROWS = 1_000
-"""Rows that the reach of the start is divided into at first; lower ones follow as the set shrinks."""
+"""Number of rows at first; lower ones follow as the set shrinks."""
 _FINEST_HEIGHT = 0.01
-"""Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
+"""Height of the last rows over sqrt(1 + N): the proven bound is then within some per cent of its limit."""
 _FINER_ROWS_COST = 0.02
 """What rows of half the height may be worth of alpha - f⁺."""
 _LATTICE = 0.25
 """Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
 _SLACK, _ULPS = 1e-9, 16.0 * np.finfo(float).eps
-"""For rounding errors of the arithmetic: parts of that lattice, and of the numbers that are added up."""
+"""Allowance for rounding errors: parts of the lattice, and of the numbers that are added up."""
 _MOST_SAMPLES = 100_000
 _TAIL_SAMPLES, _TAIL_RATIO = 2_000, 1.001
-"""A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
+"""A set that still shrinks is accepted if its bound was at most this ratio larger so many samples before."""
 _MOST_SWING = 1e5
 """Most that is added to the reach of the start for the chatter of forward Euler, f⁺ T: what memory allows."""
 _GROUP_HEIGHT = 0.02
@@ -62,7 +62,7 @@ class ErrorSystem(NamedTuple):
 
 
 class Proof(NamedTuple):
-    """What the sets show.
+    """Proven bounds of the velocity error.
 
     Attributes:
         bounds: of the error of the velocity estimate at sample k, f⁺ T; at later samples the last one.
@@ -74,11 +74,11 @@ class Proof(NamedTuple):
 
 
 class _OutOfRows(Exception):
-    """A set is larger than the rows there are."""
+    """A set needs more rows than there are."""
 
 
 def root_beyond_sliding(system: ErrorSystem, beyond: np.ndarray) -> np.ndarray:
-    """sqrt(r) with r + l sqrt(r) = beyond >= 0: what is left of an innovation outside of the sliding set."""
+    """Return sqrt(r) with r + l sqrt(r) = beyond >= 0, the root term of an innovation outside of the sliding set."""
     return 2.0 * beyond / np.maximum(system.lambda_ + np.sqrt(system.lambda_**2 + 4.0 * beyond), np.finfo(float).tiny)
 
 
@@ -113,7 +113,7 @@ class _Rows:
         return self._round_up(upper)
 
     def cover_set(self, other: "_Rows", upper: np.ndarray) -> np.ndarray:
-        """A set of other rows in these."""
+        """Cover a set of other rows by these rows."""
         below = np.arange(-self.half_count, self.half_count) * self.dg / other.dg
         # a row touches the other ones from that of its lower end to that of its upper end
         ends = [np.floor(below - _SLACK), np.ceil(below + self.dg / other.dg + _SLACK) - 1.0]
@@ -125,13 +125,13 @@ class _Rows:
         return self._round_up(covered)
 
     def _round_up(self, upper: np.ndarray, size: float = 0.0) -> np.ndarray:
-        """Bounds on the lattice; `size` of the terms that they are sums of, where these are larger."""
+        """Round bounds up to the lattice. `size` is that of their terms, if these are larger."""
         size = max(size, float(np.abs(upper[upper > -np.inf]).max(initial=0.0)))
         return np.ceil(upper / self.lattice + _SLACK + _ULPS * size / self.lattice) * self.lattice
 
     @np.errstate(invalid="ignore")  # empty rows
     def map_set(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
-        """The set one sample later, and the bound of the estimate's error at this sample."""
+        """Return the set one sample later, and the bound of the velocity estimate's error at this sample."""
         filled_rows = np.flatnonzero(upper > -np.inf)
         first, last = filled_rows[0], filled_rows[-1] + 1
         margin = self.alpha + self.push
@@ -158,7 +158,10 @@ class _Rows:
         return new, float(top * self.dg)
 
     def _correct_errors(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Largest e + phi(b) + g in the rows of z, `alpha` more on both sides; `high` mirrored is minus the lower bounds."""
+        """Return the largest e + phi(b) + g in the rows of z, which are `alpha` more on both sides.
+
+        The lower bounds are minus the mirror image of `high`.
+        """
         system, low, n, i = self.system, -high[::-1], len(high), self.alpha
         a, noise, top = system.alpha, system.noise, (rows + 1) * self.dg
         new = np.full(n + 2 * i, -np.inf)
@@ -198,7 +201,7 @@ class _Rows:
         return new
 
     def _add_sliding_set(self, new: np.ndarray, high: np.ndarray, rows: np.ndarray) -> None:
-        """The sliding set: b = g - z, e + phi(b) + g = e - b + z, and e - b is N or the bound less b, whichever is less."""
+        """Add the sliding set: b = g - z, e + phi(b) + g = e - b + z, and e - b is at most N and the bound less b."""
         a, noise, n, i, c = self.system.alpha, self.system.noise, len(high), self.alpha, self.group
         least, most, base = -high[::-1] - noise, high + noise, high - rows * self.dg
         z = (rows[0] - i + 1 + np.arange(n + 2 * i)) * self.dg
@@ -223,9 +226,9 @@ class _Rows:
 
 
 def prove(system: ErrorSystem, position: float, velocity: float, *, finest: float = _FINEST_HEIGHT) -> Proof:
-    """Bounds of the velocity error at all samples, from all starting errors |e| <= position and |g| <= velocity.
+    """Prove bounds of the velocity error at all samples, for all starting errors |e| <= position and |g| <= velocity.
 
-    The set of the start is mapped until it maps into itself. All in units of f⁺ T² and f⁺ T.
+    The starting set is mapped until it maps into itself. Units are f⁺ T² and f⁺ T.
 
     Args:
         system: the error system.
@@ -234,7 +237,7 @@ def prove(system: ErrorSystem, position: float, velocity: float, *, finest: floa
         finest: height of the rows over sqrt(1 + N); a bound that is twice as near takes about four times as long.
 
     Raises:
-        NoResult: no set was found that is never left.
+        NoResult: no invariant set was found.
     """
     reach = velocity + math.sqrt(2.0 * (system.alpha + 1.0) * position)
     reach += 10.0 * math.sqrt((system.alpha + 1.0) * (1.0 + system.noise + system.push)) + 4.0 * system.alpha

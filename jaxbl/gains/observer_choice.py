@@ -23,7 +23,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points
 
 from .pilot import Scenarios, list_scenarios, run_pilot
-from .stages import Stages
+from .stages import Stages, stage_tables
 
 TIME_CONSTANT = "equivalent_control.time_constant"
 """Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
@@ -245,21 +245,15 @@ class _KindSearch:
                 values = group.lanes[i] | starts | gains | {path: column[corner] for path, column in corners.items()}
                 for path, value in values.items():
                     columns.setdefault(path, []).append(value)
-        seeds = self.held_out_seeds if held_out else self.seeds
-        first = self.config.sweep.first_seed + (self.seeds if held_out else 0)
+        seeds, first_seed, excitation = self.seeds, self.config.sweep.first_seed, None
+        if held_out:
+            seeds, first_seed, excitation = self.held_out_seeds, first_seed + self.seeds, self.table.holdout
         # gains that were rounded to the same number are run once
         keys = list(zip(*columns.values(), strict=True))
         unique = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-        data = group.points[0].scenarios.config.to_dict()
-        for key in ("notes", "figures", "tune", "uncertainty", "axes"):
-            data.pop(key, None)
-        data["title"] = f"{self.config.title} ({name})" if self.config.title else name
+        config = group.points[0].scenarios.config
+        data = stage_tables(config, name, seeds=seeds, first_seed=first_seed, excitation=excitation)
         data["observer"] = _observer_table(kind, data["observer"], columns)
-        data["sweep"] = {"seeds": seeds, "first_seed": first} | (
-            {} if self.config.sweep.chunk is None else {"chunk": self.config.sweep.chunk}
-        )
-        if held_out and self.table.holdout is not None:
-            data["excitation"] = self.table.holdout.model_dump(by_alias=True, exclude_none=True)
         data["axes"] = [
             {"path": path, "values": [key[i] for key in unique], "zip": "trial"} for i, path in enumerate(columns)
         ]
@@ -282,9 +276,8 @@ class _KindSearch:
 
 def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> dict[str, Any]:
     """Return the `[observer]` table of a kind, with the first trial's gains."""
-    data: dict[str, Any] = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)} | {
-        "kind": kind
-    }
+    data: dict[str, Any] = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
+    data["kind"] = kind
     for path, values in columns.items():
         section, _, side_key = path.partition(".")
         if section == "observer":

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_exact, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_exact
 
-from .worst_case import half_cycle
+from .error_system import normalised_peak_ratios
 
 Intervals = list[tuple[np.ndarray, np.ndarray]]
 """Intervals of lambda (rad^0.5/s), ends left out, for each alpha; empty where the first end is not below the second."""
@@ -39,7 +39,7 @@ class Rule:
     gains: Callable[[float], tuple[float, float]] | None = None
 
 
-def _interval_where(holds: np.ndarray, low: np.ndarray, high: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+def _interval_where(holds: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf) -> tuple[np.ndarray, np.ndarray]:
     return np.where(holds, low, np.inf), np.where(holds, high, 0.0)
 
 
@@ -57,28 +57,12 @@ def _intervals_oxictl(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
     return [_interval_where(above, 2.0 * np.sqrt(f_plus), np.sqrt(2.0 * np.where(above, alpha - f_plus, 0.0)))]
 
 
-def _intervals_ordered(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
-    return [_interval_where(alpha > 0.0, alpha, np.inf)]
-
-
-def _intervals_ordered_and_root(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
-    return [_interval_where(alpha > 0.0, np.maximum(alpha, np.sqrt(2.0 * f_plus)), np.inf)]
-
-
-def _intervals_ordered_and_above(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
-    return [_interval_where(alpha > f_plus, np.maximum(alpha, np.sqrt(8.0 * f_plus)), np.inf)]
-
-
 def _intervals_quotient(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
     # lambda^2 - 2 alpha lambda + 2 alpha root < 0
     root = np.sqrt(2.0 * f_plus)
     square = alpha**2 - 2.0 * alpha * root
     half = np.sqrt(np.maximum(square, 0.0))
     return [_interval_where(square > 0.0, alpha - half, alpha + half)]
-
-
-def _intervals_above_twice_root(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
-    return [_interval_where(alpha > f_plus, 2.0 * np.sqrt(alpha), np.inf)]
 
 
 def _intervals_transcribed(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
@@ -148,7 +132,7 @@ RULES = {
         "λ² > 4 α",
         "λ² > 4 α, α > f⁺",
         f"code read: {_CAMP}(60) and (94)",
-        _intervals_above_twice_root,
+        lambda alpha, f_plus: [_interval_where(alpha > f_plus, 2.0 * np.sqrt(alpha))],
     ),
     "transcribed": Rule(
         "λ²/2α − λ⁴/16 < f⁺²",
@@ -160,20 +144,20 @@ RULES = {
         "λ > α",
         "λ > α > 0",
         f"code read: {_SMC_PSO}src/controllers/smc/algorithms/super_twisting/twisting_algorithm.py",
-        _intervals_ordered,
+        lambda alpha, f_plus: [_interval_where(alpha > 0.0, alpha)],
     ),
     "ordered_and_root": Rule(
         "λ > α, λ² > 2 f⁺",
         "λ > α > 0, λ² > 2 f⁺",
         f"documentation read: {_SMC_PSO}docs/technical/mathematical_foundations.md",
-        _intervals_ordered_and_root,
+        lambda alpha, f_plus: [_interval_where(alpha > 0.0, np.maximum(alpha, np.sqrt(2.0 * f_plus)))],
     ),
     "ordered_and_above": Rule(
         "λ > α > f⁺, λ² > 8 f⁺",
         "λ > 2 √(2 f⁺), α > f⁺, λ > α",
         f"documentation read: {_SMC_PSO}docs/theory/lyapunov_stability_proofs.md, with input gain 1. It names the bound "
         "that of the disturbance; here it is read as that of its derivative, f⁺",
-        _intervals_ordered_and_above,
+        lambda alpha, f_plus: [_interval_where(alpha > f_plus, np.maximum(alpha, np.sqrt(8.0 * f_plus)))],
     ),
     "quotient": Rule(
         "α > λ²/2(λ − √2f⁺)",
@@ -194,12 +178,6 @@ _ALPHA_RATIOS = np.concatenate([np.geomspace(1e-3, 0.999, 1000), np.geomspace(1.
 @jax.jit
 def _least_lambda_ratio(ratio: Any) -> Any:
     return least_lambda_exact(ratio, jnp.ones_like(ratio))
-
-
-@jax.jit
-def _peak_ratios(lambda_: Any, alpha: Any) -> tuple[Any, Any]:
-    f_plus = jnp.ones_like(alpha)
-    return peak_ratio(lambda_, alpha, f_plus), half_cycle(lambda_, alpha, f_plus).ratio
 
 
 def allows_gains(rule: Rule, lambda_: np.ndarray, alpha: np.ndarray, f_plus: float) -> np.ndarray:
@@ -314,8 +292,8 @@ def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> li
                 points[name] = (f_plus, gains[1], gains[0])
     bounds, lambdas, alphas = (np.array(column) for column in zip(*points.values(), strict=True))
     with jax.enable_x64(True):
-        ratios = [np.asarray(ratio) for ratio in _peak_ratios(jnp.asarray(lambdas), jnp.asarray(alphas))]
-    table = zip(bounds, bounds * alphas, np.sqrt(bounds) * lambdas, *ratios, strict=True)
+        ratios = [np.asarray(ratio) for ratio in normalised_peak_ratios(jnp.asarray(lambdas), jnp.asarray(alphas))]
+    table = zip(bounds, bounds * alphas, np.sqrt(bounds) * lambdas, *reversed(ratios), strict=True)
     keys = ("f_plus", "alpha", "lambda", "peak_ratio", "peak_ratio_simulated")
     simulated = {name: dict(zip(keys, map(float, row), strict=True)) for name, row in zip(points, table, strict=True)}
     rule_lambdas = np.array([rule_lambda for rule_lambda, _ in rule_gains.values()])

@@ -45,6 +45,22 @@ def open_stages(
         yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
 
 
+def stage_tables(config: Config, name: str, *, seeds: int, first_seed: int, excitation: Any | None = None) -> dict[str, Any]:
+    """Return the tables of a stage's study: those of `config` without its axes and evaluation, with other seeds.
+
+    `excitation` replaces that of `config`, if it is not None.
+    """
+    data = config.to_dict()
+    for key in ("notes", "figures", "tune", "uncertainty", "axes"):
+        data.pop(key, None)
+    data["title"] = f"{config.title} ({name})" if config.title else name
+    chunk = {} if config.sweep.chunk is None else {"chunk": config.sweep.chunk}
+    data["sweep"] = {"seeds": seeds, "first_seed": first_seed} | chunk
+    if excitation is not None:
+        data["excitation"] = excitation.model_dump(by_alias=True, exclude_none=True)
+    return data
+
+
 class Stages:
     """The studies that `tune` or `verify` runs, stored in the folder `out`/`command`; nothing is stored without `out`.
 

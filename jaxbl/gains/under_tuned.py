@@ -1,4 +1,4 @@
-"""What gains do that miss the exact condition: the error under a disturbance that is known, in place of the worst one.
+"""The error of gains that miss the exact condition, under a known disturbance instead of the worst one.
 
 The error system is x1' = x2 - lambda sqrt|x1| sign x1, x2' = d(t) - alpha sign x1 - damping x2. Between two passages through
 x1 = 0 it makes a half cycle; a peak V is |x2| at such a passage. Unless said to be exact, what follows is to first order in
@@ -15,20 +15,20 @@ from scipy.integrate import cumulative_trapezoid, solve_ivp
 from scipy.optimize import root
 
 _TOLERANCE = 1e-9
-"""Relative, of the simulated half cycles."""
+"""Relative tolerance of the simulated half cycles."""
 _ZERO_RATIO = 1e-4
-"""Peak over the first one, below which the error counts as gone."""
+"""Peak over the first one, below which the error counts as zero."""
 _MOST_HALF_CYCLES = 20_000
 _LONGEST_HALF_CYCLE = 1e5
-"""Of a half cycle in tau, over 1 / sqrt(alpha); without disturbance it takes 4.4."""
+"""Longest half cycle in tau, over 1 / sqrt(alpha); without disturbance it takes 4.4."""
 _STARTING_SHARE = 1e-3
-"""Part of the speed that a pulse makes, from which on an error that was zero is simulated."""
+"""Share of a pulse's final speed from which on a zero error is simulated."""
 
 
 def peak_law(
     lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, *, damping: float, peak: float
 ) -> np.ndarray:
-    """Peaks of the error over time under a slow disturbance below alpha.
+    """Return the peaks of the error over time under a slow disturbance below alpha.
 
     Without losses a cycle keeps its area V^3 / (alpha^2 - d^2), so that peaks V follow the disturbance and come back with
     it. Damping shrinks peaks at a third of its rate. lambda shrinks them at a rate k that does not depend on V: in a half
@@ -59,10 +59,10 @@ def peak_law(
 
 
 def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping: float) -> float:
-    """Largest |x2| (rad/s) that the pulses of |d| above alpha make of an error that is zero before each of them; exact.
+    """Return the largest |x2| (rad/s) that pulses of |d| above alpha cause from a zero error; this is exact.
 
-    x1 keeps the sign of d while x2 does, so that x2' = |d| - alpha - damping x2 from the begin of a pulse on. Without
-    damping that is the integral of |d| - alpha over the pulse.
+    x1 keeps the sign of d as long as x2 does, so that x2' = |d| - alpha - damping x2 from the beginning of a pulse. Without
+    damping x2 is the integral of |d| - alpha over the pulse.
     """
     steps = np.diff(times)
     remaining_share = np.exp(-damping * steps)
@@ -93,7 +93,7 @@ class ErrorPath(NamedTuple):
         times: of passages through x1 = 0 (s), shape (n,).
         peaks: |x2| there (rad/s), shape (n,).
         largest: largest |x2| at any of them (rad/s); between two of them |x2| is largest at an end while |d| < alpha.
-        gone: time (s) from which on the error counts as zero; `inf` where it does not.
+        end_time: time (s) from which on the error counts as zero; `inf` if it does not.
     """
 
     times: np.ndarray
@@ -110,9 +110,9 @@ def _half_cycle(
     start: tuple[float, float, float],
     end: float,
 ) -> tuple[float, float, float, bool]:
-    """x2 and time at the end of a half cycle, the largest |x2| in it, and whether x1 has come back to zero.
+    """Simulate a half cycle. Returns x2 and time at its end, the largest |x2|, and True if x1 has come back to zero.
 
-    `start`: root of |x1|, x2 and time; both in the sign of x1. In tau with dt = 2 sqrt|x1| d(tau) all slopes are finite.
+    `start` is the root of |x1|, x2 and the time, in the sign of x1. In tau, dt = 2 sqrt|x1| d(tau), all slopes are finite.
     """
 
     def slope(_: float, state: np.ndarray) -> tuple[float, float, float]:
@@ -205,9 +205,9 @@ def simulate_error(
 
 
 def _start_of_pulse(excess: np.ndarray, times: np.ndarray) -> tuple[float, float]:
-    """Time, and x2 (rad/s), at which a pulse of |d| - alpha has made an error that was zero just large enough to simulate.
+    """Return the time, and x2 (rad/s), at which a pulse of |d| - alpha has made a zero error large enough to simulate.
 
-    x2 is the integral of the pulse, whatever x1 is, and x1 is soon forgotten.
+    x2 is the integral of the pulse, whatever x1 is.
     """
     pulse = excess[: int(np.argmax(excess <= 0.0)) or len(excess)]
     speed = cumulative_trapezoid(pulse, times[: len(pulse)], initial=0.0)
@@ -217,7 +217,7 @@ def _start_of_pulse(excess: np.ndarray, times: np.ndarray) -> tuple[float, float
 
 
 def _interpolator(times: np.ndarray, values: np.ndarray) -> Callable[[float], float]:
-    """As `np.interp`, of one number at a time: NumPy takes ten times as long for one, and half of a simulation."""
+    """Return a function like `np.interp` for single numbers, for which NumPy takes ten times as long."""
     time_list, value_list = times.tolist(), values.tolist()
 
     def interpolate(time: float) -> float:
@@ -246,13 +246,13 @@ SINE_LIMIT = 16.0 * 2.0**0.5 / np.pi**3
 
 
 def _balance_phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
-    """Sine of the phase in which the disturbance makes up for the losses of a half cycle."""
+    """Return the sine of the phase at which the disturbance makes up for the losses of a half cycle."""
     friction = damping * alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
     return float((friction + lambda_ * np.sqrt(alpha) / SINE_LIMIT) / amplitude)
 
 
 def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0) -> SineCycle | None:
-    """Limit cycles of the error under a sine (rad/s^2, Hz), by balance of energy; None where there is none.
+    """Find the limit cycles of the error under a sine (rad/s^2, Hz) by balance of energy; None if there is none.
 
     A half cycle takes half a period, in which x2 falls by 2 V = pi alpha / w - 2 (amplitude / w) cos(phase), with w = 2 pi
     frequency. The sine puts in the energy 2 alpha amplitude sin(phase) / w^2; damping and lambda take out what they take of
@@ -268,8 +268,10 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
 
 
 def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
-    """Frequency (Hz) from which on a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`; 0 without
-    damping, `inf` where lambda alone forbids one. It is too high where alpha is close to the amplitude."""
+    """Return the least frequency (Hz) at which a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`.
+
+    It is 0 without damping, and `inf` if lambda alone forbids a cycle. It is too high if alpha is close to the amplitude.
+    """
     driving_amplitude = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
     return float(damping * alpha * np.pi**2 / (48.0 * driving_amplitude)) if driving_amplitude > 0.0 else np.inf
 
@@ -277,7 +279,7 @@ def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, dampin
 def _find_cycle(
     lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float, start: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Peak (rad/s) and phase that come back after a simulated half cycle, by Newton's method from `start`; None without."""
+    """Find a peak (rad/s) and phase that repeat after a simulated half cycle, by Newton's method; None without one."""
     circular = 2.0 * np.pi * frequency
     unit = alpha / circular
 
@@ -301,9 +303,9 @@ def _find_cycle(
 def sine_cycle_simulated(
     lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0
 ) -> SineCycle | None:
-    """As :func:`sine_cycle`, without its approximation, from which Newton's method starts.
+    """Find the limit cycles without the approximation of :func:`sine_cycle`, which is the start of Newton's method.
 
-    None where that has no cycle, or the method finds none.
+    Returns None if the approximation has no cycle, or if the method does not converge.
     """
     predicted = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
     if predicted is None:
@@ -319,8 +321,11 @@ _HALVINGS = 10
 
 
 def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: float, damping: float) -> float | None:
-    """As :func:`least_cycle_frequency`, without its approximation: the stable cycle is followed from twice that frequency
-    down to where Newton's method finds none. None where it finds none at all, or where the other one is 0 or `inf`."""
+    """Find the least frequency (Hz) of a limit cycle without the approximation of :func:`least_cycle_frequency`.
+
+    The stable cycle is followed from twice the approximate frequency down to where Newton's method finds none. Returns None
+    if it finds none at all, or if the approximation is 0 or `inf`.
+    """
     high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
     if not 0.0 < high < np.inf:
         return None

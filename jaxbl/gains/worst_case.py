@@ -15,19 +15,19 @@ import jax.numpy as jnp
 from jaxbl.observer.conditions import Values, bisect
 
 _STEP_SHARE = 0.1
-"""Part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7."""
+"""Step over the fastest time constant: the error of the peak ratio is then about 1e-7."""
 _MOST_STEPS = 20_000
-"""Of a quarter cycle: two thousand time constants, after which it has ended, or nears the origin along a ray."""
+"""Most steps of a quarter cycle, two thousand time constants: it has then ended, or nears the origin along a ray."""
 _ORIGIN_RATIO = 1e-6
-"""Error, over that at the start, from which on the way to the origin is known: its time is added in closed form."""
+"""Below this error, relative to the start, the remaining time to the origin is added in closed form."""
 _HALVINGS = 28
 """The last interval is 4 / 2^28 = 1.5e-8 of sqrt(alpha + f)."""
 
 
 class HalfCycle(NamedTuple):
-    """Speed |x2| at the end of a half cycle over that at its start, and its duration in s.
+    """The ratio of the speed |x2| at the end of a half cycle to that at its start, and its duration in s.
 
-    The ratio is 0 where the error ends at the origin within the half cycle, and `inf` where it does not come back.
+    The ratio is 0 if the error reaches the origin within the half cycle, and `inf` if it does not come back.
     """
 
     ratio: Values
@@ -83,7 +83,7 @@ def half_cycle(
         return _STEP_SHARE / (lambda_ + fastest)
 
     def nears_origin(s: _State) -> Values:
-        """At the origin: nothing is left, or it is being neared along a ray, which no trajectory crosses."""
+        """True at the origin, or where the state nears it along a ray that no trajectory crosses."""
         c = 2.0 * (alpha - homeward * f_plus)
         turning = s.x2 * (s.x2 - lambda_ * s.y) + c * s.y**2  # Q(p) y^2 for p = x1' / y
         along = (jnp.abs(turning) < _ORIGIN_RATIO**2 * (lambda_ * s.y) ** 2) & (s.x2 > 0.0)
@@ -100,7 +100,7 @@ def half_cycle(
         field_under(homeward * f_plus - alpha), step_size, lambda s: s.y, turning_state, nears_origin, has_turned
     )
     ends = nears_origin(last_state) & ~is_back
-    # what is left of x2 on the ray to the origin falls at the rate alpha - d + damping x2
+    # on the ray to the origin x2 falls at the rate alpha - d + damping x2
     rate = alpha - homeward * f_plus
     remaining_time = jnp.where(ends, jnp.abs(last_state.x2) / jnp.where(rate > 0.0, rate, 1.0), 0.0)
     damped_time = damping * remaining_time
@@ -131,7 +131,7 @@ def _march(
     nears_origin: Callable[[_State], Values],
     starts_moving: Values | bool = True,
 ) -> tuple[_State, Values]:
-    """March until `event` falls through zero. Returns the state there, and whether it came to that."""
+    """Integrate until `event` falls through zero. Returns the state there, and True where it does."""
     zero = jnp.zeros_like(state.y)
 
     def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -156,10 +156,10 @@ def _march(
 def least_lambda_simulated(
     alpha: Values, f_plus: Values, *, damping: Values | float = 0.0, speed: Values | float = 1.0
 ) -> Values:
-    """Least lambda (rad^0.5/s) at which the simulated worst case shrinks an error of a given speed (rad/s).
+    """Return the least lambda (rad^0.5/s) at which an error of this speed (rad/s) shrinks in the simulated worst case.
 
-    By bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f); 0 where damping alone is enough, and `inf` where no
-    lambda up to 4 sqrt(alpha + f) is.
+    It is found by bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f). It is 0 if damping alone is enough, and
+    `inf` if no lambda up to 4 sqrt(alpha + f) is.
     """
     arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
     alpha, f_plus, damping, speed = arguments

@@ -227,7 +227,7 @@ def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
     results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
-    monkeypatch.setattr(module, "_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
     again = verify(VERIFIED, folder)
     assert again.summary == verdict.summary
     for level, frame in verdict.levels.items():
@@ -248,7 +248,7 @@ def test_another_studys_folder_is_left_as_it_is(verified):
 def test_another_q_and_other_marks_go_on_with_what_is_there(verified, monkeypatch, tmp_path):
     verdict, folder = verified
     shutil.copytree(folder, tmp_path / "copy")
-    monkeypatch.setattr(module, "_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
     twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
     again = verify(VERIFIED | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
     titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
