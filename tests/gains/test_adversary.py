@@ -26,15 +26,15 @@ RATIOS = dict(zip(SYSTEMS, (1.17, 1.06, 1.12, 1.2), strict=True))
 def test_the_way_that_is_found_leads_there(system):
     kind = DISCRETISATIONS["implicit" if system.implicit else "explicit"]
     with jax.enable_x64(True):
-        found, way = explore_errors(kind(jnp.asarray(system.lambda_), jnp.asarray(system.alpha)), system)
+        result, way = explore_errors(kind(jnp.asarray(system.lambda_), jnp.asarray(system.alpha)), system)
     e, g, errors = np.zeros(1), np.zeros(1), []
     for noise, mean, moment, nominal in zip(*way, strict=True):
         assert abs(noise) <= system.noise
         assert abs(moment - 0.5 * mean) <= 0.25 * (1.0 - mean**2) + 1e-15
         e, g, error = stepped(system, e, g, noise, mean, moment, system.push * nominal)
         errors.append(float(error[0]))
-    assert errors[-1] == pytest.approx(found.worst, rel=1e-9)
-    assert found.state_count > 10
+    assert errors[-1] == pytest.approx(result.worst, rel=1e-9)
+    assert result.state_count > 10
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
@@ -45,23 +45,23 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
     moment = 0.5 * mean
     e, g, largest = np.zeros(1), np.zeros(1), 0.0
     for _ in range(5):
-        many = len(choices)
+        count = len(choices)
         e, g, error = stepped(
-            system, np.repeat(e, many), np.repeat(g, many),
+            system, np.repeat(e, count), np.repeat(g, count),
             *(np.tile(x, len(e)) for x in (system.noise * noise, mean, moment, system.push * nominal)),
         )  # fmt: skip
         largest = max(largest, error.max())
-    found = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
-    assert found.worst >= largest
-    assert found.violations == 0
-    assert proof.bounds[-1] <= RATIOS[system] * found.worst
+    result = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
+    assert result.worst >= largest
+    assert result.violations == 0
+    assert proof.bounds[-1] <= RATIOS[system] * result.worst
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_a_bound_that_is_too_small_is_found_out(system):
     proof = prove(system, system.noise, 0.0)
-    found = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
-    wrong = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / found.worst))
+    result = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
+    wrong = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / result.worst))
     refuted = search_violations(system, system.noise, 0.0, wrong, wrong.bounds[-1], 1)
     assert refuted.violations > 0
 
@@ -70,9 +70,9 @@ def test_runs_from_the_start_are_held_against_the_bound_of_each_sample():
     system = ErrorSystem(True, 1.5, 1.1, 1.0)
     proof = prove(system, 1.0, 50.0)
     settled = 1.05 * proof.bounds[-1]
-    found = search_violations(system, 1.0, 50.0, proof, settled, 1)
+    result = search_violations(system, 1.0, 50.0, proof, settled, 1)
     reached = int((proof.bounds <= settled).argmax())
-    assert 0.85 * reached <= found.latest + 1 <= reached
+    assert 0.85 * reached <= result.latest + 1 <= reached
     # half the time: the worst errors do not fall so fast
     early = proof._replace(bounds=proof.bounds[::2])
     assert search_violations(system, 1.0, 50.0, early, settled, 1).violations > 0
@@ -81,6 +81,6 @@ def test_runs_from_the_start_are_held_against_the_bound_of_each_sample():
 def test_the_same_seed_finds_the_same():
     system = SYSTEMS[1]
     proof = prove(system, system.noise, 0.0)
-    one, other = (search_violations(system, system.noise, 0.0, proof, 1.0, 40_000, seed=3) for _ in range(2))
-    assert one.worst == other.worst and one.runs == other.runs >= 40_000
-    np.testing.assert_array_equal(one.sequence.noise, other.sequence.noise)
+    first, other = (search_violations(system, system.noise, 0.0, proof, 1.0, 40_000, seed=3) for _ in range(2))
+    assert first.worst == other.worst and first.runs == other.runs >= 40_000
+    np.testing.assert_array_equal(first.sequence.noise, other.sequence.noise)

@@ -29,23 +29,23 @@ def frame():
 def test_runs_below_their_bound_are_counted_and_explained(frame):
     below = frame[frame["motor.converged"] & (frame["motor.margin_alpha"] <= 1.0)]
     assert 2 <= len(below) < len(frame)
-    found = summarise_converged_below(STUDY, "motor", frame)
-    assert found["converged_runs"] == found["runs"] == len(below)
+    summary = summarise_converged_below(STUDY, "motor", frame)
+    assert summary["converged_runs"] == summary["runs"] == len(below)
     shares, areas = [], []
     for _, row in below.iterrows():
         trace = run(with_values(STUDY, {AMPLITUDE: row[AMPLITUDE]})).trace
         missing = np.abs(trace["motor.acceleration"] - (trace["u"] - 0.15 * trace["motor.velocity"]) / 0.05).to_numpy()
         shares.append((missing > row[ALPHA]).mean())
         areas.append(np.clip(missing - row[ALPHA], 0.0, None).sum() * 1e-3)
-    assert found["disturbance_exceeds"] == sum(share > 0.0 for share in shares) > 0
-    assert found["share_above_alpha"] == pytest.approx(max(shares))
-    assert 0.0 < found["excursion_predicted"] < max(areas)
-    assert found["excursion_predicted"] == pytest.approx(found["excursion_simulated"], rel=1e-3)
+    assert summary["disturbance_exceeds"] == sum(share > 0.0 for share in shares) > 0
+    assert summary["share_above_alpha"] == pytest.approx(max(shares))
+    assert 0.0 < summary["excursion_predicted"] < max(areas)
+    assert summary["excursion_predicted"] == pytest.approx(summary["excursion_simulated"], rel=1e-3)
     # that is why they count as converged
-    assert found["excursion_predicted"] < STUDY.run.velocity_tolerance
-    at = found["at"]
-    assert set(at) == {AMPLITUDE, LAMBDA, ALPHA}
-    assert at[ALPHA] == 1.8
+    assert summary["excursion_predicted"] < STUDY.run.velocity_tolerance
+    axis_values = summary["at"]
+    assert set(axis_values) == {AMPLITUDE, LAMBDA, ALPHA}
+    assert axis_values[ALPHA] == 1.8
 
 
 def test_none_below(frame):
@@ -55,8 +55,8 @@ def test_none_below(frame):
 def test_the_disturbance_is_what_the_model_lacks():
     study = with_values(STUDY, {AMPLITUDE: 0.3})
     trace = run(study).trace
-    found, velocity = missing_acceleration(study.build().drive, "motor", trace), trace["motor.velocity"].to_numpy()
+    summary, velocity = missing_acceleration(study.build().drive, "motor", trace), trace["motor.velocity"].to_numpy()
     slips = np.abs(velocity) > 0.05
     assert 0.2 < slips.mean() < 1.0
     # dry friction of 0.1 N m at 0.05 kg m^2; velocity and acceleration are half a period apart
-    np.testing.assert_allclose(found[slips], -2.0 * np.sign(velocity[slips]), rtol=0.01)
+    np.testing.assert_allclose(summary[slips], -2.0 * np.sign(velocity[slips]), rtol=0.01)

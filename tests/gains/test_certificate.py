@@ -54,18 +54,18 @@ def test_bounds_lie_between_what_is_found_and_little_more(proven):
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_other_units_of_time_and_angle_change_nothing(discretisation):
     second, rad = 4.0, 0.25
-    given = {"discretisation": discretisation, "acceleration": 2.0}
-    one = certify(*GAINS, **BOUNDS | given)
+    arguments = {"discretisation": discretisation, "acceleration": 2.0}
+    first = certify(*GAINS, **BOUNDS | arguments)
     lambda_, alpha = GAINS[0] * math.sqrt(rad) / second, GAINS[1] * rad / second**2
     bounds = {
         "noise": 5e-5 * rad, "f_plus": 5.0 * rad / second**2, "period": 1e-3 * second, "velocity_error": 0.1 * rad / second,
         "acceleration": 2.0 * rad / second**2, "runs": 1,
     }  # fmt: skip
     other = certify(lambda_, alpha, **bounds, discretisation=discretisation)
-    assert other["reaching_time"] == pytest.approx(one["reaching_time"] * second)
+    assert other["reaching_time"] == pytest.approx(first["reaching_time"] * second)
     for name in ("accuracy", "final_accuracy", "resolution"):
-        assert other[name] == pytest.approx(one[name] * rad / second)
-    assert ("acceleration" in one["assumptions"]) == (discretisation == "explicit")
+        assert other[name] == pytest.approx(first[name] * rad / second)
+    assert ("acceleration" in first["assumptions"]) == (discretisation == "explicit")
 
 
 def test_worse_assumptions_prove_less(proven):
@@ -106,10 +106,12 @@ def test_the_final_accuracy_itself_can_be_asked_for(f_plus, period):
 def test_what_is_printed_is_proven(proven, change):
     """Bounds are rounded up, and what they assume is rounded down."""
     scaled = ("accuracy", "final_accuracy", "reaching_time")
-    found = proven | {name: change * proven[name] for name in scaled}
-    given = {name: change * proven["assumptions"][name] for name in ("noise", "f_plus", "velocity_error", "position_error")}
-    found["assumptions"] = proven["assumptions"] | given
-    summary = {"certificates": {"motor": found}, "passed_over": {"motor": 0}}
+    certificate_data = proven | {name: change * proven[name] for name in scaled}
+    arguments = {
+        name: change * proven["assumptions"][name] for name in ("noise", "f_plus", "velocity_error", "position_error")
+    }
+    certificate_data["assumptions"] = proven["assumptions"] | arguments
+    summary = {"certificates": {"motor": certificate_data}, "passed_over": {"motor": 0}}
     line = certificate_lines(summary)[0]
     accuracy, time, final, noise, f_plus, period, velocity, position = map(
         float, re.findall(r"[\d.]+(?:e-\d+)?(?= |\.$)", line)
@@ -119,9 +121,9 @@ def test_what_is_printed_is_proven(proven, change):
     assert table.columns == ["", "motor"]
     row = dict(table.rows)
     for value, other, printed in (
-        (found["accuracy"], "accuracy (rad/s)", accuracy),
-        (found["reaching_time"], "kept from (s)", time),
-        (found["final_accuracy"], "in the end (rad/s)", final),
+        (certificate_data["accuracy"], "accuracy (rad/s)", accuracy),
+        (certificate_data["reaching_time"], "kept from (s)", time),
+        (certificate_data["final_accuracy"], "in the end (rad/s)", final),
     ):
         assert value * (1.0 - 1e-12) <= printed == float(f"{row[other]:.4g}") <= 1.001 * value
     for name, other, printed in (
@@ -130,7 +132,7 @@ def test_what_is_printed_is_proven(proven, change):
         ("velocity_error", "velocity error at start (rad/s)", velocity),
         ("position_error", "position error at start (rad)", position),
     ):
-        assert given[name] * (1.0 + 1e-12) >= printed == float(f"{row[other]:.4g}") >= 0.999 * given[name]
+        assert arguments[name] * (1.0 + 1e-12) >= printed == float(f"{row[other]:.4g}") >= 0.999 * arguments[name]
 
 
 @pytest.mark.parametrize(
@@ -166,10 +168,10 @@ def test_a_bound_that_runs_exceed_is_refused(monkeypatch):
         return proof._replace(bounds=0.9 * proof.bounds)
 
     monkeypatch.setattr(certificate, "prove", wrong)
-    found = certify(*GAINS, **BOUNDS)
-    assert not found["certified"]
-    assert found["search"]["violations"] > 0
-    assert found["why_none"].startswith("refused: ")
+    certificate_data = certify(*GAINS, **BOUNDS)
+    assert not certificate_data["certified"]
+    assert certificate_data["search"]["violations"] > 0
+    assert certificate_data["why_none"].startswith("refused: ")
 
 
 def test_single_precision_of_the_caller_does_not_matter(proven):
@@ -194,52 +196,54 @@ def free():
 
 def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     tuned = free
-    found, gains = tuned.summary["certificates"]["motor"], tuned.summary["gains"]["motor"]
-    assert found["gains"] == {name: gains[name] for name in ("lambda", "alpha")}
-    given = found["assumptions"]
-    assert given["noise"] == pytest.approx(1e-5 + 5.0 * 1e-5)
-    assert given["f_plus"] == max(tuned.summary["f_plus"]["motor"], tuned.summary["achieved"]["motor"]["f_plus"])
-    assert (given["velocity_error"], given["position_error"], given["period"]) == (0.1, given["noise"], 1e-3)
-    assert found == certify(gains["lambda"], gains["alpha"], **given, runs=1)
+    certificate_data, gains = tuned.summary["certificates"]["motor"], tuned.summary["gains"]["motor"]
+    assert certificate_data["gains"] == {name: gains[name] for name in ("lambda", "alpha")}
+    arguments = certificate_data["assumptions"]
+    assert arguments["noise"] == pytest.approx(1e-5 + 5.0 * 1e-5)
+    assert arguments["f_plus"] == max(tuned.summary["f_plus"]["motor"], tuned.summary["achieved"]["motor"]["f_plus"])
+    assert (arguments["velocity_error"], arguments["position_error"], arguments["period"]) == (0.1, arguments["noise"], 1e-3)
+    assert certificate_data == certify(gains["lambda"], gains["alpha"], **arguments, runs=1)
     lines = write_tune_report(tuned, tmp_path)
     assert any(line.startswith("motor, proven: velocity error at most ") for line in lines)
     assert any("none violates what is proven" in line for line in lines)
     written = json.loads((tmp_path / "certificate.json").read_text())
-    assert written["sides"] == {"motor": found}
+    assert written["sides"] == {"motor": certificate_data}
     # the runs that were certified stay below
-    data = study() | {"observer": {"motor": found["gains"] | {"velocity_error": 0.1}}}
-    data["run"]["duration"] = found["reaching_time"] + 0.5
+    data = study() | {"observer": {"motor": certificate_data["gains"] | {"velocity_error": 0.1}}}
+    data["run"]["duration"] = certificate_data["reaching_time"] + 0.5
     run = jaxbl.run(data).trace
-    late = run["t"] >= found["reaching_time"]
+    late = run["t"] >= certificate_data["reaching_time"]
     error = np.abs(run["motor.velocity_estimate"] - run["motor.velocity"])
-    assert 0.0 < error[late].max() <= found["accuracy"]
+    assert 0.0 < error[late].max() <= certificate_data["accuracy"]
 
 
 def test_a_finished_certificate_is_read_again(tmp_path, monkeypatch):
     first = tune(study(), tmp_path)
     monkeypatch.setattr(certificate, "certify", None)
     assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
-    kept = tmp_path / "tune" / "certificate.json"
-    kept.write_text(kept.read_text()[:-20])
+    limited = tmp_path / "tune" / "certificate.json"
+    limited.write_text(limited.read_text()[:-20])
     monkeypatch.undo()
     assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
 
 
 def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
     limit = 0.9 * free.summary["certificates"]["motor"]["final_accuracy"]
-    kept = tune(study(accuracy=limit))
-    found = kept.summary["certificates"]["motor"]
-    assert found["final_accuracy"] <= limit == found["accuracy"]
-    assert kept.summary["passed_over"]["motor"] > 0
+    limited = tune(study(accuracy=limit))
+    certificate_data = limited.summary["certificates"]["motor"]
+    assert certificate_data["final_accuracy"] <= limit == certificate_data["accuracy"]
+    assert limited.summary["passed_over"]["motor"] > 0
     # the best of those that do
-    better = kept.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
-    better = better[better["error"] < kept.summary["achieved"]["motor"]["velocity_rmse"]]
-    assert len(better) == kept.summary["passed_over"]["motor"]
-    bounds = {name: found["assumptions"][name] for name in ("noise", "velocity_error", "position_error", "period")}
+    better = limited.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
+    better = better[better["error"] < limited.summary["achieved"]["motor"]["velocity_rmse"]]
+    assert len(better) == limited.summary["passed_over"]["motor"]
+    bounds = {
+        name: certificate_data["assumptions"][name] for name in ("noise", "velocity_error", "position_error", "period")
+    }
     for row in better.to_dict("records"):
-        f_plus = max(kept.summary["f_plus"]["motor"], row["f_plus"])
+        f_plus = max(limited.summary["f_plus"]["motor"], row["f_plus"])
         assert certify(row["lambda"], row["alpha"], **bounds, f_plus=f_plus, runs=1)["final_accuracy"] > limit
-    lines = write_tune_report(kept, tmp_path)
+    lines = write_tune_report(limited, tmp_path)
     assert any(f"the gains keep what was asked for; {len(better)} gains with less error" in line for line in lines)
 
 
@@ -260,9 +264,13 @@ def test_without_a_proof_there_is_no_file(tmp_path):
 
 
 def test_what_is_refuted_is_said_first(tmp_path, free):
-    found = free.summary["certificates"]["motor"]
-    found = found | {"certified": False, "why_none": "refused: 3 of 9", "search": found["search"] | {"violations": 3}}
-    tuned = dataclasses.replace(free, summary=free.summary | {"certificates": {"motor": found}})
+    certificate_data = free.summary["certificates"]["motor"]
+    certificate_data = certificate_data | {
+        "certified": False,
+        "why_none": "refused: 3 of 9",
+        "search": certificate_data["search"] | {"violations": 3},
+    }
+    tuned = dataclasses.replace(free, summary=free.summary | {"certificates": {"motor": certificate_data}})
     assert write_tune_report(tuned, tmp_path)[0] == "motor: no certificate: refused: 3 of 9."
     assert not (tmp_path / "certificate.json").exists()
 

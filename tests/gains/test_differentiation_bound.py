@@ -21,17 +21,17 @@ CASES = [(1e-5, 8.0, 1e-3), (0.0, 8.0, 1e-3), (1.0, 1.0, 1.0), (3e-4, 2.0, 2e-3)
 @pytest.mark.parametrize(("noise", "slope", "period"), CASES)
 def test_the_linear_program_agrees_with_the_closed_form_and_its_signal_is_admitted(noise, slope, period):
     samples = 2 * best_samples(noise, slope, period) + 5
-    found = worst_signal(noise, slope, period, samples)
-    assert found.error == pytest.approx(least_worst_error(noise, slope, period), rel=1e-7)
-    assert np.abs(found.signal).max() <= noise + 1e-9 * slope * period**2
-    assert np.abs(found.acceleration).max() <= slope * (1.0 + 1e-9)
+    errors_found = worst_signal(noise, slope, period, samples)
+    assert errors_found.error == pytest.approx(least_worst_error(noise, slope, period), rel=1e-7)
+    assert np.abs(errors_found.signal).max() <= noise + 1e-9 * slope * period**2
+    assert np.abs(errors_found.acceleration).max() <= slope * (1.0 + 1e-9)
     # the signal's values are those that its own second derivative makes
-    velocity, value, values = found.error, found.signal[0], [found.signal[0]]
-    for acceleration in found.acceleration:
+    velocity, value, values = errors_found.error, errors_found.signal[0], [errors_found.signal[0]]
+    for acceleration in errors_found.acceleration:
         value += -period * velocity + 0.5 * period**2 * acceleration
         velocity -= period * acceleration
         values.append(value)
-    np.testing.assert_allclose(values, found.signal, atol=1e-9 * (noise + slope * period**2))
+    np.testing.assert_allclose(values, errors_found.signal, atol=1e-9 * (noise + slope * period**2))
 
 
 @pytest.mark.parametrize(("noise", "slope", "period"), CASES)
@@ -62,7 +62,7 @@ def test_limits():
     assert least_worst_error(1.0, 0.0, 1e-3, most=4) == pytest.approx(2.0 / 4e-3)
 
 
-def climbed(noise, samples, starts=200):
+def climb_errors(noise, samples, starts=200):
     """Largest error of the adaptive quotient (T = L = 1) found by changes of single values of noise and f''.
 
     From random signs, and from the pair of signals behind the bound, one of which is the reading and the other one true.
@@ -85,9 +85,9 @@ def climbed(noise, samples, starts=200):
     for j in [*rng.permutation(2 * samples + 1)] * 4:
         turned = choice.copy()
         turned[:, j] = np.where(rng.random(starts) < 0.5, -turned[:, j], rng.uniform(-1.0, 1.0, starts))
-        found = errors(turned)
-        better = found > best
-        choice[better], best = turned[better], np.maximum(best, found)
+        errors_found = errors(turned)
+        better = errors_found > best
+        choice[better], best = turned[better], np.maximum(best, errors_found)
     return best.max()
 
 
@@ -96,21 +96,21 @@ def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_n
     """The pair of signals behind the bound makes it err by just that, and no search finds more."""
     least = least_exact_error(noise, 1.0, 1.0)
     assert least >= least_worst_error(noise, 1.0, 1.0)
-    found = climbed(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
-    assert found == pytest.approx(least, rel=1e-6)
+    errors_found = climb_errors(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
+    assert errors_found == pytest.approx(least, rel=1e-6)
 
 
-def proved(noise):
+def prove_bound(noise):
     """The bound of the proof in docs/theory.md (T = L = 1): the larger one over all noises that the readings may show."""
-    whole = np.arange(1, int(4.0 * math.sqrt(noise)) + 10)
+    periods = np.arange(1, int(4.0 * math.sqrt(noise)) + 10)
     worst = 0.0
-    for shown in np.linspace(0.0, noise, 1001):
-        level = 0.5 * whole - 2.0 * shown / whole
+    for shown_noise in np.linspace(0.0, noise, 1001):
+        level = 0.5 * periods - 2.0 * shown_noise / periods
         m = int((level <= 0.5 + 1e-12).sum())
         share = max((0.5 - level[m - 1]) / (level[m] - level[m - 1]), 0.0)
-        own = 0.5 * whole + 2.0 * noise / whole
-        direct = (1.0 - share) * own[m - 1] + share * own[m]
-        longer = whole[m if share > 1e-12 else m - 1 :]
+        errors_by_period = 0.5 * periods + 2.0 * noise / periods
+        direct = (1.0 - share) * errors_by_period[m - 1] + share * errors_by_period[m]
+        longer = periods[m if share > 1e-12 else m - 1 :]
         worst = max(worst, min(direct, (longer + 2.0 * noise / longer).min() - 0.5))
     return worst
 
@@ -119,16 +119,16 @@ def proved(noise):
     "noise", [0.0, 0.05, 0.145, 0.25, 0.4, 0.5, 0.6, 0.7, 0.9, 1.0, 1.3, 2.0, 4.0, 10.0, 33.0, 100.0, 1000.0]
 )
 def test_the_proof_gives_the_bound(noise):
-    ratio = proved(noise) / least_exact_error(noise, 1.0, 1.0)
+    ratio = prove_bound(noise) / least_exact_error(noise, 1.0, 1.0)
     assert 1.0 - 1e-9 <= ratio <= (1.21 if 0.0 < noise < 0.5 else 1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.145, 0.2, 0.4])
 def test_the_adaptive_quotient_under_little_noise(noise):
-    found = climbed(noise, 4) / least_exact_error(noise, 1.0, 1.0)
-    assert found <= (1.21 if noise else 1.0 + 1e-12)
+    errors_found = climb_errors(noise, 4) / least_exact_error(noise, 1.0, 1.0)
+    assert errors_found <= (1.21 if noise else 1.0 + 1e-12)
     # every noise that it takes for granted is there
-    assert found >= 0.999
+    assert errors_found >= 0.999
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

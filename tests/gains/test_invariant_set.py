@@ -33,10 +33,10 @@ def drawn_pushes(rng, n, parts=64):
     kinds = rng.integers(0, 3, n)
     w = rng.uniform(-1.0, 1.0, (n, parts))
     switch, sign = rng.random(n)[:, None], np.sign(rng.normal(size=n))[:, None]
-    at = (np.arange(parts) + 0.5) / parts
-    w = np.where(kinds[:, None] == 0, w, np.where(at < switch, sign, -sign))
+    points = (np.arange(parts) + 0.5) / parts
+    w = np.where(kinds[:, None] == 0, w, np.where(points < switch, sign, -sign))
     w = np.where(kinds[:, None] == 2, sign, w)
-    return w.mean(axis=1), (w * (1.0 - at)).mean(axis=1)
+    return w.mean(axis=1), (w * (1.0 - points)).mean(axis=1)
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
@@ -90,7 +90,7 @@ def test_no_sequence_of_a_short_horizon_exceeds_the_bounds(system):
     pushes = ((1.0, 0.5), (-1.0, -0.5), (0.0, 0.25))
     choices = np.array([(n, m, q, c) for n in (-1.0, 1.0) for m, q in pushes for c in (-1.0, 1.0)[: 1 + (system.push > 0)]])
     for start in ((0.0, 0.0), (2.0, 5.0), (-2.0, 5.0), (2.0, -5.0)):
-        e, g = (np.full(1, one) for one in start)
+        e, g = (np.full(1, number) for number in start)
         for k in range(5):
             pairs = np.array(list(itertools.product(range(len(e)), range(len(choices)))))
             taken = choices[pairs[:, 1]]
@@ -143,8 +143,8 @@ def test_forward_euler_with_a_large_lambda_has_a_set():
     system = ErrorSystem(False, 20.0, 1.5, 0.0)
     bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
     with jax.enable_x64(True):
-        found, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
-    assert 50.0 < found.worst <= bound <= 1.1 * found.worst
+        reached, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+    assert 50.0 < reached.worst <= bound <= 1.1 * reached.worst
 
 
 @pytest.mark.parametrize("implicit", [True, False])
@@ -160,6 +160,6 @@ def test_sets_of_one_height_cover_those_of_another():
     upper[coarse.half_count - 20 : coarse.half_count + 20] = rng.uniform(1.0, 9.0, 40)
     covered = fine.cover_set(coarse, upper)
     g = rng.uniform(-19.9, 19.9, 10_000) * coarse.dg
-    at = [np.floor(g / rows.dg).astype(int) + rows.half_count for rows in (coarse, fine)]
-    assert (covered[at[1]] >= upper[at[0]]).all()
+    points = [np.floor(g / rows.dg).astype(int) + rows.half_count for rows in (coarse, fine)]
+    assert (covered[points[1]] >= upper[points[0]]).all()
     assert covered.max() <= upper.max() + fine.lattice * (1.0 + 1e-6)

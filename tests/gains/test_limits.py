@@ -14,28 +14,30 @@ RANGE = (1.0, 100.0)
 NUM = 9
 
 
-def searched(error, *, chatter=lambda x, a: 0.0 * x, time=lambda x, a: 0.0 * x, exact=lambda x, a: 10.0 + 0.0 * x, **table):
+def build_search(
+    error, *, chatter=lambda x, a: 0.0 * x, time=lambda x, a: 0.0 * x, exact=lambda x, a: 10.0 + 0.0 * x, **table
+):
     """A search for lambda and alpha from 1 to 100, f_plus = 1, with one zoom; errors, their chatter, convergence times and
     margins to the exact condition are functions of both gains."""
-    found = GainSearch.__new__(GainSearch)
-    found.table = TuneTable.model_validate({"num": NUM, "margin_alpha": 1.001} | table)
-    found.sides, found.f_plus, found.limits = ("motor",), {"motor": 1.0}, {"lambda": RANGE, "alpha": RANGE}
-    found.scenarios = SimpleNamespace()
-    found.windows, found.candidates = [{"motor": found.limits}], {}
+    limits = GainSearch.__new__(GainSearch)
+    limits.table = TuneTable.model_validate({"num": NUM, "margin_alpha": 1.001} | table)
+    limits.sides, limits.f_plus, limits.limits = ("motor",), {"motor": 1.0}, {"lambda": RANGE, "alpha": RANGE}
+    limits.scenarios = SimpleNamespace()
+    limits.windows, limits.candidates = [{"motor": limits.limits}], {}
     for stage in range(2):
         if stage:
-            found.windows.append({"motor": found._zoom_in("motor")})
-        values = {gain: np.geomspace(*found.windows[-1]["motor"][gain], NUM) for gain in ("lambda", "alpha")}
+            limits.windows.append({"motor": limits._zoom_in("motor")})
+        values = {gain: np.geomspace(*limits.windows[-1]["motor"][gain], NUM) for gain in ("lambda", "alpha")}
         x, a = (axis.ravel() for axis in np.meshgrid(*values.values()))
         frame = pd.DataFrame({
             "lambda": x, "alpha": a, "converged": True, "velocity_rmse": error(x, a), "chatter": chatter(x, a),
             "convergence_time": time(x, a), "margin_alpha": 1.02 * a, "margin_exact": exact(x, a), "stage": stage,
         })  # fmt: skip
         frame["converged"] = np.isfinite(frame["velocity_rmse"])
-        found.candidates["motor"] = pd.concat(
-            [*found.candidates.values(), found._mark_feasible("motor", frame)], ignore_index=True
+        limits.candidates["motor"] = pd.concat(
+            [*limits.candidates.values(), limits._mark_feasible("motor", frame)], ignore_index=True
         )
-    return found
+    return limits
 
 
 def bowl(x, a):
@@ -45,22 +47,22 @@ def bowl(x, a):
 
 def test_of_an_optimum_inside_it_is_said_which_parts_of_the_error_balance():
     # mean squares: alpha / 10 of chatter, 10 / alpha of what is slow
-    search = searched(
+    search = build_search(
         lambda x, a: np.sqrt(a / 10.0 + 10.0 / a + np.log(x / 10.0) ** 2), chatter=lambda x, a: np.sqrt(a / 10.0)
     )
-    found = find_limits(search, "motor")
-    assert (found["binding"], found["range_ends"]) == ([], [])
-    ways = found["towards"]["alpha"]
+    limits = find_limits(search, "motor")
+    assert (limits["binding"], limits["range_ends"]) == ([], [])
+    ways = limits["towards"]["alpha"]
     assert [ways[way]["by"] for way in ("smaller", "larger")] == ["slow", "chatter"]
-    assert [found["towards"]["lambda"][way]["by"] for way in ("smaller", "larger")] == ["slow", "slow"]
-    at = ways["larger"]["at"]
+    assert [limits["towards"]["lambda"][way]["by"] for way in ("smaller", "larger")] == ["slow", "slow"]
+    larger_gain = ways["larger"]["at"]
     # a cell of the coarse map away
-    assert at == pytest.approx(10.0 * 100.0 ** (1.0 / (NUM - 1)))
-    assert ways["larger"]["change"] == pytest.approx(np.sqrt((at / 10.0 + 10.0 / at) / 2.0) - 1.0)
+    assert larger_gain == pytest.approx(10.0 * 100.0 ** (1.0 / (NUM - 1)))
+    assert ways["larger"]["change"] == pytest.approx(np.sqrt((larger_gain / 10.0 + 10.0 / larger_gain) / 2.0) - 1.0)
 
 
 def test_the_parts_of_another_error_are_not_known():
-    search = searched(bowl, chatter=lambda x, a: 0.5 * bowl(x, a))
+    search = build_search(bowl, chatter=lambda x, a: 0.5 * bowl(x, a))
     search.table = search.table.model_copy(update={"objective": "torque"})
     ways = find_limits(search, "motor")["towards"]["alpha"]
     assert [(way["limit"], way["by"]) for way in ways.values()] == [("error", None)] * 2
@@ -78,50 +80,50 @@ CONSTRAINTS = {
 @pytest.mark.parametrize("name", CONSTRAINTS)
 def test_a_constraint_that_forbids_less_error_binds(name):
     how, (gain, way) = CONSTRAINTS[name]
-    found = find_limits(searched(bowl, **how), "motor")
-    assert found["binding"] == [name]
-    assert [key for key, one in found["constraints"].items() if one["binds"]] == [name]
-    towards = found["towards"][gain][way]
+    limits = find_limits(build_search(bowl, **how), "motor")
+    assert limits["binding"] == [name]
+    assert [key for key, entry in limits["constraints"].items() if entry["binds"]] == [name]
+    towards = limits["towards"][gain][way]
     assert (towards["limit"], towards["missed"]) == ("constraint", [name])
     assert towards["change"] < -0.01
     # the limit is within a step of the zoom
     step = 100.0 ** (2.0 / (NUM - 1) ** 2)
-    assert 1.0 <= found["constraints"][name]["room"] <= step * 1.001
-    others = [one["limit"] for ways in found["towards"].values() for one in ways.values() if one is not towards]
-    assert others == ["error"] * 3
+    assert 1.0 <= limits["constraints"][name]["room"] <= step * 1.001
+    other_limits = [entry["limit"] for ways in limits["towards"].values() for entry in ways.values() if entry is not towards]
+    assert other_limits == ["error"] * 3
 
 
 def test_a_constraint_whose_gains_are_no_better_does_not_bind():
-    found = find_limits(searched(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
-    assert found["binding"] == []
-    smaller = found["towards"]["lambda"]["smaller"]
+    limits = find_limits(build_search(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
+    assert limits["binding"] == []
+    smaller = limits["towards"]["lambda"]["smaller"]
     # both are said
     assert (smaller["limit"], smaller["missed"]) == ("error", ["margin_exact"])
 
 
 def test_a_time_of_zero_has_room_without_end():
-    found = find_limits(searched(bowl, longest_convergence=1.0), "motor")
-    assert found["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
+    limits = find_limits(build_search(bowl, longest_convergence=1.0), "motor")
+    assert limits["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
 
 
 def test_ends_of_the_range_and_runs_that_diverge():
-    found = find_limits(searched(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
-    assert found["towards"]["lambda"]["smaller"]["limit"] == "range"
-    assert found["towards"]["alpha"]["smaller"]["limit"] == "range"
-    assert found["range_ends"] == ["smaller lambda", "smaller alpha"]
-    larger = found["towards"]["lambda"]["larger"]
+    limits = find_limits(build_search(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
+    assert limits["towards"]["lambda"]["smaller"]["limit"] == "range"
+    assert limits["towards"]["alpha"]["smaller"]["limit"] == "range"
+    assert limits["range_ends"] == ["smaller lambda", "smaller alpha"]
+    larger = limits["towards"]["lambda"]["larger"]
     assert (larger["limit"], larger["change"], larger["missed"]) == ("error", None, ["converged"])
 
 
 def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
-    found = find_limits(searched(lambda x, a: 1.0 + np.log(a) + np.log(x / 10.0) ** 2, margin_alpha=1.02), "motor")
-    assert found["binding"] == ["margin_alpha"]
-    assert found["range_ends"] == []
-    assert found["towards"]["alpha"]["smaller"]["at"] is None
+    limits = find_limits(build_search(lambda x, a: 1.0 + np.log(a) + np.log(x / 10.0) ** 2, margin_alpha=1.02), "motor")
+    assert limits["binding"] == ["margin_alpha"]
+    assert limits["range_ends"] == []
+    assert limits["towards"]["alpha"]["smaller"]["at"] is None
 
 
 def test_between_two_rows_of_the_coarse_map_errors_are_interpolated():
-    search = searched(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
+    search = build_search(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
     line = pd.DataFrame(find_limits(search, "motor")["profiles"]["alpha"])
     best = search.best_candidate("motor")["lambda"]
     exact = np.sqrt(np.log(best / 13.0) ** 2 + np.log(line["alpha"] / 10.0) ** 2 + 1.0)

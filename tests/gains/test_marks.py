@@ -26,7 +26,7 @@ STUDY = read_config(
 
 @pytest.fixture(scope="module")
 def marks():
-    return {one["name"]: one for one in judge_marks(STUDY, STUDY, Stages(STUDY, "verify"))}
+    return {mark["name"]: mark for mark in judge_marks(STUDY, STUDY, Stages(STUDY, "verify"))}
 
 
 def test_gains_that_hold_the_exact_condition_need_no_explanation(marks):
@@ -37,56 +37,56 @@ def test_gains_that_hold_the_exact_condition_need_no_explanation(marks):
 def test_alpha_below_the_disturbance(marks):
     trace = run(STUDY).trace
     missing = np.abs(trace["motor.acceleration"] - (trace["u"] - 0.15 * trace["motor.velocity"]) / 0.05)
-    found = marks["below"]["on_this_disturbance"]
-    assert found["largest_disturbance"] == pytest.approx(missing.max())
-    assert found["share_above_alpha"] == pytest.approx((missing > 1.9).mean())
-    assert 0.05 < found["share_above_alpha"] < 0.5
-    assert found["excursion_predicted"] == pytest.approx(found["excursion_simulated"], rel=1e-4)
+    explanation = marks["below"]["on_this_disturbance"]
+    assert explanation["largest_disturbance"] == pytest.approx(missing.max())
+    assert explanation["share_above_alpha"] == pytest.approx((missing > 1.9).mean())
+    assert 0.05 < explanation["share_above_alpha"] < 0.5
+    assert explanation["excursion_predicted"] == pytest.approx(explanation["excursion_simulated"], rel=1e-4)
     # friction takes some of what a pulse makes; two pulses are the largest of it
-    assert 0.0 < found["excursion_predicted"] < ((missing - 1.9).clip(lower=0.0) * 1e-3).sum()
+    assert 0.0 < explanation["excursion_predicted"] < ((missing - 1.9).clip(lower=0.0) * 1e-3).sum()
     # lambda alone is too large for the cycle of a sine
-    assert found["sine_cycle"] == {"least_predicted": np.inf, "least_simulated": None}
+    assert explanation["sine_cycle"] == {"least_predicted": np.inf, "least_simulated": None}
 
 
 def test_alpha_above_the_disturbance_but_too_small_a_lambda(marks):
-    one = marks["small"]
-    found = one["on_this_disturbance"]
-    assert one["peak_ratio"] > 3.0 and one["converged"]
-    assert found["share_above_alpha"] == 0.0
+    mark = marks["small"]
+    explanation = mark["on_this_disturbance"]
+    assert mark["peak_ratio"] > 3.0 and mark["converged"]
+    assert explanation["share_above_alpha"] == 0.0
     # jumps of dry friction are no slow disturbance; a tenth is what they cost here
-    assert found["largest_predicted"] == pytest.approx(found["largest_simulated"], rel=0.1)
-    assert found["tenth_predicted"] == pytest.approx(found["tenth_simulated"], rel=0.05)
-    cycle = found["sine_cycle"]
+    assert explanation["largest_predicted"] == pytest.approx(explanation["largest_simulated"], rel=0.1)
+    assert explanation["tenth_predicted"] == pytest.approx(explanation["tenth_simulated"], rel=0.05)
+    cycle = explanation["sine_cycle"]
     assert cycle["frequency"] == 2.0 * cycle["least_predicted"]
     assert 0.6 * cycle["least_predicted"] < cycle["least_simulated"] < cycle["least_predicted"]
     for name in ("stable", "threshold"):
         assert cycle["predicted"][name] == pytest.approx(cycle["simulated"][name], rel=0.15)
 
 
-def moved(position_error):
+def explain_position_error(position_error):
     """The explanation of the small gains from a position error."""
     data = STUDY.to_dict() | {"verify": {"marks": MARKS[1:2]}}
     data["observer"]["motor"] |= {"position_error": position_error, "velocity_error": 0.0}
     study = read_config(data)
-    (one,) = judge_marks(study, study, Stages(study, "verify"))
-    return one["on_this_disturbance"]
+    (mark,) = judge_marks(study, study, Stages(study, "verify"))
+    return mark["on_this_disturbance"]
 
 
 def test_a_start_beside_its_place_counts_by_its_energy():
-    found = moved(-0.0003)
-    assert found["largest_predicted"] == pytest.approx(np.sqrt(2.0 * 2.3 * 0.0003), rel=0.05)
-    assert found["tenth_predicted"] == pytest.approx(found["tenth_simulated"], rel=0.1)
+    explanation = explain_position_error(-0.0003)
+    assert explanation["largest_predicted"] == pytest.approx(np.sqrt(2.0 * 2.3 * 0.0003), rel=0.05)
+    assert explanation["tenth_predicted"] == pytest.approx(explanation["tenth_simulated"], rel=0.1)
 
 
 def test_a_larger_start_ends_in_a_limit_cycle():
     """Friction of this size under 2 Hz is no slow disturbance: only the simulation shows that."""
-    found = moved(-0.01)
-    assert found["sine_cycle"]["least_simulated"] < 2.0
-    assert found["largest_predicted"] > 0.2
-    assert found["tenth_simulated"] == np.inf
+    explanation = explain_position_error(-0.01)
+    assert explanation["sine_cycle"]["least_simulated"] < 2.0
+    assert explanation["largest_predicted"] > 0.2
+    assert explanation["tenth_simulated"] == np.inf
 
 
 def test_without_alpha_there_is_nothing_to_explain():
     study = read_config(STUDY.to_dict() | {"verify": {"marks": [{"name": "none", "lambda": 1.0, "alpha": 0.0}]}})
-    (one,) = judge_marks(study, study, Stages(study, "verify"))
-    assert one["on_this_disturbance"] is None
+    (mark,) = judge_marks(study, study, Stages(study, "verify"))
+    assert mark["on_this_disturbance"] is None

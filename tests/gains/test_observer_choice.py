@@ -23,8 +23,8 @@ def study(changes=None, **table):
     """The rigid drive under a constant torque that the observers do not know."""
     base = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5, "run.duration": 0.4}
     effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
-    given = {"observers": KINDS, "trials": 16, "refine": 2} | table
-    return rigid(base | (changes or {}), effects=effects, tune=given, sweep={"seeds": 2})
+    arguments = {"observers": KINDS, "trials": 16, "refine": 2} | table
+    return rigid(base | (changes or {}), effects=effects, tune=arguments, sweep={"seeds": 2})
 
 
 @pytest.fixture(scope="module")
@@ -36,22 +36,22 @@ def test_ratios_have_the_interval_of_a_paired_test():
     rng = np.random.default_rng(0)
     common = rng.uniform(1.0, 5.0, 10)
     errors = {"a": 2.0 * common * np.exp(0.1 * rng.standard_normal(10)), "b": common, "c": np.full(10, np.inf)}
-    found = rank_kinds(errors)
-    assert list(found) == ["b", "a", "c"]
+    ranking = rank_kinds(errors)
+    assert list(ranking) == ["b", "a", "c"]
     expected = stats.ttest_rel(np.log(errors["a"]), np.log(errors["b"])).confidence_interval()
-    np.testing.assert_allclose((found["a"]["low"], found["a"]["high"]), np.exp(expected))
-    assert found["a"]["ratio"] == pytest.approx(stats.gmean(errors["a"]) / stats.gmean(errors["b"]))
-    assert (found["b"]["error"], found["b"]["worst"]) == (pytest.approx(stats.gmean(common)), common.max())
-    assert [found["b"][key] for key in ("ratio", "low", "high")] == [1.0] * 3
-    assert set(found["c"].values()) == {None}
-    assert list_ties(found) == []
+    np.testing.assert_allclose((ranking["a"]["low"], ranking["a"]["high"]), np.exp(expected))
+    assert ranking["a"]["ratio"] == pytest.approx(stats.gmean(errors["a"]) / stats.gmean(errors["b"]))
+    assert (ranking["b"]["error"], ranking["b"]["worst"]) == (pytest.approx(stats.gmean(common)), common.max())
+    assert [ranking["b"][key] for key in ("ratio", "low", "high")] == [1.0] * 3
+    assert set(ranking["c"].values()) == {None}
+    assert list_ties(ranking) == []
 
 
 def test_equal_runs_have_no_interval():
     errors = {kind: np.full(8, 0.1 + 1e-6 * i) for i, kind in enumerate("ab")}
-    found = rank_kinds(errors)
-    assert list_ties(found) == []
-    assert all(map(runs_are_equal, found.values()))
+    ranking = rank_kinds(errors)
+    assert list_ties(ranking) == []
+    assert all(map(runs_are_equal, ranking.values()))
     errors["b"][3] *= 1.01
     assert not runs_are_equal(rank_kinds(errors)["b"])
 
@@ -60,26 +60,26 @@ def test_kinds_that_noise_alone_parts_are_not_told_apart():
     """Of two kinds with the same errors but for noise, the second's interval holds 1 in 19 of 20 draws or more: the first
     is the better one by chance, so that its ratio begins above 1."""
     rng = np.random.default_rng(1)
-    told = 0
+    count = 0
     for _ in range(400):
         errors = {kind: np.exp(0.2 * rng.standard_normal(8)) for kind in "ab"}
-        told += not list_ties(rank_kinds(errors))
-    assert told / 400 == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 400))
+        count += not list_ties(rank_kinds(errors))
+    assert count / 400 == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 400))
 
 
 def test_the_search_agrees_with_brute_force(chosen):
     """A sweep of its own over a fine grid finds no gains that are much better."""
     config = read_config(study())
-    found = chosen.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
+    ranking = chosen.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
     data = config.to_dict()
     data.pop("tune")
-    data["observer"] = {"kind": "luenberger", "motor": found["gains"] | {"velocity_error": 0.1}}
+    data["observer"] = {"kind": "luenberger", "motor": ranking["gains"] | {"velocity_error": 0.1}}
     axes = {"bandwidth": np.geomspace(1.0, 3e3, 60), "damping": np.geomspace(0.003, 10.0, 40)}
     data["axes"] = [listed(f"observer.motor.{key}", *values) for key, values in axes.items()]
     frame = sweep(data).frame
     errors = frame.groupby(list(map("observer.motor.{}".format, axes)))["motor.velocity_rmse"].max()
     # between its values the search may find better ones
-    assert 0.85 * errors.min() < found["error_in_search"] < 1.02 * errors.min()
+    assert 0.85 * errors.min() < ranking["error_in_search"] < 1.02 * errors.min()
 
 
 def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
@@ -88,21 +88,21 @@ def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
     assert chosen.summary["seeds"] == [0, 1]
     assert chosen.summary["holdout"]["seeds"] == [2, 9]
     logs = {}
-    for kind, one in point["kinds"].items():
+    for kind, kind_data in point["kinds"].items():
         data = read_config(study()).to_dict()
         data.pop("tune")
         data |= {"excitation": SINE, "sweep": {"seeds": 8, "first_seed": 2}}
-        data["observer"] = {"kind": kind, "motor": one["gains"] | {"velocity_error": 0.1}}
+        data["observer"] = {"kind": kind, "motor": kind_data["gains"] | {"velocity_error": 0.1}}
         # lanes that differ are quickly compiled
         data["axes"] = [listed("observer.motor.velocity_error", 0.1)]
         errors = sweep(data).frame["motor.velocity_rmse"]
-        assert one["worst"] == pytest.approx(errors.max())
+        assert kind_data["worst"] == pytest.approx(errors.max())
         logs[kind] = np.log(errors).mean()
-        assert one["error"] == pytest.approx(math.exp(logs[kind]), rel=1e-4)
+        assert kind_data["error"] == pytest.approx(math.exp(logs[kind]), rel=1e-4)
     assert point["best"] == min(logs, key=logs.__getitem__)
-    for kind, one in point["kinds"].items():
-        assert one["ratio"] == pytest.approx(math.exp(logs[kind] - logs[point["best"]]), rel=1e-4)
-        assert one["low"] <= one["ratio"] <= one["high"]
+    for kind, kind_data in point["kinds"].items():
+        assert kind_data["ratio"] == pytest.approx(math.exp(logs[kind] - logs[point["best"]]), rel=1e-4)
+        assert kind_data["low"] <= kind_data["ratio"] <= kind_data["high"]
 
 
 def test_the_chosen_observer_can_be_included(chosen, tmp_path):
@@ -123,28 +123,28 @@ def test_a_point_of_a_map_is_what_the_study_there_gives(tmp_path):
     """Also where the point is fixed at compile time; a finished search is only read."""
     axes = [listed("run.sample_period", 1e-3, 2e-3), listed("encoders.noise", 1e-5, 1e-4)]
     table = {"observers": ["super_twisting", "kalman"], "trials": 8, "refine": 1}
-    whole = tune(study(**table, axes=axes), tmp_path)
-    assert [list(one["values"].values()) for one in whole.summary["points"]] == [
+    choice = tune(study(**table, axes=axes), tmp_path)
+    assert [list(kind_data["values"].values()) for kind_data in choice.summary["points"]] == [
         [1e-3, 1e-5], [1e-3, 1e-4], [2e-3, 1e-5], [2e-3, 1e-4]
     ]  # fmt: skip
     alone = tune(study({"run.sample_period": 2e-3, "encoders.noise": 1e-4}, **table))
-    for kind, one in alone.summary["points"][0]["sides"]["motor"]["kinds"].items():
-        there = whole.summary["points"][3]["sides"]["motor"]["kinds"][kind]
-        assert there == {key: pytest.approx(value) for key, value in one.items()}
+    for kind, kind_data in alone.summary["points"][0]["sides"]["motor"]["kinds"].items():
+        there = choice.summary["points"][3]["sides"]["motor"]["kinds"][kind]
+        assert there == {key: pytest.approx(value) for key, value in kind_data.items()}
     again = tune(study(**table, axes=axes), tmp_path)
-    assert (again.cost["lanes"], again.summary) == (0.0, whole.summary)
-    assert whole.cost["lanes"] == 4 * 2 * (2 * 8 * 2 + 8)
+    assert (again.cost["lanes"], again.summary) == (0.0, choice.summary)
+    assert choice.cost["lanes"] == 4 * 2 * (2 * 8 * 2 + 8)
 
 
 def test_the_low_pass_is_searched_with_the_torque_and_each_side_has_its_own():
-    found = tune(
+    ranking = tune(
         small(tune={"observers": ["super_twisting", "extended_state"], "objective": "torque", "trials": 8, "refine": 1})
     )
-    sides = found.summary["points"][0]["sides"]
+    sides = ranking.summary["points"][0]["sides"]
     constants = [sides[side]["kinds"]["extended_state"]["gains"]["equivalent_control.time_constant"] for side in sides]
     assert constants[0] != constants[1]
-    kind = found.summary["for_both_sides"]
-    text = observer_toml(found.summary)
+    kind = ranking.summary["for_both_sides"]
+    text = observer_toml(ranking.summary)
     assert f'kind = "{kind}"' in text
     assert "# A study has one equivalent_control.time_constant" in text
 
@@ -155,22 +155,22 @@ def test_drives_of_an_uncertain_model_are_served_at_once():
     worst, nominal = (tune(study(**table, worst_over_uncertainty=flag)).summary for flag in (True, False))
     assert len(worst["scenarios"]) == 5
     assert "worst over 5 drives" in " ".join(worst["remarks"])
-    for kind, one in nominal["points"][0]["sides"]["motor"]["kinds"].items():
-        assert worst["points"][0]["sides"]["motor"]["kinds"][kind]["error"] > 0.99 * one["error"]
+    for kind, kind_data in nominal["points"][0]["sides"]["motor"]["kinds"].items():
+        assert worst["points"][0]["sides"]["motor"]["kinds"][kind]["error"] > 0.99 * kind_data["error"]
 
 
 def test_what_is_too_slow_is_not_chosen():
-    found = tune(study(observers=["luenberger", "dirty_derivative"], longest_convergence=1e-9)).summary
-    side = found["points"][0]["sides"]["motor"]
-    assert (side["best"], found["for_both_sides"], observer_toml(found)) == (None, None, None)
+    ranking = tune(study(observers=["luenberger", "dirty_derivative"], longest_convergence=1e-9)).summary
+    side = ranking["points"][0]["sides"]["motor"]
+    assert (side["best"], ranking["for_both_sides"], observer_toml(ranking)) == (None, None, None)
 
 
 def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
     side = SideSearch({"a": (1.0, 100.0), "b": (2.0, 2.0)}, {"a": (1.0, 100.0), "b": (2.0, 2.0)}, {})
-    tried = side.trial_gains(np.array([[0.0], [0.5], [1.0]]))
-    np.testing.assert_allclose(tried["a"], [1.0, 10.0, 100.0])
-    assert set(tried["b"]) == {2.0}
-    side.zoom_in(tried, np.array([1.0, 2.0, 3.0]))
+    trials = side.trial_gains(np.array([[0.0], [0.5], [1.0]]))
+    np.testing.assert_allclose(trials["a"], [1.0, 10.0, 100.0])
+    assert set(trials["b"]) == {2.0}
+    side.zoom_in(trials, np.array([1.0, 2.0, 3.0]))
     assert (side.best, side.error, side.gains_at_ends()) == ({"a": 1.0, "b": 2.0}, 1.0, ["a"])
     low, high = side.window["a"]
     assert (low, high) == (1.0, pytest.approx(100.0 ** (1.0 / 3.0)))
@@ -202,9 +202,9 @@ def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
     ],
 )
 def test_wrong_tables_get_one_line(table, message):
-    given = rigid(tune=table)
+    arguments = rigid(tune=table)
     with pytest.raises(InputError, match=message) as caught:
-        tune(given)
+        tune(arguments)
     assert "\n" not in str(caught.value)
 
 

@@ -12,11 +12,11 @@ def test_peaks_of_a_damped_error_and_none_of_its_chatter():
     t, turns = np.arange(0.0, 6.0, 1e-3), 8.0
     error = np.exp(-t) * np.sin(turns * t)
     rate = np.exp(-t) * (turns * np.cos(turns * t) - np.sin(turns * t))
-    at, peaks = error_peaks(error, rate, 40)
+    crossings, peaks = error_peaks(error, rate, 40)
     # slopes at the zeros k pi / turns; those of the last quarter's size are left out
     zeros = np.arange(len(peaks)) * np.pi / turns
     np.testing.assert_allclose(peaks, turns * np.cos(turns * zeros) * np.exp(-zeros), rtol=1e-3)
-    np.testing.assert_allclose(t[at], zeros, atol=1e-3)
+    np.testing.assert_allclose(t[crossings], zeros, atol=1e-3)
     assert 6 < len(peaks) < 14
     assert len(error_peaks(error, rate, 5)[1]) == 5
 
@@ -59,5 +59,7 @@ def test_the_majorant_lies_outside_of_the_worst_path(lambda_):
     np.testing.assert_allclose(slope[:100] ** 2, 2.0 * (alpha - f_plus) * (e[:100].max() - e[:100]), atol=1e-12)
     assert slope[0] == peak and slope[101] == pytest.approx(-ratio * peak) and e[101] == 0.0
     assert slope[203] == pytest.approx(ratio**2 * peak) and e[102:].max() <= 0.0
-    x, v = (size * one for size, one in zip((peak**2, peak), worst_half_cycle(lambda_, alpha, f_plus), strict=True))
+    x, v = (
+        size * coordinate for size, coordinate in zip((peak**2, peak), worst_half_cycle(lambda_, alpha, f_plus), strict=True)
+    )
     assert x.max() < e.max() and v.min() > slope[:102].min()

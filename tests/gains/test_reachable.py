@@ -29,67 +29,71 @@ def noises(states):
     ])  # fmt: skip
 
 
-def searched(kind, gains, most=50_000):
+def explore_kind(kind, gains, most=50_000):
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
-    rest = observer.start(zero, zero, lambda v: v, jnp.ones(()))
+    rest_state = observer.start(zero, zero, lambda v: v, jnp.ones(()))
     return (
         observer,
-        rest,
-        explore(build_error_step(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.further)]), most),
+        rest_state,
+        explore(build_error_step(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest_state.further)]), most),
     )
 
 
 def errors_of(observer, rest, noise, push):
     """Velocity errors at the samples of a double integrator: its own simulation, with true motion."""
 
-    def one(carry, given):
+    def ones_of_step(carry, given):
         state, position, velocity = carry
         eta, d = given
         state, estimate = observer.step(state, position + eta, lambda v: 0.0 * v, jnp.ones(()))
         return (state, position + velocity + 0.5 * d, velocity + d), estimate.velocity - velocity
 
     zero = jnp.zeros(())
-    return jax.lax.scan(one, (rest, zero, zero), (jnp.asarray(noise), jnp.asarray(push)))[1]
+    return jax.lax.scan(ones_of_step, (rest, zero, zero), (jnp.asarray(noise), jnp.asarray(push)))[1]
 
 
 @pytest.mark.parametrize(("kind", "gains"), KINDS)
 def test_the_way_leads_to_the_error_that_is_found(kind, gains):
-    observer, rest, found = searched(kind, gains)
-    assert np.abs(found.noise).max() <= NOISE
-    assert set(found.sign) <= {-1.0, 1.0} and not found.push.any()
-    errors = errors_of(observer, rest, found.noise, found.sign)
-    assert abs(errors[-1]) == pytest.approx(found.worst, rel=1e-9)
-    assert len(errors) <= found.state_count <= 50_000
+    observer, rest_state, result = explore_kind(kind, gains)
+    assert np.abs(result.noise).max() <= NOISE
+    assert set(result.sign) <= {-1.0, 1.0} and not result.push.any()
+    errors = errors_of(observer, rest_state, result.noise, result.sign)
+    assert abs(errors[-1]) == pytest.approx(result.worst, rel=1e-9)
+    assert len(errors) <= result.state_count <= 50_000
 
 
 @pytest.mark.parametrize(("kind", "gains"), KINDS)
 def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains):
-    observer, rest, found = searched(kind, gains)
+    observer, rest_state, result = explore_kind(kind, gains)
     push = np.array(list(itertools.product([-1.0, 1.0], repeat=4)))
-    noise = NOISE * np.array([(1.0, *one) for one in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
+    noise = NOISE * np.array([(1.0, *ones_of_step) for ones_of_step in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
     pairs = np.repeat(noise, len(push), axis=0), np.tile(np.column_stack([push, push[:, -1]]), (len(noise), 1))
-    assert found.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest, n, d))(*pairs)).max()
+    assert result.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest_state, n, d))(*pairs)).max()
 
 
 @pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.999), ((0.15, 1.0), 0.995), ((0.1, 0.3), 0.998)])
 def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
     """That is the sum of absolute sensitivities."""
-    one, unit = jnp.ones(()), np.eye(3)
+    ones_of_step, unit = jnp.ones(()), np.eye(3)
     observer = Luenberger(*map(jnp.asarray, gains))
-    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, one)
-    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, one)
-    moved, seen, push = -np.column_stack([new.position, new.velocity]), np.asarray(estimate.velocity), np.array([0.5, 1.0])
+    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, ones_of_step)
+    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, ones_of_step)
+    moved, seen_velocity, push = (
+        -np.column_stack([new.position, new.velocity]),
+        np.asarray(estimate.velocity),
+        np.array([0.5, 1.0]),
+    )
 
     def step(states, noise):
-        given = np.column_stack([states, noise])
-        return given @ moved, np.abs(given @ seen)
+        sample_inputs = np.column_stack([states, noise])
+        return sample_inputs @ moved, np.abs(sample_inputs @ seen_velocity)
 
-    found, worst, left = explore(step, noises, push[None]), NOISE * abs(seen[2]), seen[:2]
+    result, worst, left = explore(step, noises, push[None]), NOISE * abs(seen_velocity[2]), seen_velocity[:2]
     for _ in range(400):
         worst, left = worst + NOISE * abs(moved[2] @ left) + abs(push @ left), moved[:2] @ left
-    assert share * worst <= found.worst <= worst * (1.0 + 1e-9)
+    assert share * worst <= result.worst <= worst * (1.0 + 1e-9)
 
 
 def test_more_errors_kept_find_more():
-    worst = [searched(ImplicitSuperTwisting, (1.5, 1.1), most)[2].worst for most in (2_000, 100_000)]
+    worst = [explore_kind(ImplicitSuperTwisting, (1.5, 1.1), most)[2].worst for most in (2_000, 100_000)]
     assert worst[0] < worst[1]

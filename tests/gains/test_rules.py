@@ -31,17 +31,17 @@ SUFFICIENT = SCALE_FREE | {"ordered_and_above", "usual_pair", "small_pair"}
 
 
 @pytest.fixture(scope="module")
-def judged():
+def judged_rules():
     """Of all rules, by name, on a map."""
     lambda_, alpha = np.meshgrid(LAMBDA, ALPHA, indexing="ij")
     ratio = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha)))
-    return {one["name"]: one for one in judge_rules(ALPHA, LAMBDA, ratio)}
+    return {judgement["name"]: judgement for judgement in judge_rules(ALPHA, LAMBDA, ratio)}
 
 
 def test_all_rules_are_judged(judged):
     assert list(judged) == list(RULES)
-    assert {name for name, one in judged.items() if one["kind"] == "region"} == set(STATED)
-    assert all(one["source"] and one["states"] for one in judged.values())
+    assert {name for name, judgement in judged.items() if judgement["kind"] == "region"} == set(STATED)
+    assert all(judgement["source"] and judgement["states"] for judgement in judged.values())
 
 
 @pytest.mark.parametrize("name", STATED)
@@ -51,24 +51,24 @@ def test_region_is_the_one_that_is_stated(name):
     # half of them in the units of f_plus, half as numbers
     unit = np.where(np.arange(600) % 2, f_plus, 1.0)
     alpha, lambda_ = unit * 10.0 ** draw.uniform(-1.0, 1.5, 600), np.sqrt(unit) * 10.0 ** draw.uniform(-1.0, 1.5, 600)
-    found = [
-        bool(allows_gains(RULES[name], *np.array([[one], [two]]), f)[0])
-        for one, two, f in zip(lambda_, alpha, f_plus, strict=True)
+    judgements = [
+        bool(allows_gains(RULES[name], *np.array([[judgement], [two]]), f)[0])
+        for judgement, two, f in zip(lambda_, alpha, f_plus, strict=True)
     ]
-    expected = [bool(STATED[name](*given)) for given in zip(lambda_, alpha, f_plus, strict=True)]
+    expected = [bool(STATED[name](*numbers)) for numbers in zip(lambda_, alpha, f_plus, strict=True)]
     assert 10 < sum(expected) < 590
-    assert found == expected
+    assert judgements == expected
 
 
 def test_which_are_sufficient_and_which_depend_on_units(judged):
-    assert {name for name, one in judged.items() if one["sufficient"]} == SUFFICIENT
-    assert {name for name, one in judged.items() if one.get("scale_free")} == SCALE_FREE
-    for name, one in judged.items():
-        assert (one["counterexample"] is None) == (name in SUFFICIENT)
-        assert one.get("alpha_below_f_plus", False) == (name not in SUFFICIENT)
+    assert {name for name, judgement in judged.items() if judgement["sufficient"]} == SUFFICIENT
+    assert {name for name, judgement in judged.items() if judgement.get("scale_free")} == SCALE_FREE
+    for name, judgement in judged.items():
+        assert (judgement["counterexample"] is None) == (name in SUFFICIENT)
+        assert judgement.get("alpha_below_f_plus", False) == (name not in SUFFICIENT)
         if name in SUFFICIENT:
-            assert one["margin"] > 1.0
-            assert one.get("cells", {}).get("counterexamples", 0) == 0
+            assert judgement["margin"] > 1.0
+            assert judgement.get("cells", {}).get("counterexamples", 0) == 0
 
 
 @pytest.mark.parametrize("name", sorted(SUFFICIENT & set(STATED)))
@@ -90,8 +90,8 @@ def test_no_gains_of_a_sufficient_rule_fail(name):
 @pytest.mark.parametrize("name", sorted(set(RULES) - SUFFICIENT))
 def test_counterexamples_in_the_observers_own_states(name, judged):
     """An adversary who sees the error: its largest push outward, then homeward."""
-    found = judged[name]["counterexample"]
-    f_plus, alpha, lambda_ = (found[key] for key in ("f_plus", "alpha", "lambda"))
+    judgements = judged[name]["counterexample"]
+    f_plus, alpha, lambda_ = (judgements[key] for key in ("f_plus", "alpha", "lambda"))
     assert STATED[name](lambda_, alpha, f_plus)
 
     def slope(t, s):
@@ -103,19 +103,19 @@ def test_counterexamples_in_the_observers_own_states(name, judged):
 
     passes.terminal, passes.direction = True, -1
     unit = np.sqrt(f_plus)
-    one = solve_ivp(
+    judgement = solve_ivp(
         slope, (0.0, 40.0 / unit), [0.0, unit], events=passes, rtol=1e-8, atol=1e-10 * f_plus, max_step=0.01 / unit
     )
     if alpha < f_plus:
-        assert found["peak_ratio_simulated"] == np.inf
-        assert one.status == 0
-        assert one.y[1, -1] > 1.5 * unit
+        assert judgements["peak_ratio_simulated"] == np.inf
+        assert judgement.status == 0
+        assert judgement.y[1, -1] > 1.5 * unit
         return
-    assert one.status == 1
-    ratio = -one.y[1, -1] / unit
+    assert judgement.status == 1
+    ratio = -judgement.y[1, -1] / unit
     assert ratio > 1.0
-    assert ratio == pytest.approx(found["peak_ratio_simulated"], rel=2e-3)
-    assert found["peak_ratio"] == pytest.approx(found["peak_ratio_simulated"], rel=1e-5)
+    assert ratio == pytest.approx(judgements["peak_ratio_simulated"], rel=2e-3)
+    assert judgements["peak_ratio"] == pytest.approx(judgements["peak_ratio_simulated"], rel=1e-5)
 
 
 @pytest.mark.parametrize("name", STATED)

@@ -15,11 +15,11 @@ def stage(folder, changes=None, **given):
     """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
     study = read_config(thirty(**(changes or {})))
     with open_stages(study, "tune", folder, None, **given) as stages:
-        found = dict(stages.manifest)
+        manifest = dict(stages.manifest)
         stages.write_manifest(pilot=1.5)
         table = stages.read_or_compute("table.parquet", lambda: pd.DataFrame({"x": [1.0, 2.0]}))
         stages.run(study, "coarse")
-        return stages.cost["lanes"], found, table
+        return stages.cost["lanes"], manifest, table
 
 
 def test_a_damaged_manifest_is_written_anew(tmp_path):
@@ -28,11 +28,11 @@ def test_a_damaged_manifest_is_written_anew(tmp_path):
     before = path.read_bytes()
     path.write_bytes(before[: len(before) // 2])
     # what it said is found again; the stage's parts are there
-    lanes, found, _ = stage(tmp_path)
-    assert (lanes, found) == (0, {})
+    lanes, manifest, _ = stage(tmp_path)
+    assert (lanes, manifest) == (0, {})
     assert path.read_bytes() == before
-    lanes, found, _ = stage(tmp_path)
-    assert lanes == 0 and found["pilot"] == 1.5
+    lanes, manifest, _ = stage(tmp_path)
+    assert lanes == 0 and manifest["pilot"] == 1.5
 
 
 def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
@@ -46,7 +46,7 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
     with pytest.raises(InputError, match="holds another study"):
         stage(tmp_path, {"encoders": {"noise": 1e-3}})
     assert (path.read_bytes(), parts(tmp_path / "tune" / "coarse")) == before
-    assert sorted(one.name for one in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
+    assert sorted(path.name for path in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
     # of a command that is not there nobody can say whose it is
     with pytest.raises(InputError, match="is damaged"), open_stages(read_config(thirty()), "verify", tmp_path, None):
         pass
@@ -65,14 +65,16 @@ def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
     """The third one has another drive, and figures of all are those of studies by themselves."""
     compiled = []
     monkeypatch.setattr(
-        programs, "_compile_fused", lambda *given, real=programs._compile_fused: compiled.append(given) or real(*given)
+        programs, "_compile_fused", lambda *options, real=programs._compile_fused: compiled.append(options) or real(*options)
     )
     axes = [[listed(ALPHA, *alphas), listed(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
     inertias = 0.05, 0.05, 0.06
-    studies = [rigid({"drive.motor_inertia": one}, axes=each) for one, each in zip(inertias, axes, strict=True)]
+    studies = [
+        rigid({"drive.motor_inertia": path}, axes=study_axes) for path, study_axes in zip(inertias, axes, strict=True)
+    ]
     with open_stages(read_config(studies[0]), "tune", None, None, backend="fused") as stages:
-        found = [stages.run(study, str(i)).frame for i, study in enumerate(studies)]
+        manifest = [stages.run(study, str(i)).frame for i, study in enumerate(studies)]
     assert len(compiled) == 2
-    for frame, study in zip(found, studies, strict=True):
+    for frame, study in zip(manifest, studies, strict=True):
         pd.testing.assert_frame_equal(frame, sweep(study, backend="fused").frame, check_exact=True)
     assert len(compiled) == 5

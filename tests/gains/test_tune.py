@@ -54,8 +54,8 @@ def test_optimum_agrees_with_brute_force_over_a_fine_grid(chosen):
     frame = sweep(study).frame
     groups = frame.groupby(["observer.motor.alpha", "observer.motor.lambda"])
     error = groups["motor.velocity_rmse"].max()
-    kept = groups["motor.converged"].min() & (groups["motor.margin_alpha"].min() >= 1.1)
-    least = error[kept & (groups["motor.margin_exact"].min() >= 1.1)].min()
+    meets_all = groups["motor.converged"].min() & (groups["motor.margin_alpha"].min() >= 1.1)
+    least = error[meets_all & (groups["motor.margin_exact"].min() >= 1.1)].min()
     achieved = chosen.summary["achieved"]["motor"]
     # two stages of five values each way reach a step of 1.4 in lambda and alpha
     assert achieved["velocity_rmse"] <= 1.1 * least
@@ -68,8 +68,8 @@ def test_candidates_are_judged_by_their_worst_run(chosen):
     frame = chosen.candidates["motor"]
     assert len(frame) == 2 * 25
     assert set(frame["stage"]) == {0, 1}
-    kept = frame["converged"] & (frame["margin_alpha"] >= 1.1) & (frame["margin_exact"] >= 1.1)
-    pd.testing.assert_series_equal(frame["feasible"], kept, check_names=False)
+    meets_all = frame["converged"] & (frame["margin_alpha"] >= 1.1) & (frame["margin_exact"] >= 1.1)
+    pd.testing.assert_series_equal(frame["feasible"], meets_all, check_names=False)
     best = frame[frame["feasible"]].sort_values("error").iloc[0]
     gains = chosen.summary["gains"]["motor"]
     assert (gains["lambda"], gains["alpha"]) == (best["lambda"], best["alpha"])
@@ -209,12 +209,12 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
 def test_a_range_that_ends_too_early_is_said():
     table = TABLE | {"alpha_ratio": {"start": 4.0, "stop": 20.0}, "refine": 0}
-    found = tune(one_side(tune=table)).summary
+    summary = tune(one_side(tune=table)).summary
     assert any(
         "the optimum lies at the end alpha / f⁺ = 4 of the range searched (tune.alpha_ratio)" in remark
-        for remark in found["remarks"]
+        for remark in summary["remarks"]
     )
-    limits = found["limits"]["motor"]
+    limits = summary["limits"]["motor"]
     assert limits["range_ends"] == ["smaller alpha"]
     assert limits["binding"] == []
     assert limits["towards"]["alpha"]["smaller"]["limit"] == "range"
@@ -222,10 +222,10 @@ def test_a_range_that_ends_too_early_is_said():
 
 def test_a_constraint_that_holds_the_optimum_back_is_said():
     table = TABLE | {"margin_exact": 5.0, "refine": 0}
-    found = tune(one_side(tune=table)).summary
-    assert found["achieved"]["motor"]["margin_exact"] >= 5.0
-    assert any("margin_exact = 5 forbids better gains" in remark for remark in found["remarks"])
-    limits = found["limits"]["motor"]
+    summary = tune(one_side(tune=table)).summary
+    assert summary["achieved"]["motor"]["margin_exact"] >= 5.0
+    assert any("margin_exact = 5 forbids better gains" in remark for remark in summary["remarks"])
+    limits = summary["limits"]["motor"]
     assert limits["binding"] == ["margin_exact"]
     assert limits["constraints"]["margin_exact"]["binds"]
     assert not limits["constraints"]["margin_alpha"]["binds"]
@@ -235,20 +235,20 @@ def test_limits_are_those_of_the_candidates(chosen):
     limits, achieved = (chosen.summary[key]["motor"] for key in ("limits", "achieved"))
     assert list(limits["constraints"]) == ["converged", "margin_alpha", "margin_exact"]
     for name in ("margin_alpha", "margin_exact"):
-        one = limits["constraints"][name]
-        assert one["value"] == achieved[name]
-        assert one["room"] == pytest.approx(achieved[name] / 1.1)
-        assert one["binds"] == (name in limits["binding"])
+        constraint = limits["constraints"][name]
+        assert constraint["value"] == achieved[name]
+        assert constraint["room"] == pytest.approx(achieved[name] / 1.1)
+        assert constraint["binds"] == (name in limits["binding"])
     gains, frame = chosen.summary["gains"]["motor"], chosen.candidates["motor"]
     for gain, other in (("lambda", "alpha"), ("alpha", "lambda")):
         line = pd.DataFrame(limits["profiles"][gain])
         assert line[gain].is_monotonic_increasing
         # where the zoom was run, its own runs
         there = frame[(frame["stage"] == 1) & np.isclose(frame[other], gains[other], rtol=1e-9)].sort_values(gain)
-        shown = line[line[gain].between(there[gain].min() * 0.999, there[gain].max() * 1.001)]
-        np.testing.assert_allclose(shown[gain], there[gain])
-        np.testing.assert_allclose(shown["error"], there["error"])
-        assert [not names for names in shown["missed"]] == there["feasible"].to_list()
+        shown_line = line[line[gain].between(there[gain].min() * 0.999, there[gain].max() * 1.001)]
+        np.testing.assert_allclose(shown_line[gain], there[gain])
+        np.testing.assert_allclose(shown_line["error"], there["error"])
+        assert [not names for names in shown_line["missed"]] == there["feasible"].to_list()
         # and the whole range
         assert line[f"{gain}_ratio"].iloc[[0, -1]].to_list() == pytest.approx(chosen.summary["range"][f"{gain}_ratio"])
     held = chosen.summary["conditions"]["motor"]
@@ -258,16 +258,16 @@ def test_limits_are_those_of_the_candidates(chosen):
 
 def test_gains_that_do_not_converge_have_no_factor():
     slow = {"name": "slow", "motor": {"lambda": 0.001, "alpha": 1.5}}
-    found = tune(one_side(tune=TABLE | {"compare": [slow], "refine": 0})).summary
-    assert found["holdout"]["factors"]["motor"]["slow"] == {"why_none": "slow: converged in 0 % of the runs"}
-    assert "motor: the gains 'slow' converge in only 0 % of the held-out runs: no factor is stated." in found["remarks"]
+    summary = tune(one_side(tune=TABLE | {"compare": [slow], "refine": 0})).summary
+    assert summary["holdout"]["factors"]["motor"]["slow"] == {"why_none": "slow: converged in 0 % of the runs"}
+    assert "motor: the gains 'slow' converge in only 0 % of the held-out runs: no factor is stated." in summary["remarks"]
 
 
 def test_same_gains_by_two_names_are_compared_once_and_shown_twice():
-    found = tune(
+    summary = tune(
         one_side(tune=TABLE | {"refine": 0, "compare": [{"name": "as it is", "motor": {"lambda": 4.0, "alpha": 9.0}}]})
     )
-    rows = {row["name"]: row for row in found.summary["holdout"]["rows"]}
+    rows = {row["name"]: row for row in summary.summary["holdout"]["rows"]}
     assert {**rows["as it is"], "name": "config"} == rows["config"]
 
 

@@ -22,7 +22,7 @@ from jaxbl.sweeps.trial import run
 
 def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=10_000, rest=0.0):
     """Passages through x1 = 0 in the observer's own states, down to one below `rest`: times, and x2 with its sign."""
-    time, state, found = 0.0, np.array(start), []
+    time, state, simulated = 0.0, np.array(start), []
     for _ in range(most):
         sign = np.sign(state[0]) or np.sign(state[1])
 
@@ -35,7 +35,7 @@ def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=
 
         passes.terminal, passes.direction = True, -1
         size = abs(state[1]) / alpha
-        one = solve_ivp(
+        solution = solve_ivp(
             slope,
             (time, end),
             state,
@@ -46,13 +46,13 @@ def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=
             first_step=min(1e-4 * size, end - time),
             max_step=0.1 * max(size, 1e-3),
         )
-        if one.status != 1:
+        if solution.status != 1:
             break
-        time, state = one.t[-1], np.array([0.0, one.y[1, -1]])
-        found.append((time, state[1]))
+        time, state = solution.t[-1], np.array([0.0, solution.y[1, -1]])
+        simulated.append((time, state[1]))
         if abs(state[1]) < rest:
             break
-    return np.array(found).reshape(-1, 2).T
+    return np.array(simulated).reshape(-1, 2).T
 
 
 TIMES = np.linspace(0.0, 12.0, 6001)
@@ -64,11 +64,11 @@ def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
     law = peak_law(lambda_, 1.8, TIMES, SLOW, damping=damping, peak=0.02)
     times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), rest=1.8e-3)
     expected = np.interp(times, TIMES, law)
-    kept = expected > 2e-3
-    assert kept.sum() > 30
-    np.testing.assert_allclose(np.abs(x2[kept]), expected[kept], rtol=0.02, atol=1e-4)
+    is_compared = expected > 2e-3
+    assert is_compared.sum() > 30
+    np.testing.assert_allclose(np.abs(x2[is_compared]), expected[is_compared], rtol=0.02, atol=1e-4)
     # it does change
-    assert expected[kept].min() < 0.75 * 0.02
+    assert expected[is_compared].min() < 0.75 * 0.02
 
 
 def test_without_losses_peaks_come_back_with_the_disturbance():
@@ -90,28 +90,28 @@ def test_the_law_ends_after_a_finite_time():
     rate = 0.25 * np.pi * 0.02 * 1.8 / np.sqrt(2.0 * 1.8)
     end = np.log1p(0.1 * 0.5 / rate) / 0.5
     assert TIMES[np.argmax(law == 0.0)] == pytest.approx(end, abs=0.01)
-    found = simulate_error(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, velocity_error=0.1)
-    assert found.end_time == pytest.approx(end, rel=0.01)
+    simulated = simulate_error(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, velocity_error=0.1)
+    assert simulated.end_time == pytest.approx(end, rel=0.01)
 
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.3, 0.0), (0.05, 1.0), (2.5, 0.0)])
 def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
-    found = simulate_error(lambda_, 1.8, TIMES, SLOW, damping=damping, velocity_error=0.5)
+    simulated = simulate_error(lambda_, 1.8, TIMES, SLOW, damping=damping, velocity_error=0.5)
     times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 3.0, damping, (0.0, 0.5), most=12)
-    assert found.largest == 0.5
-    assert found.peaks[0] == 0.5
-    count = min(len(times), len(found.times) - 1)
+    assert simulated.largest == 0.5
+    assert simulated.peaks[0] == 0.5
+    count = min(len(times), len(simulated.times) - 1)
     assert (count > 3) == (lambda_ < 2.0)
     # the disturbance is linear between samples
-    np.testing.assert_allclose(found.peaks[1 : count + 1], np.abs(x2[:count]), rtol=2e-4)
-    np.testing.assert_allclose(found.times[1 : count + 1], times[:count], rtol=2e-4)
+    np.testing.assert_allclose(simulated.peaks[1 : count + 1], np.abs(x2[:count]), rtol=2e-4)
+    np.testing.assert_allclose(simulated.times[1 : count + 1], times[:count], rtol=2e-4)
 
 
 def test_simulated_error_from_a_position_error():
-    found = simulate_error(0.3, 1.8, TIMES, SLOW, position_error=-0.2, velocity_error=0.1)
+    simulated = simulate_error(0.3, 1.8, TIMES, SLOW, position_error=-0.2, velocity_error=0.1)
     times, x2 = peaks(0.3, 1.8, lambda t: 1.5 * np.sin(t), 3.0, 0.0, (-0.2, 0.1), most=3)
-    np.testing.assert_allclose(found.peaks[:3], np.abs(x2), rtol=2e-4)
-    np.testing.assert_allclose(found.times[:3], times, rtol=2e-4)
+    np.testing.assert_allclose(simulated.peaks[:3], np.abs(x2), rtol=2e-4)
+    np.testing.assert_allclose(simulated.times[:3], times, rtol=2e-4)
 
 
 def test_excursion_of_a_pulse():
@@ -130,8 +130,8 @@ def test_excursion_of_a_pulse():
 def test_excursions_where_the_error_settles_between_pulses(lambda_, damping):
     times = np.linspace(0.0, 12.5, 12501)
     disturbance = 1.2 * np.sin(1.005 * times) + 0.4 * np.sin(2.7 * times + 1.0)
-    found = simulate_error(lambda_, 1.3, times, disturbance, damping=damping, velocity_error=0.0)
-    assert found.largest == pytest.approx(excursion(1.3, times, disturbance, damping), rel=1e-4)
+    simulated = simulate_error(lambda_, 1.3, times, disturbance, damping=damping, velocity_error=0.0)
+    assert simulated.largest == pytest.approx(excursion(1.3, times, disturbance, damping), rel=1e-4)
 
 
 CYCLES = [(1.15, 0.3, 0.0), (2.0, 0.2, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3), (2.0, 0.0, 0.25)]
@@ -140,14 +140,14 @@ CYCLES = [(1.15, 0.3, 0.0), (2.0, 0.2, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3), 
 @pytest.mark.parametrize(("alpha", "lambda_", "damping"), CYCLES)
 def test_limit_cycle_under_a_sine(alpha, lambda_, damping):
     frequency = 0.5 / np.pi
-    predicted, found = (of(lambda_, alpha, 1.0, frequency, damping) for of in (sine_cycle, sine_cycle_simulated))
-    assert predicted.stable == pytest.approx(found.stable, rel=0.06)
-    assert predicted.threshold == pytest.approx(found.threshold, rel=0.12)
-    assert 0.0 < found.threshold < found.stable
+    predicted, simulated = (of(lambda_, alpha, 1.0, frequency, damping) for of in (sine_cycle, sine_cycle_simulated))
+    assert predicted.stable == pytest.approx(simulated.stable, rel=0.06)
+    assert predicted.threshold == pytest.approx(simulated.threshold, rel=0.12)
+    assert 0.0 < simulated.threshold < simulated.stable
     # errors that begin near it come to it
-    _, x2 = peaks(lambda_, alpha, lambda t: -np.sin(t), 500.0, damping, (0.0, 0.95 * found.stable), most=150)
-    assert np.abs(np.abs(x2[:4]) / found.stable - 1.0).max() > 0.01
-    np.testing.assert_allclose(np.abs(x2[-4:]), found.stable, rtol=1e-3)
+    _, x2 = peaks(lambda_, alpha, lambda t: -np.sin(t), 500.0, damping, (0.0, 0.95 * simulated.stable), most=150)
+    assert np.abs(np.abs(x2[:4]) / simulated.stable - 1.0).max() > 0.01
+    np.testing.assert_allclose(np.abs(x2[-4:]), simulated.stable, rtol=1e-3)
 
 
 @pytest.mark.parametrize("alpha", [1.15, 2.0, 10.0])
@@ -172,8 +172,8 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
 
 
 def test_least_frequency_of_a_cycle():
-    given = {"lambda_": 0.005, "alpha": 1.8, "amplitude": 1.56, "damping": 3.0}
-    least = least_cycle_frequency(*given.values())
+    numbers = {"lambda_": 0.005, "alpha": 1.8, "amplitude": 1.56, "damping": 3.0}
+    least = least_cycle_frequency(*numbers.values())
     cycles = [sine_cycle(0.005, 1.8, 1.56, share * least, 3.0) for share in (0.999, 1.001)]
     assert cycles[0] is None
     assert cycles[1] is not None
@@ -214,6 +214,6 @@ def test_gains_of_table_1_end_in_the_cycle_on_the_papers_drive_at_a_higher_frequ
     # alpha covers all of it
     assert np.abs(missing).max() < 1.8
     turns = np.exp(-2j * np.pi * frequency * part["t"].to_numpy())
-    found = sine_cycle_simulated(0.005, 1.8, 2.0 * abs(np.mean(missing * turns)), frequency, 3.0)
+    simulated = sine_cycle_simulated(0.005, 1.8, 2.0 * abs(np.mean(missing * turns)), frequency, 3.0)
     error = np.abs(velocity - part["motor.velocity_estimate"].to_numpy()).max()
-    assert error == pytest.approx(found.stable, rel=0.02)
+    assert error == pytest.approx(simulated.stable, rel=0.02)

@@ -45,7 +45,7 @@ def exact(ratio):
     return brentq(log_peaks, 0.0, 1.9 * np.sqrt(c2))
 
 
-def demanded(alpha, f_plus):
+def demand_lambda(alpha, f_plus):
     """Least lambda by condition for one pair."""
     names = ("davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact")
     if not alpha > f_plus:
@@ -61,40 +61,40 @@ def demanded(alpha, f_plus):
 
 
 def entries(summary, level):
-    (found,) = [entry for entry in summary["levels"] if entry["level"] == level]
-    return found
+    (level_data,) = [entry for entry in summary["levels"] if entry["level"] == level]
+    return level_data
 
 
 def test_normalised_level_counted_again(verified):
     verdict, _ = verified
-    found, plane = entries(verdict.summary, "normalised"), verdict.error_map
+    level_data, plane = entries(verdict.summary, "normalised"), verdict.error_map
     np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
     np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
     assert plane.ratio.shape == (9, 7)
-    assert found["cells"] == 63
-    least = [demanded(alpha, 1.0) for alpha in plane.alpha]
+    assert level_data["cells"] == 63
+    least = [demand_lambda(alpha, 1.0) for alpha in plane.alpha]
     np.testing.assert_allclose(plane.boundary, [column["exact"] for column in least], atol=1e-6)
     worked = np.array([[lambda_ > column["exact"] for column in least] for lambda_ in plane.lambda_])
     np.testing.assert_array_equal(plane.ratio < 1.0, worked)
-    assert found["converged"] == worked.sum()
-    for entry in found["conditions"]:
-        column = np.array([one[entry["name"]] for one in least])
+    assert level_data["converged"] == worked.sum()
+    for entry in level_data["conditions"]:
+        column = np.array([demands[entry["name"]] for demands in least])
         holds = plane.lambda_[:, None] > column
         assert 0 < entry["holds"] == holds.sum() < 63
         assert entry["counterexamples"] == 0
         assert entry["fails_but_converged"] == (~holds & worked).sum()
-        ratios = column / [one["exact"] for one in least]
-        kept = entry["conservatism"]
-        np.testing.assert_allclose((kept["median"], kept["max"]), (np.median(ratios), ratios.max()), rtol=1e-5)
+        ratios = column / [demands["exact"] for demands in least]
+        stored = entry["conservatism"]
+        np.testing.assert_allclose((stored["median"], stored["max"]), (np.median(ratios), ratios.max()), rtol=1e-5)
 
 
 @pytest.fixture(scope="module")
-def judged(verified):
+def judged_cells(verified):
     """By level and bound, the rows of the frame as dicts, each with what the conditions demand."""
     verdict, _ = verified
     return {
         (level, bound): [
-            row | {"demanded": demanded(row[ALPHA], row[column])} for row in verdict.levels[level].to_dict("records")
+            row | {"demanded": demand_lambda(row[ALPHA], row[column])} for row in verdict.levels[level].to_dict("records")
         ]
         for level in KEYS
         for bound, column in BOUNDS.items()
@@ -104,15 +104,15 @@ def judged(verified):
 @pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
 def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
     verdict, _ = verified
-    found = entries(verdict.summary, level)
+    level_data = entries(verdict.summary, level)
     rows = judged[level, "true"]
     keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
-    assert found["side"] == "motor"
-    assert found["cells"] == len(rows) == len(keys) == cells
-    assert found["converged"] == sum(row["motor.converged"] for row in rows)
-    assert found["diverged"] == sum(not row["finite"] for row in rows)
-    assert found["converged"] > 0
-    for bound, listing in (("true", found["conditions"]), ("claimed", found["claimed_bound"]["conditions"])):
+    assert level_data["side"] == "motor"
+    assert level_data["cells"] == len(rows) == len(keys) == cells
+    assert level_data["converged"] == sum(row["motor.converged"] for row in rows)
+    assert level_data["diverged"] == sum(not row["finite"] for row in rows)
+    assert level_data["converged"] > 0
+    for bound, listing in (("true", level_data["conditions"]), ("claimed", level_data["claimed_bound"]["conditions"])):
         rows = judged[level, bound]
         for entry in listing:
             name = entry["name"]
@@ -127,23 +127,26 @@ def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
     first = {}
     for row in judged[level, "true"]:
         if row["motor.converged"]:
-            rest = tuple(row[key] for key in KEYS[level] if key != LAMBDA)
-            if rest not in first or row[LAMBDA] < first[rest][LAMBDA]:
-                first[rest] = row
-    for entry in found["conditions"]:
+            other_values = tuple(row[key] for key in KEYS[level] if key != LAMBDA)
+            if other_values not in first or row[LAMBDA] < first[other_values][LAMBDA]:
+                first[other_values] = row
+    for entry in level_data["conditions"]:
         ratios = np.array([row["demanded"][entry["name"]] / row[LAMBDA] for row in first.values()])
         least = np.array([row[LAMBDA] == 0.05 for row in first.values()])
         strict = np.isfinite(ratios) & (ratios > 1.0)
-        kept = entry["conservatism"]
+        stored = entry["conservatism"]
         if strict.any():
-            np.testing.assert_allclose((kept["median"], kept["max"]), (np.median(ratios[strict]), ratios[strict].max()))
+            np.testing.assert_allclose((stored["median"], stored["max"]), (np.median(ratios[strict]), ratios[strict].max()))
         else:
-            assert kept["median"] is None and kept["max"] is None
-        assert (kept["columns"], kept["at_least"]) == (strict.sum(), (strict & least).sum())
+            assert stored["median"] is None and stored["max"] is None
+        assert (stored["columns"], stored["at_least"]) == (strict.sum(), (strict & least).sum())
     if level == "drive":
-        assert found["conditions"][0]["name"] == "davila_fridman" and found["conditions"][0]["conservatism"]["columns"] > 0
+        assert (
+            level_data["conditions"][0]["name"] == "davila_fridman"
+            and level_data["conditions"][0]["conservatism"]["columns"] > 0
+        )
     small = [row[BOUNDS["true"]] > row[BOUNDS["claimed"]] for row in judged[level, "true"] if row["motor.converged"]]
-    assert found["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
+    assert level_data["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
 
 
 def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified, judged):
@@ -160,9 +163,9 @@ def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verifie
                 if row[LAMBDA] > row["demanded"][name] and not row["motor.converged"]
             }
             part = listed_[(listed_["level"] == level) & (listed_["bound"] == bound) & (listed_["condition"] == name)]
-            found = list(part[keys].itertuples(index=False, name=None))
-            assert len(found) == len(failed)
-            assert set(found) == failed
+            level_data = list(part[keys].itertuples(index=False, name=None))
+            assert len(level_data) == len(failed)
+            assert set(level_data) == failed
             sizes.append(len(failed))
     assert sum(sizes) == len(listed_)
     assert np.sum(np.array(sizes) > 0) >= 5
@@ -197,25 +200,25 @@ def test_causes_in_the_summary_count_runs(verified):
 
 def test_verdict_on_disk(verified):
     verdict, folder = verified
-    found = json.loads((folder / "verdict.json").read_text())
-    assert found == verdict.summary
-    assert [level["level"] for level in found["levels"]] == ["normalised", "drive", "sampled"]
-    for level in found["levels"]:
+    level_data = json.loads((folder / "verdict.json").read_text())
+    assert level_data == verdict.summary
+    assert [level["level"] for level in level_data["levels"]] == ["normalised", "drive", "sampled"]
+    for level in level_data["levels"]:
         assert isinstance(level["cells"], int)
         assert [entry["name"] for entry in level["conditions"]] == list(module.CONDITIONS)
         for entry in level["conditions"]:
             assert isinstance(entry["holds"], int) and isinstance(entry["counterexamples"], int)
             assert {"median", "max"} <= set(entry["conservatism"])
-    rules = {one["name"]: one for one in found["rules"]}
-    for entry in found["levels"][0]["conditions"]:
+    rules = {demands["name"]: demands for demands in level_data["rules"]}
+    for entry in level_data["levels"][0]["conditions"]:
         # a rule that is a condition holds in the same cells, but for q
         if entry["name"] in rules and entry["name"] != "davila_fridman":
             assert rules[entry["name"]]["cells"] == {key: entry[key] for key in ("holds", "counterexamples")}
-    kept = pd.read_parquet(folder / "counterexamples.parquet")
-    pd.testing.assert_frame_equal(kept, verdict.counterexamples, check_dtype=False)
+    stored = pd.read_parquet(folder / "counterexamples.parquet")
+    pd.testing.assert_frame_equal(stored, verdict.counterexamples, check_dtype=False)
     true = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
-    assert found["counterexamples_in_all"] == len(true)
-    assert [entry["cause"] for entry in found["counterexamples"]] == true["cause"].tolist()[:200]
+    assert level_data["counterexamples_in_all"] == len(true)
+    assert [entry["cause"] for entry in level_data["counterexamples"]] == true["cause"].tolist()[:200]
 
 
 def contents(folder):
@@ -224,7 +227,7 @@ def contents(folder):
 
 def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
     verdict, folder = verified
-    results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
+    results = {path: stored for path, stored in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
@@ -234,7 +237,7 @@ def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
         pd.testing.assert_frame_equal(again.levels[level], frame)
     pd.testing.assert_frame_equal(again.counterexamples, verdict.counterexamples)
     after = contents(folder)
-    assert all(after[path] == kept for path, kept in results.items())
+    assert all(after[path] == stored for path, stored in results.items())
 
 
 def test_another_studys_folder_is_left_as_it_is(verified):
@@ -256,8 +259,8 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(verified, monkeypatc
     least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (again, verdict))
     # (1 + q) / (1 - q) at 0.6 and at 0.3
     assert least / before == pytest.approx(4.0 / (13.0 / 7.0))
-    one, same = again.summary["marks"]
-    assert one | {"name": "the same"} == same
+    demands, same = again.summary["marks"]
+    assert demands | {"name": "the same"} == same
 
 
 def test_a_verification_keeps_to_its_backend(verified):
@@ -331,8 +334,8 @@ def test_without_anything_unknown_there_is_nothing_to_check():
 def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verified):
     """Forward Euler chatters with period times alpha: a quarter of 16 ms would do, or no Euler."""
     verdict, folder = verified
-    found = verdict.counterexamples
-    chosen = found[(found["level"] == "sampled") & (found[ALPHA] == 8.0) & (found[LAMBDA] == 12.0)]
+    level_data = verdict.counterexamples
+    chosen = level_data[(level_data["level"] == "sampled") & (level_data[ALPHA] == 8.0) & (level_data[LAMBDA] == 12.0)]
     assert set(chosen[PERIOD]) == {16e-3}
     assert set(chosen["cause"]) == {"explicit discretisation", "period too long or explicit discretisation"}
     periods = [
@@ -363,9 +366,9 @@ def test_claimed_bound_that_misses_friction_at_rest(tmp_path):
     frame = verdict.levels["drive"]
     np.testing.assert_allclose(frame["motor.f_plus_acceleration"], 0.0, atol=1e-12)
     np.testing.assert_allclose(frame["motor.f_plus"][frame[ALPHA] == 9.0], 0.1 / 0.05, rtol=0.01)
-    found = verdict.counterexamples
-    assert set(found["level"]) == {"drive", "sampled"}
-    assert set(found["bound"]) == {"claimed"}
-    assert set(found[ALPHA]) == {0.5}
-    assert set(found["cause"]) == {"f_plus underestimated"}
+    level_data = verdict.counterexamples
+    assert set(level_data["level"]) == {"drive", "sampled"}
+    assert set(level_data["bound"]) == {"claimed"}
+    assert set(level_data[ALPHA]) == {0.5}
+    assert set(level_data["cause"]) == {"f_plus underestimated"}
     assert entries(verdict.summary, "drive")["claimed_bound"]["too_small"] == 1.0

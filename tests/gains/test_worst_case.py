@@ -18,17 +18,17 @@ LANES, CELLS = 400, 16_384
 
 
 def half(lambda_, alpha, f_plus=1.0, damping=0.0, speed=1.0, outward=1.0, homeward=-1.0, ray=0.0):
-    given = np.broadcast_arrays(lambda_, alpha, f_plus, damping, speed, outward, homeward, ray)
-    shape, size = given[0].shape, given[0].size
-    *gains, damping, speed, outward, homeward, ray = (np.resize(x, LANES if size <= LANES else CELLS) for x in given)
-    found = HALF(*gains, damping=damping, speed=speed, outward=outward, homeward=homeward, ray=ray)
-    return HalfCycle(*(np.asarray(x)[:size].reshape(shape) for x in found))
+    arguments = np.broadcast_arrays(lambda_, alpha, f_plus, damping, speed, outward, homeward, ray)
+    shape, size = arguments[0].shape, arguments[0].size
+    *gains, damping, speed, outward, homeward, ray = (np.resize(x, LANES if size <= LANES else CELLS) for x in arguments)
+    half_cycles = HALF(*gains, damping=damping, speed=speed, outward=outward, homeward=homeward, ray=ray)
+    return HalfCycle(*(np.asarray(x)[:size].reshape(shape) for x in half_cycles))
 
 
 def least(alpha, f_plus=1.0, damping=0.0, speed=1.0):
-    given = np.broadcast_arrays(alpha, f_plus, damping, speed)
-    *gains, damping, speed = (np.resize(x, LANES) for x in given)
-    return np.asarray(LEAST(*gains, damping=damping, speed=speed))[: given[0].size].reshape(given[0].shape)
+    arguments = np.broadcast_arrays(alpha, f_plus, damping, speed)
+    *gains, damping, speed = (np.resize(x, LANES) for x in arguments)
+    return np.asarray(LEAST(*gains, damping=damping, speed=speed))[: arguments[0].size].reshape(arguments[0].shape)
 
 
 def reference(lambda_, alpha, f_plus, damping=0.0, speed=1.0, outward=1.0, homeward=-1.0, ray=0.0):
@@ -82,9 +82,9 @@ def test_ratio_is_the_closed_form_over_a_plane(plane):
 def test_no_counterexample_to_any_condition(plane):
     lambda_, alpha, ratio, _ = plane
     assert len(ratio) >= 200_000
-    one = np.ones_like(alpha)
+    ones_like_alpha = np.ones_like(alpha)
     for name, (_, limit) in conditions.CONDITIONS.items():
-        holds = lambda_ > np.asarray(jax.jit(limit)(alpha, one))
+        holds = lambda_ > np.asarray(jax.jit(limit)(alpha, ones_like_alpha))
         assert holds.sum() > 50_000, name
         assert np.all(ratio[holds] < 1.0), name
     assert np.sum(~holds) > 50_000
@@ -94,11 +94,11 @@ def test_no_counterexample_to_any_condition(plane):
 
 
 def test_exact_condition_is_sharp_and_others_hold_at_their_limits():
-    alpha, one = 1.0 + np.geomspace(1e-3, 19.0, LANES), np.ones(LANES)
-    limits = {name: np.asarray(jax.jit(f)(alpha, one)) for name, (_, f) in conditions.CONDITIONS.items()}
+    alpha, ones_like_alpha = 1.0 + np.geomspace(1e-3, 19.0, LANES), np.ones(LANES)
+    limits = {name: np.asarray(jax.jit(f)(alpha, ones_like_alpha)) for name, (_, f) in conditions.CONDITIONS.items()}
     for name, limit in limits.items():
-        assert np.all(half(limit * (1.0 + 1e-5), alpha, one).ratio < 1.0), name
-    assert np.all(half(limits["exact"] * (1.0 - 1e-5), alpha, one).ratio > 1.0)
+        assert np.all(half(limit * (1.0 + 1e-5), alpha, ones_like_alpha).ratio < 1.0), name
+    assert np.all(half(limits["exact"] * (1.0 - 1e-5), alpha, ones_like_alpha).ratio > 1.0)
 
 
 def gains(seed):
@@ -114,20 +114,20 @@ def test_a_constant_disturbance_only_changes_alpha(share):
     """x2 then falls at the constant rate alpha - d through the whole half cycle."""
     lambda_, alpha, f_plus = gains(1)
     speed = np.exp(np.random.default_rng(2).uniform(-3.0, 3.0, LANES))
-    found = half(lambda_, alpha, f_plus, speed=speed, outward=share, homeward=share)
+    half_cycles = half(lambda_, alpha, f_plus, speed=speed, outward=share, homeward=share)
     rate = alpha - share * f_plus
     closed = np.asarray(RATIO(lambda_, rate, np.zeros(LANES)))
     assert 50 < np.sum(closed == 0.0) < 350
-    np.testing.assert_allclose(found.ratio, closed, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found.time, (1.0 + closed) * speed / rate, rtol=2e-6)
+    np.testing.assert_allclose(half_cycles.ratio, closed, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(half_cycles.time, (1.0 + closed) * speed / rate, rtol=2e-6)
 
 
 def test_without_lambda_x2_turns_where_x1_does():
     _, alpha, f_plus = gains(3)
-    found = half(0.0, alpha, f_plus, speed=2.0)
+    half_cycles = half(0.0, alpha, f_plus, speed=2.0)
     ratio = np.sqrt((alpha + f_plus) / (alpha - f_plus))
-    np.testing.assert_allclose(found.ratio, ratio, rtol=1e-6)
-    np.testing.assert_allclose(found.time, 2.0 / (alpha - f_plus) + 2.0 * ratio / (alpha + f_plus), rtol=1e-6)
+    np.testing.assert_allclose(half_cycles.ratio, ratio, rtol=1e-6)
+    np.testing.assert_allclose(half_cycles.time, 2.0 / (alpha - f_plus) + 2.0 * ratio / (alpha + f_plus), rtol=1e-6)
 
 
 def random_case(seed, friction=(-3.0, 2.0)):
@@ -141,11 +141,11 @@ def random_case(seed, friction=(-3.0, 2.0)):
 
 def agrees(case, **changes):
     lambda_, alpha, f_plus, damping, speed = case
-    found = half(lambda_, alpha, f_plus, damping=damping, speed=speed, **changes)
+    half_cycles = half(lambda_, alpha, f_plus, damping=damping, speed=speed, **changes)
     ratio, time = reference(*case, **changes)
     assert 0.0 < ratio < np.inf
-    np.testing.assert_allclose(found.ratio, ratio, rtol=1e-6, atol=5e-7)
-    np.testing.assert_allclose(found.time, time, rtol=1e-6)
+    np.testing.assert_allclose(half_cycles.ratio, ratio, rtol=1e-6, atol=5e-7)
+    np.testing.assert_allclose(half_cycles.time, time, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -170,37 +170,37 @@ def test_other_disturbances_as_scipy(seed):
 def test_damped_time_to_the_origin():
     """Straight home under no disturbance, x2' = -alpha - damping x2 throughout."""
     damping = np.geomspace(1e-3, 1e3, 30)
-    found = half(20.0, 2.0, 1.0, damping=damping, speed=0.7, outward=0.0, homeward=0.0)
-    np.testing.assert_array_equal(found.ratio, 0.0)
-    np.testing.assert_allclose(found.time, np.log1p(damping * 0.7 / 2.0) / damping, rtol=1e-6)
+    half_cycles = half(20.0, 2.0, 1.0, damping=damping, speed=0.7, outward=0.0, homeward=0.0)
+    np.testing.assert_array_equal(half_cycles.ratio, 0.0)
+    np.testing.assert_allclose(half_cycles.time, np.log1p(damping * 0.7 / 2.0) / damping, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("lambda_", "alpha", "damping"), [(30.0, 1.02, 0.1), (30.0, 2.0, 30.0), (60.0, 1.5, 1.0)])
 def test_with_large_lambda_as_scipy(lambda_, alpha, damping):
     """The way home along the ray is then many of the steps that lambda asks for."""
-    found = half(lambda_, alpha, 1.0, damping=damping)
-    assert found.ratio == 0.0
+    half_cycles = half(lambda_, alpha, 1.0, damping=damping)
+    assert half_cycles.ratio == 0.0
     ratio, time = reference(lambda_, alpha, 1.0, damping)
     assert abs(ratio) < 5e-6
-    np.testing.assert_allclose(found.time, time, rtol=5e-6)
+    np.testing.assert_allclose(half_cycles.time, time, rtol=5e-6)
 
 
 def test_with_lambda_without_end_x2_falls_by_the_second_arc_alone():
     lambda_, damping = (x.ravel() for x in np.meshgrid(np.geomspace(1e3, 1e5, 10), [1e-3, 1.0, 30.0, 1e3]))
-    found = half(lambda_, 2.0, 1.0, damping=damping, speed=0.5)
-    np.testing.assert_array_equal(found.ratio, 0.0)
-    np.testing.assert_allclose(found.time, np.log1p(damping * 0.5 / 3.0) / damping, rtol=1e-3)
+    half_cycles = half(lambda_, 2.0, 1.0, damping=damping, speed=0.5)
+    np.testing.assert_array_equal(half_cycles.ratio, 0.0)
+    np.testing.assert_allclose(half_cycles.time, np.log1p(damping * 0.5 / 3.0) / damping, rtol=1e-3)
 
 
 def test_ratio_depends_on_three_numbers_only():
     lambda_, alpha, f_plus = gains(5)
     speed, friction = np.exp(np.random.default_rng(6).uniform(-3.0, 3.0, (2, LANES)))
-    found = half(lambda_, alpha, f_plus, damping=friction * f_plus / speed, speed=speed)
+    half_cycles = half(lambda_, alpha, f_plus, damping=friction * f_plus / speed, speed=speed)
     scaled = half(lambda_ / np.sqrt(f_plus), alpha / f_plus, np.ones(LANES), damping=friction)
-    np.testing.assert_allclose(found.ratio, scaled.ratio, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.time, scaled.time * speed / f_plus, rtol=1e-9)
+    np.testing.assert_allclose(half_cycles.ratio, scaled.ratio, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(half_cycles.time, scaled.time * speed / f_plus, rtol=1e-9)
     # and on the friction number indeed
-    assert np.abs(found.ratio - half(lambda_, alpha, f_plus).ratio).max() > 0.5
+    assert np.abs(half_cycles.ratio - half(lambda_, alpha, f_plus).ratio).max() > 0.5
 
 
 @pytest.fixture(scope="module")
@@ -232,8 +232,8 @@ def test_ratio_falls_with_damping_where_it_is_not_small(cube):
 
 @pytest.mark.parametrize(("lambda_", "alpha"), [(0.0, 1.0), (1.0, 1.0), (50.0, 0.5), (1.0, 0.0)])
 def test_peaks_do_not_come_back_where_alpha_does_not_exceed_the_disturbance(lambda_, alpha):
-    found = half(lambda_, alpha, 1.0)
-    assert found.ratio == np.inf and found.time == np.inf
+    half_cycles = half(lambda_, alpha, 1.0)
+    assert half_cycles.ratio == np.inf and half_cycles.time == np.inf
 
 
 def test_least_lambda_without_damping_is_the_exact_one():
@@ -252,11 +252,11 @@ def test_least_lambda_falls_with_damping():
     alpha = 1.0 + np.geomspace(1e-3, 19.0, 15)
     damping = np.append(0.0, np.geomspace(0.01, 10.0, 16))
     shape = np.meshgrid(alpha, damping, indexing="ij")
-    found = least(shape[0], damping=shape[1])
-    before, after = found[:, :-1], found[:, 1:]
+    half_cycles = least(shape[0], damping=shape[1])
+    before, after = half_cycles[:, :-1], half_cycles[:, 1:]
     assert np.all((after < before)[before > 0.0])
     assert np.all(after[before == 0.0] == 0.0)
-    assert np.all(found[:, -1] == 0.0)
+    assert np.all(half_cycles[:, -1] == 0.0)
 
 
 def enough_damping(alpha):
@@ -290,15 +290,15 @@ def test_with_damping_alpha_may_be_smaller_than_f_plus_by_what_friction_takes_up
     [(1.1, 1.0, 0.3, 1.0), (2.0, 1.0, 0.5, 0.5), (6.0, 3.0, 2.0, 0.7), (0.9, 1.0, 0.4, 1.0), (0.5, 1.0, 1.2, 0.8)],
 )
 def test_least_lambda_with_damping_is_where_scipys_peaks_stop_falling(alpha, f_plus, damping, speed):
-    found = float(least(alpha, f_plus, damping, speed))
-    assert 0.0 < found < np.inf
-    assert reference(found * 1.001, alpha, f_plus, damping, speed)[0] < 1.0
-    assert reference(found * 0.999, alpha, f_plus, damping, speed)[0] > 1.0
+    half_cycles = float(least(alpha, f_plus, damping, speed))
+    assert 0.0 < half_cycles < np.inf
+    assert reference(half_cycles * 1.001, alpha, f_plus, damping, speed)[0] < 1.0
+    assert reference(half_cycles * 0.999, alpha, f_plus, damping, speed)[0] > 1.0
 
 
 def test_columns_broadcast():
     lambda_, alpha = np.array([0.5, 1.0, 2.0])[:, None], np.array([1.5, 3.0])
-    found = HALF(lambda_, alpha, 1.0, damping=0.3)
-    assert found.ratio.shape == found.time.shape == (3, 2)
-    for ours, padded in zip(found, half(lambda_, alpha, damping=0.3), strict=True):
+    half_cycles = HALF(lambda_, alpha, 1.0, damping=0.3)
+    assert half_cycles.ratio.shape == half_cycles.time.shape == (3, 2)
+    for ours, padded in zip(half_cycles, half(lambda_, alpha, damping=0.3), strict=True):
         np.testing.assert_allclose(ours, padded, rtol=1e-12)
