@@ -147,7 +147,7 @@ class _KindSearch:
         """By kind: for each group and point, the sides' searches."""
         rows = sum(len(point.scenarios.names) for group in self.groups for point in group.points)
         runs = len(table.observers) * rows * len(self._side_sets())
-        stages.total_lanes = runs * (table.trial_gains * (1 + table.refine) * self.seeds + self.held_out_seeds)
+        stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
 
     def _side_sets(self) -> list[tuple[str, ...]]:
         """Return the sets of sides that are searched in the same runs.
@@ -169,7 +169,7 @@ class _KindSearch:
             searches = self.searches[kind][number]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
-                unit = _draw_quasi_random(free, self.table.trial_gains, stage)
+                unit = _draw_quasi_random(free, self.table.trials, stage)
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
                 for side_set in self._side_sets():
                     rows = []
@@ -394,7 +394,7 @@ def _summary(search: _KindSearch, held_out: Mapping[str, list[list[dict[str, np.
         "objective": table.objective,
         "objective_metric": f"{table.objective}_rmse ({SIDE_METRICS[f'{table.objective}_rmse'].unit})",
         "observers": table.observers,
-        "trials": table.trial_gains * (1 + table.refine),
+        "trials": table.trials * (1 + table.refine),
         "seeds": [config.sweep.first_seed, first - 1],
         "scenarios": search.groups[0].points[0].scenarios.names,
         "axes": [axis.path for axis in table.axes],

@@ -19,7 +19,7 @@ SYSTEMS = [
     ErrorSystem(False, 2.0, 4.0, 5.0, 1.0),
 ]
 RATIOS = dict(zip(SYSTEMS, (1.17, 1.06, 1.12, 1.2), strict=True))
-"""Of the proven bound to the worst found, at most."""
+"""Largest ratio of the proven bound to the worst error that was found."""
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)

@@ -163,8 +163,8 @@ def test_bad_numbers_are_told(changes, message):
 def test_a_bound_that_runs_exceed_is_refused(monkeypatch):
     prove = certificate.prove
 
-    def wrong(*given):
-        proof = prove(*given)
+    def wrong(*arguments):
+        proof = prove(*arguments)
         return proof._replace(bounds=0.9 * proof.bounds)
 
     monkeypatch.setattr(certificate, "prove", wrong)

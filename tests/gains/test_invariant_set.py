@@ -69,7 +69,7 @@ def test_image_holds_whatever_the_adversary_does(system):
 
 
 def test_rounding_errors_of_large_numbers_stay_inside():
-    """Of the lattice, double precision has hundredths at 1e14: the exact successors are still in the image."""
+    """Double precision resolves hundredths of the lattice at 1e14: the exact successors are still in the image."""
     system, rng = ErrorSystem(False, 2.0, 4.0, 20.0), np.random.default_rng(5)
     rows = _Rows(system, 0.25, 400.0)
     assert rows.dg == 0.25

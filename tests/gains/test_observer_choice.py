@@ -57,7 +57,7 @@ def test_equal_runs_have_no_interval():
 
 
 def test_kinds_that_noise_alone_parts_are_not_told_apart():
-    """Of two kinds with the same errors but for noise, the second's interval holds 1 in 19 of 20 draws or more: the first
+    """If noise alone separates two kinds, the second's interval holds 1 in 19 of 20 draws or more: the first
     is the better one by chance, so that its ratio begins above 1."""
     rng = np.random.default_rng(1)
     count = 0
@@ -83,7 +83,7 @@ def test_the_search_agrees_with_brute_force(chosen):
 
 
 def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
-    """Of every kind, on the other input and with seeds that the search has not seen."""
+    """Checked for every kind, on the other input and with seeds that the search has not seen."""
     point = chosen.summary["points"][0]["sides"]["motor"]
     assert chosen.summary["seeds"] == [0, 1]
     assert chosen.summary["holdout"]["seeds"] == [2, 9]

@@ -39,17 +39,17 @@ def explore_kind(kind, gains, most=50_000):
     )
 
 
-def errors_of(observer, rest, noise, push):
+def errors_of(observer, rest_state, noise, push):
     """Velocity errors at the samples of a double integrator: its own simulation, with true motion."""
 
-    def ones_of_step(carry, given):
+    def step_errors(carry, sample_inputs):
         state, position, velocity = carry
-        eta, d = given
+        eta, d = sample_inputs
         state, estimate = observer.step(state, position + eta, lambda v: 0.0 * v, jnp.ones(()))
         return (state, position + velocity + 0.5 * d, velocity + d), estimate.velocity - velocity
 
     zero = jnp.zeros(())
-    return jax.lax.scan(ones_of_step, (rest, zero, zero), (jnp.asarray(noise), jnp.asarray(push)))[1]
+    return jax.lax.scan(step_errors, (rest_state, zero, zero), (jnp.asarray(noise), jnp.asarray(push)))[1]
 
 
 @pytest.mark.parametrize(("kind", "gains"), KINDS)
@@ -66,7 +66,7 @@ def test_the_way_leads_to_the_error_that_is_found(kind, gains):
 def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains):
     observer, rest_state, result = explore_kind(kind, gains)
     push = np.array(list(itertools.product([-1.0, 1.0], repeat=4)))
-    noise = NOISE * np.array([(1.0, *ones_of_step) for ones_of_step in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
+    noise = NOISE * np.array([(1.0, *signs) for signs in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
     pairs = np.repeat(noise, len(push), axis=0), np.tile(np.column_stack([push, push[:, -1]]), (len(noise), 1))
     assert result.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest_state, n, d))(*pairs)).max()
 
@@ -74,10 +74,10 @@ def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains)
 @pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.999), ((0.15, 1.0), 0.995), ((0.1, 0.3), 0.998)])
 def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
     """That is the sum of absolute sensitivities."""
-    ones_of_step, unit = jnp.ones(()), np.eye(3)
+    period, unit = jnp.ones(()), np.eye(3)
     observer = Luenberger(*map(jnp.asarray, gains))
-    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, ones_of_step)
-    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, ones_of_step)
+    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, period)
+    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, period)
     moved, seen_velocity, push = (
         -np.column_stack([new.position, new.velocity]),
         np.asarray(estimate.velocity),

@@ -32,16 +32,16 @@ SUFFICIENT = SCALE_FREE | {"ordered_and_above", "usual_pair", "small_pair"}
 
 @pytest.fixture(scope="module")
 def judged_rules():
-    """Of all rules, by name, on a map."""
+    """Judgements of all rules on a map, by name."""
     lambda_, alpha = np.meshgrid(LAMBDA, ALPHA, indexing="ij")
     ratio = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha)))
     return {judgement["name"]: judgement for judgement in judge_rules(ALPHA, LAMBDA, ratio)}
 
 
-def test_all_rules_are_judged(judged):
-    assert list(judged) == list(RULES)
-    assert {name for name, judgement in judged.items() if judgement["kind"] == "region"} == set(STATED)
-    assert all(judgement["source"] and judgement["states"] for judgement in judged.values())
+def test_all_rules_are_judged(judged_rules):
+    assert list(judged_rules) == list(RULES)
+    assert {name for name, judgement in judged_rules.items() if judgement["kind"] == "region"} == set(STATED)
+    assert all(judgement["source"] and judgement["states"] for judgement in judged_rules.values())
 
 
 @pytest.mark.parametrize("name", STATED)
@@ -60,10 +60,10 @@ def test_region_is_the_one_that_is_stated(name):
     assert judgements == expected
 
 
-def test_which_are_sufficient_and_which_depend_on_units(judged):
-    assert {name for name, judgement in judged.items() if judgement["sufficient"]} == SUFFICIENT
-    assert {name for name, judgement in judged.items() if judgement.get("scale_free")} == SCALE_FREE
-    for name, judgement in judged.items():
+def test_which_are_sufficient_and_which_depend_on_units(judged_rules):
+    assert {name for name, judgement in judged_rules.items() if judgement["sufficient"]} == SUFFICIENT
+    assert {name for name, judgement in judged_rules.items() if judgement.get("scale_free")} == SCALE_FREE
+    for name, judgement in judged_rules.items():
         assert (judgement["counterexample"] is None) == (name in SUFFICIENT)
         assert judgement.get("alpha_below_f_plus", False) == (name not in SUFFICIENT)
         if name in SUFFICIENT:
@@ -88,9 +88,9 @@ def test_no_gains_of_a_sufficient_rule_fail(name):
 
 
 @pytest.mark.parametrize("name", sorted(set(RULES) - SUFFICIENT))
-def test_counterexamples_in_the_observers_own_states(name, judged):
+def test_counterexamples_in_the_observers_own_states(name, judged_rules):
     """An adversary who sees the error: its largest push outward, then homeward."""
-    judgements = judged[name]["counterexample"]
+    judgements = judged_rules[name]["counterexample"]
     f_plus, alpha, lambda_ = (judgements[key] for key in ("f_plus", "alpha", "lambda"))
     assert STATED[name](lambda_, alpha, f_plus)
 
@@ -119,27 +119,27 @@ def test_counterexamples_in_the_observers_own_states(name, judged):
 
 
 @pytest.mark.parametrize("name", STATED)
-def test_coverage_is_the_share_of_cells(name, judged):
-    """By points drawn evenly over the logarithmic map."""
+def test_coverage_is_the_share_of_cells(name, judged_rules):
+    """Counted by points drawn evenly over the logarithmic map."""
     draw = np.random.default_rng(7)
     alpha = ALPHA[0] * (ALPHA[-1] / ALPHA[0]) ** draw.random(20_000)
     lambda_ = LAMBDA[0] * (LAMBDA[-1] / LAMBDA[0]) ** draw.random(20_000)
     works = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha))) < 1.0
-    for entry in judged[name]["covers"]:
+    for entry in judged_rules[name]["covers"]:
         bound = entry["f_plus"]
         allowed = allows_gains(RULES[name], np.sqrt(bound) * lambda_, bound * alpha, bound)
         assert entry["share"] == pytest.approx((allowed & works).sum() / works.sum(), abs=0.02)
-    cells = judged[name]["cells"]
+    cells = judged_rules[name]["cells"]
     grid = allows_gains(RULES[name], LAMBDA[:, None], ALPHA[None, :], 1.0)
     fails = np.asarray(peak_ratio(*np.broadcast_arrays(LAMBDA[:, None], ALPHA[None, :]), np.ones((96, 96)))) >= 1.0
     assert (cells["holds"], cells["counterexamples"]) == (grid.sum(), (grid & fails).sum())
 
 
-def test_margins(judged):
+def test_margins(judged_rules):
     """Least lambda over the exact one, where it is known: 1.146 at alpha = f⁺ (docs/theory.md), 0.900 at large alpha."""
-    assert judged["seeber_horn"]["margin"] == pytest.approx(np.sqrt(2.0) / 1.146, rel=2e-3)
-    assert judged["moreno_osorio"]["margin"] == pytest.approx(0.5 * np.pi, rel=1e-3)
+    assert judged_rules["seeber_horn"]["margin"] == pytest.approx(np.sqrt(2.0) / 1.146, rel=2e-3)
+    assert judged_rules["moreno_osorio"]["margin"] == pytest.approx(0.5 * np.pi, rel=1e-3)
     for name, gain in (("usual_pair", 1.5), ("small_pair", 1.0)):
-        assert judged[name]["margin"] == pytest.approx(gain / 0.99122, rel=1e-4)
+        assert judged_rules[name]["margin"] == pytest.approx(gain / 0.99122, rel=1e-4)
     simulated = half_cycle(np.array([1.0]), np.array([1.1]), np.array([1.0])).ratio
     assert 0.98 < float(simulated[0]) < 1.0

@@ -11,10 +11,10 @@ from jaxbl.sweeps import programs
 from jaxbl.sweeps.sweep import sweep
 
 
-def stage(folder, changes=None, **given):
+def stage(folder, changes=None, **options):
     """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
     study = read_config(thirty(**(changes or {})))
-    with open_stages(study, "tune", folder, None, **given) as stages:
+    with open_stages(study, "tune", folder, None, **options) as stages:
         manifest = dict(stages.manifest)
         stages.write_manifest(pilot=1.5)
         table = stages.read_or_compute("table.parquet", lambda: pd.DataFrame({"x": [1.0, 2.0]}))

@@ -188,13 +188,13 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
     study = one_side()
     ran, run = [], Engine.run
 
-    def counted(engine, chunk):
+    def count_lanes(engine, chunk):
         if len(ran) == 2:
             raise KeyboardInterrupt
         ran.append(chunk)
         return run(engine, chunk)
 
-    monkeypatch.setattr(Engine, "run", counted)
+    monkeypatch.setattr(Engine, "run", count_lanes)
     with pytest.raises(KeyboardInterrupt):
         tune(study, tmp_path, backend="scan")
     with pytest.raises(InputError, match="was begun with --backend scan; go on with that, or choose another folder"):

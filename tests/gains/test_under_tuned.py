@@ -20,8 +20,8 @@ from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.sweeps.trial import run
 
 
-def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=10_000, rest=0.0):
-    """Passages through x1 = 0 in the observer's own states, down to one below `rest`: times, and x2 with its sign."""
+def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=10_000, least_peak=0.0):
+    """Passages through x1 = 0 in the observer's own states, down to one below `least_peak`: times, and x2 with its sign."""
     time, state, simulated = 0.0, np.array(start), []
     for _ in range(most):
         sign = np.sign(state[0]) or np.sign(state[1])
@@ -50,7 +50,7 @@ def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=
             break
         time, state = solution.t[-1], np.array([0.0, solution.y[1, -1]])
         simulated.append((time, state[1]))
-        if abs(state[1]) < rest:
+        if abs(state[1]) < least_peak:
             break
     return np.array(simulated).reshape(-1, 2).T
 
@@ -62,7 +62,7 @@ SLOW = 1.5 * np.sin(TIMES)
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.0, 0.0), (0.0, 1.0), (0.01, 0.0), (0.005, 3.0)])
 def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
     law = peak_law(lambda_, 1.8, TIMES, SLOW, damping=damping, peak=0.02)
-    times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), rest=1.8e-3)
+    times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), least_peak=1.8e-3)
     expected = np.interp(times, TIMES, law)
     is_compared = expected > 2e-3
     assert is_compared.sum() > 30
@@ -167,7 +167,7 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
     assert np.abs(lasting[-4:]).min() > 0.9 * start[1]
     for phase in np.arange(0.0, 2.0 * np.pi, 0.5 * np.pi):
         start = 0.0, 0.5 * np.pi * alpha
-        _, x2 = peaks(1.08 * limit, alpha, lambda t, p=phase: np.sin(t + p), 500.0, 0.0, start, most=200, rest=1e-3)
+        _, x2 = peaks(1.08 * limit, alpha, lambda t, p=phase: np.sin(t + p), 500.0, 0.0, start, most=200, least_peak=1e-3)
         assert np.abs(x2[-1]) < 1e-3
 
 

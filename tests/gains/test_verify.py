@@ -90,7 +90,7 @@ def test_normalised_level_counted_again(verified):
 
 @pytest.fixture(scope="module")
 def judged_cells(verified):
-    """By level and bound, the rows of the frame as dicts, each with what the conditions demand."""
+    """Rows of the frames as dicts by level and bound, each with the lambda that the conditions demand."""
     verdict, _ = verified
     return {
         (level, bound): [
@@ -102,10 +102,10 @@ def judged_cells(verified):
 
 
 @pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
-def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
+def test_levels_of_the_drive_counted_again(level, cells, verified, judged_cells):
     verdict, _ = verified
     level_data = entries(verdict.summary, level)
-    rows = judged[level, "true"]
+    rows = judged_cells[level, "true"]
     keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
     assert level_data["side"] == "motor"
     assert level_data["cells"] == len(rows) == len(keys) == cells
@@ -113,7 +113,7 @@ def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
     assert level_data["diverged"] == sum(not row["finite"] for row in rows)
     assert level_data["converged"] > 0
     for bound, listing in (("true", level_data["conditions"]), ("claimed", level_data["claimed_bound"]["conditions"])):
-        rows = judged[level, bound]
+        rows = judged_cells[level, bound]
         for entry in listing:
             name = entry["name"]
             holds = [row[LAMBDA] > row["demanded"][name] for row in rows]
@@ -125,7 +125,7 @@ def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
             assert entry["fails_but_converged"] == worked
     # the least lambda that worked, everything else being equal
     first = {}
-    for row in judged[level, "true"]:
+    for row in judged_cells[level, "true"]:
         if row["motor.converged"]:
             other_values = tuple(row[key] for key in KEYS[level] if key != LAMBDA)
             if other_values not in first or row[LAMBDA] < first[other_values][LAMBDA]:
@@ -145,16 +145,16 @@ def test_levels_of_the_drive_counted_again(level, cells, verified, judged):
             level_data["conditions"][0]["name"] == "davila_fridman"
             and level_data["conditions"][0]["conservatism"]["columns"] > 0
         )
-    small = [row[BOUNDS["true"]] > row[BOUNDS["claimed"]] for row in judged[level, "true"] if row["motor.converged"]]
+    small = [row[BOUNDS["true"]] > row[BOUNDS["claimed"]] for row in judged_cells[level, "true"] if row["motor.converged"]]
     assert level_data["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
 
 
-def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified, judged):
+def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified, judged_cells):
     verdict, _ = verified
     listed_ = verdict.counterexamples
     assert set(listed_["side"]) == {"motor"}
     sizes = []
-    for (level, bound), rows in judged.items():
+    for (level, bound), rows in judged_cells.items():
         keys = KEYS[level]
         for name in rows[0]["demanded"]:
             failed = {

@@ -82,9 +82,9 @@ def test_ratio_is_the_closed_form_over_a_plane(plane):
 def test_no_counterexample_to_any_condition(plane):
     lambda_, alpha, ratio, _ = plane
     assert len(ratio) >= 200_000
-    ones_like_alpha = np.ones_like(alpha)
+    f_plus = np.ones_like(alpha)
     for name, (_, limit) in conditions.CONDITIONS.items():
-        holds = lambda_ > np.asarray(jax.jit(limit)(alpha, ones_like_alpha))
+        holds = lambda_ > np.asarray(jax.jit(limit)(alpha, f_plus))
         assert holds.sum() > 50_000, name
         assert np.all(ratio[holds] < 1.0), name
     assert np.sum(~holds) > 50_000
@@ -94,11 +94,11 @@ def test_no_counterexample_to_any_condition(plane):
 
 
 def test_exact_condition_is_sharp_and_others_hold_at_their_limits():
-    alpha, ones_like_alpha = 1.0 + np.geomspace(1e-3, 19.0, LANES), np.ones(LANES)
-    limits = {name: np.asarray(jax.jit(f)(alpha, ones_like_alpha)) for name, (_, f) in conditions.CONDITIONS.items()}
+    alpha, f_plus = 1.0 + np.geomspace(1e-3, 19.0, LANES), np.ones(LANES)
+    limits = {name: np.asarray(jax.jit(f)(alpha, f_plus)) for name, (_, f) in conditions.CONDITIONS.items()}
     for name, limit in limits.items():
-        assert np.all(half(limit * (1.0 + 1e-5), alpha, ones_like_alpha).ratio < 1.0), name
-    assert np.all(half(limits["exact"] * (1.0 - 1e-5), alpha, ones_like_alpha).ratio > 1.0)
+        assert np.all(half(limit * (1.0 + 1e-5), alpha, f_plus).ratio < 1.0), name
+    assert np.all(half(limits["exact"] * (1.0 - 1e-5), alpha, f_plus).ratio > 1.0)
 
 
 def gains(seed):
@@ -222,7 +222,7 @@ def test_ratio_falls_with_lambda(cube):
 
 
 def test_ratio_falls_with_damping_where_it_is_not_small(cube):
-    """Of peaks that fall to a tenth anyway, damping turns back so much earlier that they are a little larger with it."""
+    """Peaks that fall to a tenth anyway are slightly larger with damping, which turns the error back earlier."""
     before, after = cube[:, :-1], cube[:, 1:]
     assert np.sum(before > 0.1) > 5000
     assert np.all((after < before)[before > 0.1])
