@@ -44,15 +44,15 @@ class NominalDrive:
     stiffness: float = math.inf
     half_gap: float = 0.0
 
-    def inertia(self, channel: str) -> float:
+    def inertia_at(self, channel: str) -> float:
         """Return the torque on the motor that accelerates the drive, per acceleration of the encoder `channel`."""
-        return self._at(channel, self.motor_inertia + self.load_inertia / self.gear_ratio**2)
+        return self._refer_to(channel, self.motor_inertia + self.load_inertia / self.gear_ratio**2)
 
-    def viscous(self, channel: str) -> float:
+    def viscous_at(self, channel: str) -> float:
         """Return the viscous torque of the drive on the motor, per speed of the encoder `channel`."""
-        return self._at(channel, self.motor_viscous + self.load_viscous / self.gear_ratio**2)
+        return self._refer_to(channel, self.motor_viscous + self.load_viscous / self.gear_ratio**2)
 
-    def _at(self, channel: str, at_motor: float) -> float:
+    def _refer_to(self, channel: str, at_motor: float) -> float:
         # the torque acts at the motor
         return at_motor if channel == "theta_e" else at_motor * self.gear_ratio
 
@@ -205,21 +205,21 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     twist, torque, place, velocity, acceleration, motor_velocity, motor_acceleration = np.concatenate(parts).T
     shaft_torque = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
     target = twist - shaft_torque / nominal.stiffness
-    ones = np.ones(len(target))
+    constant = np.ones(len(target))
     best = None
     for flank in (shaft_torque, velocity, acceleration):
         is_clear = np.abs(flank) > 0.3 * rms(flank)
         share = float(np.mean(flank[is_clear] > 0.0)) if is_clear.any() else 0.0
         if is_clear.sum() < 0.25 * len(is_clear) or not 0.05 < share < 0.95:
             continue
-        rows = np.column_stack([ones, np.sign(flank), velocity, acceleration])[is_clear]
+        rows = np.column_stack([constant, np.sign(flank), velocity, acceleration])[is_clear]
         mean_square = _residual_mean_square(target[is_clear], rows)
         if best is None or mean_square < best[0]:
             best = (mean_square, is_clear, rows)
     flanks = best is not None
     if best is None:
-        rows = np.column_stack([ones, velocity, acceleration])
-        best = (_residual_mean_square(target, rows), ones > 0.0, rows)
+        rows = np.column_stack([constant, velocity, acceleration])
+        best = (_residual_mean_square(target, rows), constant > 0.0, rows)
     mean_square, is_clear, rows = best
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
     harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]

@@ -149,7 +149,7 @@ class _Rig:
     def half_range(self) -> float:
         return 0.5 * (float(self.position.max()) - float(self.position.min()))
 
-    def columns(self, terms: Sequence[str], shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def compute_columns(self, terms: Sequence[str], shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the torque per unit of stiffness, offset, and sizes of terms in order; shape (rows, linear numbers)."""
         shapes_by_name = dict(zip(_shape_names(terms), shapes, strict=True))
         x = self.position - shapes_by_name.get("centre", 0.0)
@@ -164,12 +164,12 @@ class _Rig:
             elif term == "dry friction":
                 columns.append(self.direction[rows])
             elif term == "hysteresis":
-                columns.append(self._hysteresis(deflection, shapes_by_name["length"])[rows])
+                columns.append(self._compute_hysteresis(deflection, shapes_by_name["length"])[rows])
             elif term == "friction under load":
                 columns.append((np.abs(deflection) * self.direction)[rows])
         return np.stack(columns, axis=1)
 
-    def _hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
+    def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
         for part, begins in zip(self.stretches, self.begins, strict=True):
@@ -296,7 +296,7 @@ class _Model(NamedTuple):
     error: float
 
     @property
-    def possible(self) -> bool:
+    def is_possible(self) -> bool:
         """True if stiffness and all sizes are positive."""
         return bool(self.sizes[0] > 0.0 and (self.sizes[2:] > 0.0).all())
 
@@ -310,7 +310,7 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
             if term not in best.terms
         ]
         candidates = [
-            (model, gain) for model in models if model.possible and (gain := _compute_gain(rig, best, model)) is not None
+            (model, gain) for model in models if model.is_possible and (gain := _compute_gain(rig, best, model)) is not None
         ]
         if not candidates:
             return best
@@ -376,7 +376,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     }
 
     def compute_residual(shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        columns = rig.columns(terms, shapes, rows)
+        columns = rig.compute_columns(terms, shapes, rows)
         return rig.torque[rows] - columns @ _fit_sizes(columns, rig.torque[rows])
 
     shapes = np.empty(0)
@@ -391,14 +391,14 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
         solutions = [search(np.clip(np.array(start), *inside), args=(few_rows,)) for start in starts]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = search(best.x, args=(rig.rows,)).x
-    columns = rig.columns(terms, shapes, rig.rows)
+    columns = rig.compute_columns(terms, shapes, rig.rows)
     sizes = _fit_sizes(columns, rig.torque[rig.rows])
     return _Model(terms, shapes, sizes, float(np.mean((rig.torque[rig.rows] - columns @ sizes) ** 2)))
 
 
 def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
     """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
-    columns, torque = rig.columns(model.terms, model.shapes, rig.rows), rig.torque[rig.rows]
+    columns, torque = rig.compute_columns(model.terms, model.shapes, rig.rows), rig.torque[rig.rows]
     errors = []
     for block in np.array_split(np.arange(len(torque)), _FOLDS):
         is_fitted = np.ones(len(torque), dtype=bool)
@@ -431,11 +431,11 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         *_shape_names(model.terms),
     ]
     values = np.concatenate([model.sizes, model.shapes])
-    columns = rig.columns(model.terms, model.shapes, rig.rows)
+    columns = rig.compute_columns(model.terms, model.shapes, rig.rows)
     slopes, step = [], 1e-4 * rig.half_range
     for offset in step * np.eye(len(model.shapes)):
         ends = model.shapes - offset, model.shapes + offset
-        low, high = (rig.columns(model.terms, shapes, rig.rows) @ model.sizes for shapes in ends)
+        low, high = (rig.compute_columns(model.terms, shapes, rig.rows) @ model.sizes for shapes in ends)
         slopes.append((high - low) / (2.0 * step))
     jacobian = np.column_stack([columns, *slopes])
     residual = rig.torque[rig.rows] - columns @ model.sizes
@@ -454,7 +454,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
                 open_.append(name)
         numbers[name] = Number(value, error, (low, high), _unit_of(name, linear))
     torque = np.full(len(full_rig.position), np.nan)
-    torque[full_rig.rows] = full_rig.columns(model.terms, model.shapes, full_rig.rows) @ model.sizes
+    torque[full_rig.rows] = full_rig.compute_columns(model.terms, model.shapes, full_rig.rows) @ model.sizes
     spread = float(np.std(rig.torque[rig.rows]))
     residual_rms = rms(residual)
     reversals = len(rig.stretches) - sum(rig.begins)
@@ -493,6 +493,6 @@ def element_error(
     rig = _prepare_rig(position, torque, segments, period, noise)
     if rig is None:
         return None
-    residual = torque[rig.rows] - rig.columns(element.terms, element.shapes, rig.rows) @ element.sizes
+    residual = torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
     residual_rms = rms(residual)
     return residual_rms, residual_rms / float(np.std(torque[rig.rows]))

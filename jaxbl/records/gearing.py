@@ -62,12 +62,12 @@ class Gearing(LostMotion):
     def describe_lost_motion(self, unit: str) -> str:
         """Describe value, error and interval; for rad also in degrees."""
         low, high = self.lost_motion_interval
-        digits = _decimals(self.lost_motion_error)
+        digits = _count_decimals(self.lost_motion_error)
         text = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
         text += f" (95 %: {low:.{digits}f} to {high:.{digits}f}"
         if unit == "rad":
             value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
-            digits = _decimals(error)
+            digits = _count_decimals(error)
             text += f"; {value:.{digits}f} ± {error:.{digits}f}°"
         return f"{text})"
 
@@ -76,7 +76,7 @@ class Gearing(LostMotion):
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
 
 
-def _decimals(error: float) -> int:
+def _count_decimals(error: float) -> int:
     """Return the number of decimals that shows two digits of an error."""
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
@@ -131,17 +131,19 @@ def fit_gearing(
     is_wide = min(twist, least_twist) > WIDE_TWIST * motion
     # with stick and slip, or a coarse encoder, the load shows its direction no sooner than the motor
     slow = min(width, _velocity_bandwidth(motor[part], period) or width)
-    lost = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, is_wide=is_wide)
-    if lost is None:
+    lost_motion_fit = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, is_wide=is_wide)
+    if lost_motion_fit is None:
         # no flank is in contact for long: the rough regression has to do
-        lost = LostMotion.from_motion(2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2]))
+        lost_motion_fit = LostMotion.from_motion(
+            2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2])
+        )
     # the crossing of the gap is not modelled: an error of 0.5 % of the gap, by motions of several frequencies
     speed = _rms(rows[:, 1])
-    skew_error = float(np.hypot(errors[1], 0.005 * lost.lost_motion / speed) / abs(coefficients[0]))
+    skew_error = float(np.hypot(errors[1], 0.005 * lost_motion_fit.lost_motion / speed) / abs(coefficients[0]))
     # with a gap as large as the motion a delay cannot be found
     has_skew = has_skew and not is_wide
     return Gearing(
-        **vars(replace(lost, twist_residual=lost.twist_residual / spread if spread else np.inf)),
+        **vars(replace(lost_motion_fit, twist_residual=lost_motion_fit.twist_residual / spread if spread else np.inf)),
         ratio=slope,
         ratio_error=float(np.hypot(slope_errors[0], slope * least_twist / motion if is_wide else 0.0)),
         skew=skew if has_skew else None,

@@ -42,7 +42,9 @@ class LostMotion:
         value: float, error: float, residual: float = math.inf, changes: int = 0, freedom: int = BLOCKS - 1
     ) -> "LostMotion":
         """Return a lost motion whose flank is decided by the direction of motion."""
-        return LostMotion(value, error, _interval(value, error, freedom), "motion", changes, (), (value, value), residual)
+        return LostMotion(
+            value, error, _compute_interval(value, error, freedom), "motion", changes, (), (value, value), residual
+        )
 
     def enclose(self, other: "LostMotion") -> "LostMotion":
         """Return an interval that encloses this estimate and another one, which rests on different assumptions."""
@@ -51,7 +53,7 @@ class LostMotion:
         return self.from_motion(value, error, self.twist_residual, self.flank_changes)
 
 
-def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
+def _compute_interval(value: float, error: float, freedom: int) -> tuple[float, float]:
     from scipy.special import stdtrit
 
     reach = float(stdtrit(max(freedom, 1), 0.975)) * error
@@ -266,7 +268,7 @@ def fit_lost_motion_by_load(
         return None
     change_times = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in changes)
     least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9])
-    interval = _interval(size, error, min(len(passes), BLOCKS) - 1)
+    interval = _compute_interval(size, error, min(len(passes), BLOCKS) - 1)
     return LostMotion(
         size, error, interval, "load", len(change_times), change_times, (float(least), float(largest)), residual
     )

@@ -237,9 +237,9 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     `file.contradiction` is set if no fit would be worth its time. Friction takes the power <u ω> + J <fall of ω² a second>
     / 2, the model's f <ω²>; noise, gaps and shafts do not change this. Without nominal friction this part is left out.
     """
-    nominal_inertia = nominal.inertia(channel)
+    nominal_inertia = nominal.inertia_at(channel)
     inertia, inertia_error = float(rigid_fit.values[0]), float(rigid_fit.errors[0])
-    nominal_power = nominal.viscous(channel) * rigid_fit.square
+    nominal_power = nominal.viscous_at(channel) * rigid_fit.square
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
     power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
     has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
@@ -274,7 +274,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
-    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous(channel)
+    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
     if (
         viscous < -8.0 * float(rigid_fit.errors[1])
         and rigid_fit.inflation[1] < 10.0
