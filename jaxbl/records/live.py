@@ -146,7 +146,7 @@ class _ChannelReader:
 
     def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
         self._table, self._channels = table, _stream_channels(table)
-        file = LogFile(Path(name), Columns.fromkeys(columns, ()))
+        file = LogFile(Path(name), Columns(dict.fromkeys(columns, ())))
         keys = {channel_table.column_or(channel): channel for channel, channel_table in self._channels.items()}
         self._indices = {
             column: list(columns).index(file.find_column(column, keys.get(column, ""))) for column in stream_columns(table)

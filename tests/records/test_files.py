@@ -392,7 +392,7 @@ def install_readers(monkeypatch):
 
 
 @pytest.mark.parametrize("read", [read_blocks, lazy_blocks, lambda path: pd.DataFrame(read_blocks(path))])
-def test_readers_of_install_readers_packages_read_the_files_of_their_ending(read, installed, tmp_path):
+def test_readers_of_installed_packages_read_the_files_of_their_ending(read, install_readers, tmp_path):
     np.stack([T, U], axis=1).tofile(tmp_path / "log.REC")
     assert not files.is_log(tmp_path / "log.REC")
     install_readers(rec=read)
