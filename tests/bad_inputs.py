@@ -346,14 +346,14 @@ TABLES = [
 def written(path: Path, columns: dict) -> None:
     frame = pd.DataFrame(columns)
     if path.suffix == ".parquet":
-        frame.astype({name: str for name, one in columns.items() if one.dtype.kind == "c"}).to_parquet(path)
+        frame.astype({name: str for name, column in columns.items() if column.dtype.kind == "c"}).to_parquet(path)
     elif path.suffix == ".mat":
-        savemat(path, {name: one for name, one in columns.items() if one.dtype.kind not in "MmO"})
+        savemat(path, {name: column for name, column in columns.items() if column.dtype.kind not in "MmO"})
     elif path.suffix == ".h5":
         with h5py.File(path, "w") as file:
-            for name, one in columns.items():
-                if one.dtype.kind not in "MmO":
-                    file[name] = one
+            for name, column in columns.items():
+                if column.dtype.kind not in "MmO":
+                    file[name] = column
     elif path.suffix == ".json":
         path.write_text(frame.to_json(orient="records", default_handler=str))
     else:
@@ -396,17 +396,17 @@ def checked(read, *given) -> str:
     # of the processor's time: a crowded machine is no failure; and what waits is ended after a while
     before = sum(os.times()[:2])
     faulthandler.dump_traceback_later(10 * SECONDS, exit=True)
-    said = read(*given)
+    output = read(*given)
     faulthandler.cancel_dump_traceback_later()
     assert sum(os.times()[:2]) - before < SECONDS, "took too long"
     assert 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < BYTES, "took too much memory"
-    assert "allocate" not in said and "MemoryError" not in said
-    assert said.isprintable() and len(said) <= 2500, said
-    return said
+    assert "allocate" not in output and "MemoryError" not in output
+    assert output.isprintable() and len(output) <= 2500, output
+    return output
 
 
 def main(what: str, folder: Path) -> None:
-    said: dict[str, str] = {}
+    output: dict[str, str] = {}
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     # that a failure of this test is no failure of the machine
     resource.setrlimit(resource.RLIMIT_AS, (size + 3 * BYTES, size + 3 * BYTES))
@@ -416,12 +416,12 @@ def main(what: str, folder: Path) -> None:
             for name, make in cases.items():
                 place = folder / f"{prefix} {name}"
                 place.mkdir()
-                found = make(place)
+                result = make(place)
                 if prefix == "study":
-                    path = content(place, "study.toml", found if isinstance(found, str) else text(found))
-                    said[f"{prefix} {name}"] = checked(study, path)
+                    path = content(place, "study.toml", result if isinstance(result, str) else text(result))
+                    output[f"{prefix} {name}"] = checked(study, path)
                 else:
-                    said[f"{prefix} {name}"] = checked(log, *(found if isinstance(found, tuple) else (found,)))
+                    output[f"{prefix} {name}"] = checked(log, *(result if isinstance(result, tuple) else (result,)))
     else:
         path, model = folder / "study.toml", folder / "model.toml"
         generated = settings(max_examples=int(sys.argv[3]), database=None, derandomize=True, deadline=None,
@@ -431,16 +431,16 @@ def main(what: str, folder: Path) -> None:
         @given(studies())
         def try_study(data):
             path.write_bytes(data)
-            said[str(len(said))] = checked(study, path)
+            output[str(len(output))] = checked(study, path)
 
         @generated
         @given(logs(folder / "log"))
         def try_log(given):
             model.write_bytes(given[1])
-            said[str(len(said))] = checked(log, given[0], model)
+            output[str(len(output))] = checked(log, given[0], model)
 
         try_study() if what == "toml" else try_log()
-    (folder / "said.json").write_text(json.dumps(said))
+    (folder / "said.json").write_text(json.dumps(output))
 
 
 if __name__ == "__main__":

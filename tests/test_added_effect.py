@@ -71,9 +71,9 @@ def test_its_numbers_are_identified(installed, tmp_path):
     known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
     (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
     jaxbl(installed, "identify", log, "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
-    found = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
-    assert found[f"effects.{NAME}.torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
-    assert found[f"effects.{NAME}.length"]["value"] == pytest.approx(LENGTH, rel=0.05)
+    parameters = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
+    assert parameters[f"effects.{NAME}.torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
+    assert parameters[f"effects.{NAME}.length"]["value"] == pytest.approx(LENGTH, rel=0.05)
 
 
 def test_it_is_named_where_it_is_missing(installed, tmp_path):
@@ -81,9 +81,9 @@ def test_it_is_named_where_it_is_missing(installed, tmp_path):
     (tmp_path / "model.toml").write_text(tomli_w.dumps(model()), encoding="utf-8")
     out = tmp_path / "found"
     jaxbl(installed, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
-    found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-    assert found["verdict"] == "explained"
-    (finding,) = found["findings"]
+    content = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert content["verdict"] == "explained"
+    (finding,) = content["findings"]
     assert finding["effect"] == NAME and finding["confidence"] > 0.99
     assert finding["parameters"]["torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
     assert finding["parameters"]["length"]["value"] == pytest.approx(LENGTH, rel=0.05)

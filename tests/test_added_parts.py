@@ -124,16 +124,16 @@ def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
         "warning: jaxbl.metrics: 'broken' (more_parts:Nothing) is left out: "
         "AttributeError: module 'more_parts' has no attribute 'Nothing'"
     ]
-    found = json.loads(done.stdout)
-    assert found["input"] == pytest.approx([-0.4, -0.39936, -0.39872])
+    content = json.loads(done.stdout)
+    assert content["input"] == pytest.approx([-0.4, -0.39936, -0.39872])
     for name, true in (("stiffness", 1.0), ("cubic", 30.0)):
-        assert found["identified"][name]["true"] == true
-        assert found["identified"][name]["motor"] == pytest.approx(true, rel=0.2)
-    assert found["peak"][0] == pytest.approx(found["peak"][1])
-    assert found["size"][0] == pytest.approx(found["size"][1])
-    assert found["swept"]["motor.velocity_peak"][0] != found["swept"]["motor.velocity_peak"][1]
-    assert max(map(abs, found["swept"]["motor.cubic_error"])) < 0.2
-    text = "\n".join(found["page"])
+        assert content["identified"][name]["true"] == true
+        assert content["identified"][name]["motor"] == pytest.approx(true, rel=0.2)
+    assert content["peak"][0] == pytest.approx(content["peak"][1])
+    assert content["size"][0] == pytest.approx(content["size"][1])
+    assert content["swept"]["motor.velocity_peak"][0] != content["swept"]["motor.velocity_peak"][1]
+    assert max(map(abs, content["swept"]["motor.cubic_error"])) < 0.2
+    text = "\n".join(content["page"])
     assert '`[transmission]` with `law = "cubic_shaft"`' in text and '`[excitation]` with `kind = "triangle"`' in text
     assert "| `side.velocity_peak` | rad/s | largest velocity error in the last quarter |" in text
     assert "| `side.cubic_error` |  | relative error of the identified cubic |" in text

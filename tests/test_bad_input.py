@@ -142,8 +142,8 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     call = [*before, sys.executable, "-m", "jaxbl", "plot", folder]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     folder.chmod(0o755)
-    said = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
-    assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {said}\n")
+    output = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
+    assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {output}\n")
 
 
 @pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])
@@ -158,8 +158,8 @@ def test_an_interrupt_before_work_begins(tmp_path, default_interrupt, wait):
         next(line for line in lines if line.endswith(" typer\n") or " click" in line)
         time.sleep(wait)
         process.send_signal(signal.SIGINT)
-        rest = process.stderr.read()
+        content = process.stderr.read()
         process.wait(300)
-    said = [line for line in rest.splitlines() if not line.startswith("import time:")]
+    output = [line for line in content.splitlines() if not line.startswith("import time:")]
     assert process.returncode == 130
-    assert len(said) == 1 and said[0].startswith("interrupted")
+    assert len(output) == 1 and output[0].startswith("interrupted")

@@ -39,9 +39,9 @@ def test_its_table_fits_a_terminal_with_long_names(tmp_path):
     names = [f"transmission.friction_of_{'another_' * i}package" for i in range(1, 5)]
     many = DIAGNOSIS | {"findings": [{"effect": name, "confidence": 0.5} for name in names]}
     rows = [
-        make_batch_row(tmp_path / name, found, refused)
+        make_batch_row(tmp_path / name, result, refused)
         for name in ("a.csv", f"{'machine_' * 6}7.csv")
-        for found, refused in ((many, ""), (DIAGNOSIS, ""), (None, f"a.csv: {'columns should have other names; ' * 9}"))
+        for result, refused in ((many, ""), (DIAGNOSIS, ""), (None, f"a.csv: {'columns should have other names; ' * 9}"))
     ]
     lines = format_batch(rows)
     assert all(len(line) <= 80 for line in lines) and all(name in " ".join(lines) for name in names)
@@ -80,9 +80,9 @@ def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):
     for name in ("a.csv", "b.csv", "c.csv", "a.toml"):
         (tmp_path / name).write_text("")
     work, _ = read_batch(Path(), Path("a.toml"), Path("out"), overwrite=False)
-    seen = []
+    calls = []
     monkeypatch.setattr(batch, "_diagnose_log", _found)
-    rows = run_batch(work, Path("out"), None, lambda *done: seen.append(done), client)
+    rows = run_batch(work, Path("out"), None, lambda *done: calls.append(done), client)
     assert [row["log"] for row in rows] == ["a.csv", "b.csv", "c.csv"]
-    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert list(pd.read_csv("out/batch.csv")["verdict"]) == ["explained"] * 3

@@ -494,11 +494,11 @@ def test_progress_in_a_pipe_is_a_line_now_and_then(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(terminal, "_EVERY", 0.05)
     monkeypatch.setattr(terminal, "_LOOK", 0.01)
-    for quiet, said in ((True, False), (False, True)):
+    for quiet, output in ((True, False), (False, True)):
         with terminal.progress_bar("runs", quiet=quiet):
             time.sleep(0.2)
         out, errors = capsys.readouterr()
-        assert out == without_progress(errors) == "" and bool(errors) == said
+        assert out == without_progress(errors) == "" and bool(errors) == output
 
 
 def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
@@ -509,11 +509,11 @@ def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
     assert lines.look(12.0) is None
     for t in range(13, 90):
         lines.update(500 + 2 * (t - 12), 1000)
-        said = lines.look(float(t))
+        shown_line = lines.look(float(t))
     lines.hear("drawing")
     assert lines.look(90.0) == "jaxbl: drawing, 654 of 1000 runs (65 %), about 3 min left"
     assert without_progress("jaxbl: drawing, 654 of 1000 runs (65 %), about 2 min left\nx\n") == "x\n"
-    assert said is None
+    assert shown_line is None
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])
@@ -581,8 +581,8 @@ def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
     done = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     ended = json.loads(done.stdout.splitlines()[-1])
-    said = {name: (code, without_progress(errors)) for name, (code, errors) in ended.items()}
-    assert said == dict.fromkeys(SHIPPED, (0, ""))
+    output = {name: (code, without_progress(errors)) for name, (code, errors) in ended.items()}
+    assert output == dict.fromkeys(SHIPPED, (0, ""))
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
@@ -651,9 +651,9 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
     assert code == 0 and any(line.startswith("gap") and " yes " in line for line in out)
     code, out, err = call("identify", "rig.csv", "--model", model, "--out", "found", "--holdout", "again.csv")
     assert (code, err) == (0, []) and out[0].startswith("transmission.stiffness = ") and " N/m, 95 %: " in out[0]
-    found = json.loads(Path("found/identification.json").read_text())["parameters"]
+    parameters = json.loads(Path("found/identification.json").read_text())["parameters"]
     assert json.loads(Path("found/identification.json").read_text())["title"] == "Transmission of rig.csv"
-    assert found["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
+    assert parameters["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
     assert tomllib.loads(Path("found/model.toml").read_text())["transmission"]["law"] == "dead_zone"
     assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(left(Path("found")))
     with pytest.raises(InputError, match=r"study.toml: log.kind: 'element' is a transmission alone, without the drive"):
@@ -715,9 +715,9 @@ def test_a_log_is_identified(call, tmp_path):
     assert code == 0
     assert lines[0].startswith("drive.motor_inertia = 0.0")
     assert lines[-1] == "results/axis/report.html"
-    found = json.loads((tmp_path / "results/axis/identification.json").read_text())
+    content = json.loads((tmp_path / "results/axis/identification.json").read_text())
     names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
-    assert list(found["parameters"]) == names
+    assert list(content["parameters"]) == names
     finished = (tmp_path / "results/axis/identification.json").stat().st_mtime_ns
     assert call("identify", "axis.csv", "--model", "axis.toml") == (code, lines, [])
     assert (tmp_path / "results/axis/identification.json").stat().st_mtime_ns == finished
@@ -833,12 +833,12 @@ def quick(monkeypatch):
         tasks.append(task)
         return _Found(task)
 
-    def report(found, folder, steps=()):
+    def report(result, folder, steps=()):
         from jaxbl.report.diagnose import diagnosis_lines
 
         (folder / "report.html").write_text("its page")
-        (folder / "diagnosis.json").write_text(json.dumps(found.summary))
-        return diagnosis_lines(found.summary)
+        (folder / "diagnosis.json").write_text(json.dumps(result.summary))
+        return diagnosis_lines(result.summary)
 
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", run_task)
     monkeypatch.setattr("jaxbl.report.diagnose.write_diagnosis_report", report)
@@ -860,12 +860,12 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms (noise; most that a complete "
         "model leaves): theta_e 0.1 -> 0.001 rad (0.001; 0.0012), "
     )
-    at = lines.index("Next:")
-    assert lines[at - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    index = lines.index("Next:")
+    assert lines[index - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
     assert [command for command, _ in steps_in(lines)] == [run, "jaxbl explore 'results/an axis'"]
     assert lines[-1] == "results/an axis/report.html"
-    assert call(*DIAGNOSE) == (0, [*lines[: at - 1], *lines[at:]], [])
+    assert call(*DIAGNOSE) == (0, [*lines[: index - 1], *lines[index:]], [])
     assert len(quick) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
@@ -898,8 +898,8 @@ def test_what_cannot_be_diagnosed_is_told(arguments, message, axis, quick, call,
 
 def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", interrupt)
-    told = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
-    assert call(*DIAGNOSE, "--out", "out") == (130, [], [told])
+    messages = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
+    assert call(*DIAGNOSE, "--out", "out") == (130, [], [messages])
     assert not (tmp_path / "out").exists()
 
 
@@ -936,32 +936,32 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick,
 def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, monkeypatch, capsys):
     write(tmp_path)
     code, lines, _ = call("sweep", "study.toml", "--json", "--out", "out")
-    found = json.loads("\n".join(lines))
-    assert (code, found["command"], found["exit"]) == (0, "sweep", 0)
-    assert found["summary"] == {"title": "small", "runs": 3, "finished": True}
-    assert found["found"][0].startswith("3 runs.") and found["open"] == "out/report.html"
-    assert [one["command"].split()[1] for one in found["next"]] == ["explore", "tune", "simulate"]
-    assert set(found["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
+    content = json.loads("\n".join(lines))
+    assert (code, content["command"], content["exit"]) == (0, "sweep", 0)
+    assert content["summary"] == {"title": "small", "runs": 3, "finished": True}
+    assert content["found"][0].startswith("3 runs.") and content["open"] == "out/report.html"
+    assert [one["command"].split()[1] for one in content["next"]] == ["explore", "tune", "simulate"]
+    assert set(content["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
     assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
     monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     out, errors = capsys.readouterr()
-    said = "none.toml: no such file; here are study.toml"
-    assert (end.value.code, errors) == (2, f"jaxbl: {said}\n")
-    assert json.loads(out) == {"command": "sweep", "exit": 2, "error": said}
+    output = "none.toml: no such file; here are study.toml"
+    assert (end.value.code, errors) == (2, f"jaxbl: {output}\n")
+    assert json.loads(out) == {"command": "sweep", "exit": 2, "error": output}
 
 
 def test_completion_knows_the_commands(tmp_path):
     asked = {"_JAXBL_COMPLETE": "complete_bash", "COMP_WORDS": "jaxbl swee", "COMP_CWORD": "1"}
     code = "import sys; sys.argv = ['jaxbl']; from jaxbl.__main__ import program; program()"
-    shown = run_python("-c", code, cwd=tmp_path, **asked)
-    assert shown.stdout.split() == ["sweep"]
+    result = run_python("-c", code, cwd=tmp_path, **asked)
+    assert result.stdout.split() == ["sweep"]
 
 
 def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
-    shown = setup._find_shipped_study("gain_map.toml")
-    assert shown.is_file() and shown.name == "gain_map.toml"
+    shipped_study = setup._find_shipped_study("gain_map.toml")
+    assert shipped_study.is_file() and shipped_study.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
@@ -969,8 +969,8 @@ def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
 
 def steps_in(lines):
     """Command lines under "Next:", each with its question."""
-    at = lines.index("Next:") + 1
-    rows = lines[at : at + 2 * sum(line.startswith("  jaxbl ") for line in lines[at:])]
+    index = lines.index("Next:") + 1
+    rows = lines[index : index + 2 * sum(line.startswith("  jaxbl ") for line in lines[index:])]
     assert all(line.startswith("  jaxbl ") for line in rows[::2]) and all(len(line) <= 80 for line in rows[1::2])
     return [(command.strip(), question.strip()) for command, question in zip(rows[::2], rows[1::2], strict=True)]
 

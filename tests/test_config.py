@@ -375,18 +375,18 @@ def table(section, tag, name, module):
     + [("excitation", "kind", name, module) for name, module in EXCITATIONS.items() if name != "recorded"],
 )
 def test_every_module_has_the_table_of_its_parameters(section, tag, name, module):
-    given = table(section, tag, name, module)
-    data = (rigid if name == "rigid" else small)(**{section: given})
+    inputs = table(section, tag, name, module)
+    data = (rigid if name == "rigid" else small)(**{section: inputs})
     config = read_config(data)
     built = getattr(config.build(), section)
     assert type(built) is module
     for field, _ in parameters(module):
-        assert getattr(built, field.name) == given[config_key(field.name)]
+        assert getattr(built, field.name) == inputs[config_key(field.name)]
         low = parameters_by_name(module)[field.name]
         if low.above is not None or low.minimum is not None:
             wrong = low.above if low.above is not None else low.minimum - 1
             with pytest.raises(InputError, match=f"{section}.{config_key(field.name)}: should be"):
-                read_config(data | {section: given | {config_key(field.name): wrong}})
+                read_config(data | {section: inputs | {config_key(field.name): wrong}})
 
 
 def parameters_by_name(module):
@@ -436,10 +436,10 @@ def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
     experiment = config.build()
     known, leaves = numeric_paths(config), leaf_paths(experiment)
     if data["drive"]["kind"] == "rigid":  # what one inertia has no use for
-        leaves = {path: about for path, about in leaves.items() if "load" not in path}
+        leaves = {path: leaf for path, leaf in leaves.items() if "load" not in path}
     assert set(leaves) <= set(known)
-    for path, about in leaves.items():
-        assert known[path].unit == about.unit
+    for path, leaf in leaves.items():
+        assert known[path].unit == leaf.unit
         assert known[path].doc
         moved = with_values(config, {path: 0.625})
         assert get_leaf(moved.build(), path) == 0.625, path
@@ -577,9 +577,9 @@ def test_files_of_an_included_file_are_relative_to_it(tmp_path, monkeypatch):
         assert excitation.file == str(tmp_path / "parts" / "log.csv")
     # of a mapping: relative to the working directory
     monkeypatch.chdir(tmp_path)
-    given = {"include": ["base.toml", "parts/input.toml"], "observer": {"motor": {"lambda": 1.0, "alpha": 2.0}}}
-    assert read_config(given).excitation.file == str(tmp_path / "parts" / "log.csv")
-    assert given["include"] == ["base.toml", "parts/input.toml"]
+    inputs = {"include": ["base.toml", "parts/input.toml"], "observer": {"motor": {"lambda": 1.0, "alpha": 2.0}}}
+    assert read_config(inputs).excitation.file == str(tmp_path / "parts" / "log.csv")
+    assert inputs["include"] == ["base.toml", "parts/input.toml"]
 
 
 GAINS = "[observer.motor]\nlambda = 1.0\nalpha = 2.0\n"

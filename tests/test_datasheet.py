@@ -61,7 +61,7 @@ def test_numbers_of_linear_axes_become_si(kind, name, text, value):
 
 def test_examples_and_defaults_can_be_read():
     items = [item for _, item in chain.from_iterable(items_by_name().values())]
-    assert len(items) == sum(len(about.items) for about in KINDS.values())
+    assert len(items) == sum(len(kind.items) for kind in KINDS.values())
     for item in items:
         assert item.read(item.example).value > 0.0
         assert not item.default or item.default_answer().text == "not given"
@@ -180,11 +180,11 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     }  # fmt: skip
     turning = {name: screw[name] for name in ITEMS["geared"] if name in screw}
     turning |= {name: Answer(value, "given: by hand") for name, value in at_motor.items()}
-    text, found = write_first_study(KINDS["screw"], screw, "")
+    text, result = write_first_study(KINDS["screw"], screw, "")
     _, other = write_first_study(KINDS["geared"], turning, "")
     # numbers are written with six digits, of which impacts in the gap make more
-    assert found["motor"]["f_plus"] == pytest.approx(other["motor"]["f_plus"], rel=1e-2)
-    assert found["load"]["f_plus"] * ratio == pytest.approx(other["load"]["f_plus"], rel=1e-2)
+    assert result["motor"]["f_plus"] == pytest.approx(other["motor"]["f_plus"], rel=1e-2)
+    assert result["load"]["f_plus"] * ratio == pytest.approx(other["load"]["f_plus"], rel=1e-2)
     for line in (
         "load_inertia = 60.0 # kg, given: 60 kg",
         "load_viscous = 200.0 # N s/m, given: 200 N s/m",
@@ -222,8 +222,8 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     ],
 )
 def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_path):
-    code, said, _ = call("init", "axis.toml", *words(kind, numbers | SHORT))
-    assert code == 0 and ("m/s² (motor)." in said[0]) == (kind == "linear") and "load" not in said[0]
+    code, output, _ = call("init", "axis.toml", *words(kind, numbers | SHORT))
+    assert code == 0 and ("m/s² (motor)." in output[0]) == (kind == "linear") and "load" not in output[0]
     text = (tmp_path / "axis.toml").read_text()
     assert all(f"\n{line}\n" in text for line in lines)
     assert not any(unit in text.partition("[drive]")[2] for unit in ("rad", "N m", "kg m²")) or kind == "direct"
@@ -281,11 +281,11 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "can_ask_user", lambda: True)
     examples = {item.question: item.example for item in KINDS["linear"].items}
     asked = []
-    said = iter(["gearless", "Linear", "8 kg"])
+    output = iter(["gearless", "Linear", "8 kg"])
 
     def prompt(text, default, err):
         asked.append(text)
-        return next(said, default or examples.get(text.partition(", such as")[0]))
+        return next(output, default or examples.get(text.partition(", such as")[0]))
 
     monkeypatch.setattr("typer.prompt", prompt)
     code, lines, errors = call("init", "axis.toml", "--frequency", "20 Hz")
@@ -311,5 +311,5 @@ def test_simulate_sweep_and_tune_run_what_is_written(kind, call):
     for line in printed:
         code, lines, _ = call(*line.split()[1:])
         assert code == 0 and lines[-1].endswith("/report.html")
-    found = tomllib.loads(Path("results/axis_gains/gains.toml").read_text())["observer"]
-    assert found["motor"]["alpha"] > 0.0 and ("load" in found) == KINDS[kind].law
+    observer = tomllib.loads(Path("results/axis_gains/gains.toml").read_text())["observer"]
+    assert observer["motor"]["alpha"] > 0.0 and ("load" in observer) == KINDS[kind].law

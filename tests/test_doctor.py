@@ -16,12 +16,12 @@ def whole():
 def test_it_names_versions_devices_and_folders_and_tests_itself(whole, call, monkeypatch):
     monkeypatch.setattr(doctor, "examine", lambda: whole)
     code, lines, _ = call("doctor")
-    found = {one.name: one for one in whole}
-    assert {"jaxbl", "python", "packages", "devices", "cache", "results", "one run", "two backends"} <= set(found)
+    result = {one.name: one for one in whole}
+    assert {"jaxbl", "python", "packages", "devices", "cache", "results", "one run", "two backends"} <= set(result)
     # tests keep no programs
     assert [one.name for one in whole if not one.good] == ["cache"]
     assert code == 1 and lines[-1] == "Not in order: cache."
-    assert "jax " in found["packages"].found and all(len(line) <= 80 or "/" in line for line in lines)
+    assert "jax " in result["packages"].found and all(len(line) <= 80 or "/" in line for line in lines)
     code, lines, _ = call("doctor", "--json")
     data = json.loads("\n".join(lines))
     assert data["exit"] == 1 and len(data["summary"]["findings"]) == len(whole)
@@ -31,5 +31,5 @@ def test_a_wrong_answer_is_found(monkeypatch):
     trial = run(doctor._make_study())
     trace = trial.trace.assign(**{"motor.velocity": 1.00001 * trial.trace["motor.velocity"]})
     monkeypatch.setattr(doctor, "run", lambda study: trial._replace(trace=trace))
-    found = doctor._test_one_run("one run")
-    assert not found.good and found.found.endswith("too far; report it with these lines")
+    finding = doctor._test_one_run("one run")
+    assert not finding.good and finding.found.endswith("too far; report it with these lines")

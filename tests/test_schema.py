@@ -57,14 +57,14 @@ def test_it_refuses_what_is_wrong(wrong, errors):
 
 
 def test_it_says_units_and_meanings_and_knows_every_effect():
-    found = build_schema()
-    text = json.dumps(found)
+    schema = build_schema()
+    text = json.dumps(schema)
     assert all(f'"const": "{kind}"' in text for kind in EFFECTS)
     assert '"null"' not in text
-    assert found["$defs"]["TwoInertia"]["properties"]["motor_inertia"]["description"] == "motor inertia J_e (kg m²)"
-    for name, table in found["$defs"].items():
-        for key, about in table.get("properties", {}).items():
-            assert "const" in about or "description" in about or "$ref" in about, f"{name}.{key}"
+    assert schema["$defs"]["TwoInertia"]["properties"]["motor_inertia"]["description"] == "motor inertia J_e (kg m²)"
+    for name, table in schema["$defs"].items():
+        for key, description in table.get("properties", {}).items():
+            assert "const" in description or "description" in description or "$ref" in description, f"{name}.{key}"
 
 
 def test_the_command_prints_or_writes_it_and_overwrites_nothing(call, tmp_path):

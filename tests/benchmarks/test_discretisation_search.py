@@ -23,9 +23,9 @@ def largest(kind, gains, noise, paths):
 def test_the_worst_error_is_the_larger_of_search_and_pairs():
     kind, gains, noise = ImplicitSuperTwisting, (1.5, 1.1), 2.0
     pairs = [largest(kind, gains, noise, x[None]) for x in audit.pairs(noise, audit.horizon(noise))]
-    found = audit.search_worst(kind, gains, noise)
-    assert found > max(pairs)
-    assert audit.worst(kind, gains, noise, audit.horizon(noise)) == found
+    worst = audit.search_worst(kind, gains, noise)
+    assert worst > max(pairs)
+    assert audit.worst(kind, gains, noise, audit.horizon(noise)) == worst
 
 
 def test_pairs_make_super_twisting_err_by_the_bounds():
@@ -40,11 +40,11 @@ def test_pairs_make_super_twisting_err_by_the_bounds():
 
 def test_a_linear_observer_has_its_worst_case_in_closed_form():
     kind, gains, noise, samples = Luenberger, (0.4, 0.7), 3.0, 60
-    found = float(audit.worst_linear(kind, gains, noise, samples))
+    worst_linear = float(audit.worst_linear(kind, gains, noise, samples))
     sensitivity = jax.grad(lambda x: audit.error(kind(*gains), noise, x))(jnp.zeros((2, samples)))
-    assert found == pytest.approx(float(audit.simulate_errors(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
+    assert worst_linear == pytest.approx(float(audit.simulate_errors(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
     random = np.random.default_rng(0).choice([-1.0, 1.0], (500, 2, samples))
-    assert largest(kind, gains, noise, jnp.asarray(random)) < found
+    assert largest(kind, gains, noise, jnp.asarray(random)) < worst_linear
 
 
 @pytest.mark.parametrize("order", range(1, 6))
@@ -53,19 +53,19 @@ def test_schemes_without_noise(order):
     h, lipschitz = 0.02, 2.0 ** (order + 1)
     t = h * np.arange(1500)
     unit = h**order * lipschitz
-    bias, rest = {}, {}
+    bias, remainder = {}, {}
     for name, scheme in audit.SCHEMES.items():
         y = 0.5 * t**2 if order >= 2 else t
         start = [0.0, 0.0 if order >= 2 else 1.0, 1.0, *[0.0] * 3][: order + 1]
         velocity = t if order >= 2 else 0.0 * t + 1.0
-        found = audit.late_velocity(scheme, order, lipschitz, h, y, start)
-        bias[name] = np.abs(found - velocity[-found.size :]).max()
+        late_velocity = audit.late_velocity(scheme, order, lipschitz, h, y, start)
+        bias[name] = np.abs(late_velocity - velocity[-late_velocity.size :]).max()
         still = audit.late_velocity(scheme, order, lipschitz, h, 0.0 * t, [1e-3, *[0.0] * order])
-        rest[name] = np.abs(np.diff(still)).max()
+        remainder[name] = np.abs(np.diff(still)).max()
     rounding = 2**order * np.finfo(float).eps * 450.0 / h
     first, alone, own, exact = audit.SCHEMES
     assert bias[exact] <= 4.0 * rounding
-    assert rest[exact] <= 1e-12 * unit
+    assert remainder[exact] <= 1e-12 * unit
     assert bias[own] == pytest.approx(0.5 * h if order >= 2 else 0.0, abs=4.0 * rounding)
-    assert rest[own] <= 1e-12 * unit
-    assert min(rest[first], rest[alone]) > 0.1 * unit
+    assert remainder[own] <= 1e-12 * unit
+    assert min(remainder[first], remainder[alone]) > 0.1 * unit

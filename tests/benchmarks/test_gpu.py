@@ -22,11 +22,11 @@ def test_lorenz_by_the_kernel_and_by_the_scan():
 def test_the_kernel_alone_gives_the_figures_of_a_run(monkeypatch):
     monkeypatch.setattr(gpu, "DeviceSimulator", partial(DeviceSimulator, interpret=True))
     work = Workload(130, 150, "float64")
-    found, whole, expected = (run() for run in (gpu.chain_kernel(work), gpu.chain_fused(work), FusedChain(work, 1)))
-    assert set(found) == set(whole) == set(expected)
+    actual, full, expected = (run() for run in (gpu.chain_kernel(work), gpu.chain_fused(work), FusedChain(work, 1)))
+    assert set(actual) == set(full) == set(expected)
     for name, figure in expected.items():
-        assert found[name].shape == (130,)
-        np.testing.assert_array_equal(found[name], whole[name])
+        assert actual[name].shape == (130,)
+        np.testing.assert_array_equal(actual[name], full[name])
         # so short a run identifies nothing
         if name.endswith("_rmse"):
-            np.testing.assert_allclose(found[name], figure, rtol=1e-6, err_msg=name)
+            np.testing.assert_allclose(actual[name], figure, rtol=1e-6, err_msg=name)

@@ -62,27 +62,27 @@ def test_clutter_is_there_and_small_and_its_name_is_not_spurious(found):
         assert bool(case.truth["clutter"]) == (case.kind == "clutter")
         assert not set(case.truth["clutter"]) & set(case.truth["effects"])
     case = found[-1]
-    said = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
-    one = outcome(case, {"verdict": "unknown_effect", "findings": said})
+    output = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
+    one = outcome(case, {"verdict": "unknown_effect", "findings": output})
     assert one.is_right and one.spurious_effects == ["motor.inertia"]
     assert sum(row["right"] * row["count"] for row in calibration([one])) == 2
 
 
 def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
-    given = _PLANTS["direct"]
-    machine = Machine(given["drive"], None)
+    direct = _PLANTS["direct"]
+    machine = Machine(direct["drive"], None)
     hidden = ["motor.coulomb_friction", "load.gravity"]
-    drawn = [_add_known_effect(machine, hidden, given, np.random.default_rng(seed)) for seed in range(20)]
+    drawn = [_add_known_effect(machine, hidden, direct, np.random.default_rng(seed)) for seed in range(20)]
     assert drawn == [()] * 20
-    one = [_add_known_effect(machine, hidden[:1], given, np.random.default_rng(seed)) for seed in range(20)]
-    assert {effects[0]["kind"] for effects in one if effects} == {"load.gravity"}
+    machines = [_add_known_effect(machine, hidden[:1], direct, np.random.default_rng(seed)) for seed in range(20)]
+    assert {effects[0]["kind"] for effects in machines if effects} == {"load.gravity"}
 
 
 def test_same_seed_same_cases():
-    one, other, third = cases(9, 1, "hard", 0.2)[0], cases(9, 1, "hard", 0.2)[0], cases(10, 1, "hard", 0.2)[0]
-    np.testing.assert_array_equal(one.log.theta_e, other.log.theta_e)
-    assert one.truth == other.truth
-    assert one.model == other.model != third.model
+    case, other, third = cases(9, 1, "hard", 0.2)[0], cases(9, 1, "hard", 0.2)[0], cases(10, 1, "hard", 0.2)[0]
+    np.testing.assert_array_equal(case.log.theta_e, other.log.theta_e)
+    assert case.truth == other.truth
+    assert case.model == other.model != third.model
 
 
 def test_kinds_come_in_their_shares_and_logs_are_whole(found):
@@ -133,9 +133,9 @@ def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(foun
             continue
         law = None if config.transmission is None else config.transmission.build()
         plant = Plant(config.drive.build(), law, tuple(effect.build() for effect in config.effects))
-        own = _package(plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"])
+        package = _package(plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"])
         truth = case.traces[0].states[0]
-        assert np.abs(own - truth).max() < 2e-3 * np.ptp(truth), case.name
+        assert np.abs(package - truth).max() < 2e-3 * np.ptp(truth), case.name
         checked[case.kind] += 1
     assert checked == {"single": 4, "new": min(len(NEW), 4)}
 
@@ -196,17 +196,17 @@ def test_a_wrong_answer_is_counted_where_it_belongs(found):
     wrong = next(name for name in EFFECTS if name not in pair.hidden)
     findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong)]
     gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
-    told = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
-    assert told.is_right and told.spurious_effects == [wrong] and told.worse
-    assert told.reduction < 0.0 and told.reachable is None
+    messages = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
+    assert messages.is_right and messages.spurious_effects == [wrong] and messages.worse
+    assert messages.reduction < 0.0 and messages.reachable is None
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {"theta_e": 0.1}).reachable == pytest.approx(1.0)
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {}).reachable is None
-    curve = calibration([told])
+    curve = calibration([messages])
     assert curve == [{"confidence": pytest.approx(0.8), "right": pytest.approx(2 / 3), "count": 3}]
     assert calibration_error(curve) == pytest.approx(0.8 - 2 / 3)
     unknown = next(case for case in found if case.kind == "unknown")
-    told = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong, "confidence": 0.95}]})
-    assert scores([told])["confidently_wrong"]["value"] == 1.0
+    messages = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong, "confidence": 0.95}]})
+    assert scores([messages])["confidently_wrong"]["value"] == 1.0
     with pytest.raises(ValueError, match="verdict 'maybe'"):
         outcome(unknown, {"verdict": "maybe"})
 
@@ -221,9 +221,9 @@ def test_a_diagnosis_that_fails_is_an_outcome(found, capsys):
 
 
 def test_the_error_of_a_nominal_number_is_the_effect_and_nothing_else():
-    some = [case for case in cases(4, 44, "single", duration=2.0) if error_of(*case.hidden) is not None]
-    assert some
-    for case in some:
+    selection = [case for case in cases(4, 44, "single", duration=2.0) if error_of(*case.hidden) is not None]
+    assert selection
+    for case in selection:
         (name,) = case.hidden
         added = sum(case.truth["effects"][name].values())
         key = error_of(name)
@@ -241,12 +241,12 @@ def _no_oracle(case):
 
 
 def test_processes_share_the_cases_and_an_oracle_may_fail(found, capsys):
-    some = [case for case in found if case.hidden][:3]
-    outcomes = run(some, _sees_nothing, _no_oracle, jobs=2)
-    assert [one.name for one in outcomes] == [case.name for case in some]
+    selection = [case for case in found if case.hidden][:3]
+    outcomes = run(selection, _sees_nothing, _no_oracle, jobs=2)
+    assert [one.name for one in outcomes] == [case.name for case in selection]
     assert all(one.ratio is None and one.reduction == 0.0 for one in outcomes)
-    told = [line for line in capsys.readouterr().err.splitlines() if " of 3: " in line]
-    assert len(told) == 3 and all("WRONG" in line for line in told)
+    messages = [line for line in capsys.readouterr().err.splitlines() if " of 3: " in line]
+    assert len(messages) == 3 and all("WRONG" in line for line in messages)
 
 
 def test_the_proof_parts_true_from_nominal_model(found):
@@ -270,9 +270,9 @@ def test_windows_begin_with_what_the_motion_before_has_left(found, name, monkeyp
 
 
 def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tmp_path):
-    some = found[:3]
-    save(some, tmp_path / "logs")
-    for case in some:
+    selection = found[:3]
+    save(selection, tmp_path / "logs")
+    for case in selection:
         model = tomllib.loads((tmp_path / "logs" / f"{case.name}.toml").read_text())
         assert model == case.model
         record = read_record(tmp_path / "logs" / f"{case.name}.csv")
@@ -281,9 +281,9 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tm
         folder.mkdir(parents=True)
         (folder / "diagnosis.json").write_text(json.dumps(oracle(None, case.model, None)))
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
-    assert set(truth) == {case.name for case in some}
+    assert set(truth) == {case.name for case in selection}
     outcomes = read_outcomes(found[:4], tmp_path / "found")
     assert [one.is_right for one in outcomes] == [True, True, True, False]
-    made = write(outcomes, tmp_path / "out", "A seed")
-    assert {path.name for path in made} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
+    result = write(outcomes, tmp_path / "out", "A seed")
+    assert {path.name for path in result} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
     assert (tmp_path / "out" / "scores.md").read_text().startswith("## A seed")

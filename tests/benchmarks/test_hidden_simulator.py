@@ -132,9 +132,9 @@ def reference(torques, inertias, half, start, commands, lag):
         while now < begin + PERIOD * (1 - 1e-12):
 
             def right(t, y):
-                both, _, rate = sides(t, y)
+                pair, _, rate = sides(t, y)
                 a = [
-                    abs(m) * (total - m * level) / j for m, (total, level), j in zip(modes[:2], both, inertias, strict=True)
+                    abs(m) * (total - m * level) / j for m, (total, level), j in zip(modes[:2], pair, inertias, strict=True)
                 ]
                 return [y[1], a[0], y[3], a[1], rate]
 
@@ -152,11 +152,11 @@ def reference(torques, inertias, half, start, commands, lag):
 
             flanks.terminal, flanks.direction = True, -1
             events = [leaves(0), leaves(1), flanks] if half else [leaves(0), leaves(1)]
-            found = solve_ivp(
+            result = solve_ivp(
                 right, (now, begin + PERIOD), state, "DOP853", events=events, rtol=1e-10, atol=1e-13, max_step=PERIOD / 4
             )
-            state, now = found.y[:, -1], found.t[-1]
-            for i, times in enumerate(found.t_events):
+            state, now = result.y[:, -1], result.t[-1]
+            for i, times in enumerate(result.t_events):
                 if not len(times):
                     continue
                 changes += 1

@@ -47,10 +47,10 @@ def test_the_regression_adds_dry_friction_to_the_nominal_terms_first(record):
     motion = [part.kinematics for part in parts]
     spans = max(np.abs(k.velocity["motor"]).max() for k in motion), max(np.ptp(k.position["motor"]) for k in motion)
     terms = terms_of(parts, model(), False, tuple(map(float, spans)))
-    found = stepwise(terms, terms)
-    assert found.names[:3] == ["inertia", "viscous", "Coulomb"]
-    assert found.factors["Coulomb"][0] == pytest.approx(COULOMB, rel=0.05)
-    assert found.factors["inertia"][0] == pytest.approx(INERTIA, rel=0.02)
+    result = stepwise(terms, terms)
+    assert result.names[:3] == ["inertia", "viscous", "Coulomb"]
+    assert result.factors["Coulomb"][0] == pytest.approx(COULOMB, rel=0.05)
+    assert result.factors["inertia"][0] == pytest.approx(INERTIA, rel=0.02)
 
 
 def test_without_mujoco_its_column_says_so(record, monkeypatch):

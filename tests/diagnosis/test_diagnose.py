@@ -61,13 +61,13 @@ def test_the_missing_effect_is_named_with_its_number(found):
 def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path):
     log = logged(torque_noise=0.02)
     log.write(tmp_path / "axis.csv")
-    found = diagnose(tmp_path / "axis.csv", model())
-    (one,) = found.summary["findings"]
+    diagnosis = diagnose(tmp_path / "axis.csv", model())
+    (one,) = diagnosis.summary["findings"]
     assert one["effect"] == "motor.coulomb_friction"
     assert one["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
-    (note,) = (note for note in found.summary["notes"] if "does not feel" in note)
+    (note,) = (note for note in diagnosis.summary["notes"] if "does not feel" in note)
     assert note.startswith("The channel u carries noise of 0.02")
-    np.testing.assert_allclose(found.trace["u"], log.u, rtol=1e-9)
+    np.testing.assert_allclose(diagnosis.trace["u"], log.u, rtol=1e-9)
 
 
 @pytest.mark.parametrize("felt", [False, True])
@@ -98,12 +98,12 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
 
 
 def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
-    whole = read_record(logs / "axis.csv")
+    full_record = read_record(logs / "axis.csv")
     task = read_diagnosis_task(logs / "axis.csv", model())
     assert len(task.record.time) == 1500 and task.record.segments == (slice(DELAY_SAMPLES, 1500),)
     assert task.holdout.segments == (slice(1500, 2000),)
-    np.testing.assert_array_equal(task.holdout.time, whole.time)
-    parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
+    np.testing.assert_array_equal(task.holdout.time, full_record.time)
+    parts = dataclasses.replace(full_record, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
     first, last = split_off_last_quarter(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
@@ -123,19 +123,26 @@ def test_what_an_effect_takes_off_is_its_torque(found):
 
 
 def test_the_observers_are_a_second_witness(found):
-    about = found.summary["where"]["motor"]["observed"]
-    assert about["converged"] is True and about["correlation"] > 0.95
-    assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.05) and about["rms"] > 5.0 * about["noise"]
-    assert set(about["gains"]) == {"lambda", "alpha"} and about["time_constant"] == 0.01 and about["bandwidth"] < 16.0
+    description = found.summary["where"]["motor"]["observed"]
+    assert description["converged"] is True and description["correlation"] > 0.95
+    assert (
+        description["rms"] == pytest.approx(description["smoother_rms"], rel=0.05)
+        and description["rms"] > 5.0 * description["noise"]
+    )
+    assert (
+        set(description["gains"]) == {"lambda", "alpha"}
+        and description["time_constant"] == 0.01
+        and description["bandwidth"] < 16.0
+    )
     trace, (one,) = found.trace, found.observed["motor"]
-    known = trace["motor.observed_before"].notna()
+    is_observed = trace["motor.observed_before"].notna()
     # the beginnings of both parts are left out
     first = DELAY_SAMPLES + one.skipped
-    assert not known[:first].any() and known[first:1500].all()
-    assert not known[1500 : 1500 + one.skipped].any() and known[1500 + one.skipped :].all()
-    assert (trace["motor.observed_noise"].notna() == known).all()
+    assert not is_observed[:first].any() and is_observed[first:1500].all()
+    assert not is_observed[1500 : 1500 + one.skipped].any() and is_observed[1500 + one.skipped :].all()
+    assert (trace["motor.observed_noise"].notna() == is_observed).all()
     np.testing.assert_array_equal(trace["motor.observed_before"][first:1500], one.residual.torque)
-    assert trace["motor.observed_before"][known].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
+    assert trace["motor.observed_before"][is_observed].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
     assert not any("observer" in note for note in found.summary["notes"])
 
 
@@ -145,8 +152,8 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
     with jax.enable_x64(True):
         setup = set_up(task)
         observed = observed_torques(setup.bare, setup.fitted.segments)
-        about, (note,) = summary_module.observers_say(setup.bare, observed, setup)
-    assert about["motor"]["converged"] is False and about["motor"]["rms"] is None
+        description, (note,) = summary_module.observers_say(setup.bare, observed, setup)
+    assert description["motor"]["converged"] is False and description["motor"]["rms"] is None
     assert note.startswith("The motor's observer does not converge on this log (lambda = 2, alpha = 1)")
 
 
@@ -157,7 +164,7 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
     assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
     again = read_config(tmp_path / "model.toml")
-    assert [one.kind for one in again.effects] == ["motor.coulomb_friction"]
+    assert [effect.kind for effect in again.effects] == ["motor.coulomb_friction"]
     summary = read_json(tmp_path / "diagnosis.json")
     assert summary == found.summary and diagnosis_lines(summary) == lines
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
@@ -214,18 +221,18 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
     real = explain.refined
 
-    def spoilt(experiment, free, *rest):
-        found = real(experiment, free, *rest)
+    def spoilt(experiment, free, *remainder):
+        diagnosis = real(experiment, free, *remainder)
         sizes = [one.path for one in free if one.path.startswith("effects.") and one.role == "size"]
-        wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path) for path in sizes})
-        return found._replace(experiment=wrong)
+        wrong = set_leaves(diagnosis.experiment, {path: 4.0 * get_leaf(diagnosis.experiment, path) for path in sizes})
+        return diagnosis._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
     task = read_diagnosis_task(logs / "first.csv", model(), holdout=logs / "last.csv")
     stages = []
-    found = run_diagnosis(task, lambda *at: stages.append(at))
+    diagnosis = run_diagnosis(task, lambda *index: stages.append(index))
     assert stages == [(i, 6) for i in range(1, 7)]
-    summary = found.summary
+    summary = diagnosis.summary
     assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
     assert summary["verdict"] == "unknown_effect"
     assert any("was found, and withdrawn" in note for note in summary["notes"])
@@ -236,14 +243,14 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     # new numbers alone take the model's place only where they are better
     after, before = gap["holdout_rmse_after"], gap["holdout_rmse_before"]
     assert sum(np.log(after[name] / before[name]) for name in before) <= 0.0
-    assert found.model.effects == []
+    assert diagnosis.model.effects == []
 
 
 def test_a_tie_has_an_experiment(logs, found, tmp_path):
     record = read_record(logs / "axis.csv")
     assert tied({"findings": []}) is None
-    told = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
-    assert told[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    messages = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
+    assert messages[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
     rival = {"effect": "motor.quadratic_drag", "drive": model()["drive"], "effects": other}
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
@@ -270,10 +277,10 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     part(driven(fast, [friction], 1e-3, 1), FIRST).write(log)
     part(driven(0.8 * fast, [friction], 1e-3, 2), LAST).write(holdout)
     task = read_diagnosis_task(log, model(), holdout=holdout)
-    found = run_diagnosis(task)
-    pair = tied(found.summary)
+    diagnosis = run_diagnosis(task)
+    pair = tied(diagnosis.summary)
     assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
-    best = next_experiment(found.summary, found.model, task.record, travel=6.0)
+    best = next_experiment(diagnosis.summary, diagnosis.model, task.record, travel=6.0)
     assert best is not None and best.apart > 100.0
     driven(best.torque, [friction], 1e-3, 3).write(other)
     (one,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
@@ -295,14 +302,14 @@ def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
     means = log.u.reshape(-1, 2).mean(axis=1)
     dataclasses.replace(log, t=log.t[::2], u=means, theta_e=log.theta_e[::2]).write(coarse)
     log.write(again)
-    for given, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], again)):
-        task = read_diagnosis_task(given, model(), holdout=holdout)
+    for inputs, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], again)):
+        task = read_diagnosis_task(inputs, model(), holdout=holdout)
         for record in (task.record, task.holdout):
             assert record.sample_period == pytest.approx(0.004)
-        said = [
+        output = [
             note for record in (task.record, task.holdout) for note in record.notes if "every 4 ms, sampled every 2" in note
         ]
-        assert said
+        assert output
 
 
 def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
@@ -324,11 +331,11 @@ def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
     """And not called complete: friction of a third of the input goes unseen."""
     torque = 2e-3 * logged().u
     driven(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
-    told = (
+    messages = (
         r"axis\.csv: noise hides everything: with readings as noisy as 0\.03 rad \(theta_e\), no torque of less than "
         r"2\d\d % of the input would be seen; noise 7 times smaller, or torques as many times larger, are needed$"
     )
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=messages):
         diagnose(tmp_path / "axis.csv", model())
 
 

@@ -32,30 +32,30 @@ def search(log, study):
 def test_a_hidden_effect_is_named_with_its_numbers(i, duration, tmp_path):
     """Of 2000 samples each, by the same programs."""
     case = cases(SEED, 4, "single", duration)[i]
-    found = explained(case, tmp_path)
+    result = explained(case, tmp_path)
     (name,) = case.hidden
-    assert found.verdict == "explained"
-    assert [one.effect for one in found.findings] == [name]
+    assert result.verdict == "explained"
+    assert [finding.effect for finding in result.findings] == [name]
     for key, value in case.truth["effects"][name].items():
         if key in _SIZES:
             # errors of nominal numbers are known no better than these are
             side, _, kind = name.partition(".")
             nominal = case.model["drive"].get(f"{side}_{key}", 1.0 if kind == "gain_error" else 0.0)
             open_to = 0.15 * abs(value) + 2.5 * case.conditions["uncertainty"] * nominal
-            assert abs(found.findings[0].numbers[key]) == pytest.approx(abs(value), abs=open_to)
+            assert abs(result.findings[0].numbers[key]) == pytest.approx(abs(value), abs=open_to)
 
 
 @pytest.mark.parametrize("i", range(2))
 def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
-    found = explained(cases(SEED, 2, "none", 4.0)[i], tmp_path)
-    assert found.verdict == "no_discrepancy"
-    assert found.findings == ()
+    result = explained(cases(SEED, 2, "none", 4.0)[i], tmp_path)
+    assert result.verdict == "no_discrepancy"
+    assert result.findings == ()
 
 
 def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
-    found = explained(cases(SEED, 1, "unknown", 2.0)[0], tmp_path)
-    assert found.verdict == "unknown_effect"
-    assert max(gain for gain, _ in found.rest.values()) > CLEAR
+    result = explained(cases(SEED, 1, "unknown", 2.0)[0], tmp_path)
+    assert result.verdict == "unknown_effect"
+    assert max(gain for gain, _ in result.rest.values()) > CLEAR
 
 
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
@@ -66,11 +66,11 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
     one = search(tmp_path / "log.csv", model())
     assert len(one.segments) == 2
-    found = one.run()
-    assert found.verdict == "explained"
-    assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]
+    trial = one.run()
+    assert trial.verdict == "explained"
+    assert [one.effect for one in trial.findings] == ["motor.coulomb_friction"]
     # friction that contains it explains as much, and is no alternative
-    (finding,) = found.findings
+    (finding,) = trial.findings
     assert finding.confidence > 0.99 and finding.alternatives == ()
 
 
@@ -84,8 +84,8 @@ HIDDEN = {
 @pytest.mark.parametrize("name", HIDDEN)
 def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
     driven(logged().u, [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")
-    found = search(tmp_path / "log.csv", model()).run()
-    assert found.verdict == "explained"
-    assert [one.effect for one in found.findings] == [name]
+    trial = search(tmp_path / "log.csv", model()).run()
+    assert trial.verdict == "explained"
+    assert [finding.effect for finding in trial.findings] == [name]
     for key, value in HIDDEN[name].items():
-        assert found.findings[0].numbers[key] == pytest.approx(value, rel=0.02)
+        assert trial.findings[0].numbers[key] == pytest.approx(value, rel=0.02)

@@ -22,8 +22,8 @@ class Candidate:
 
 def columns(design, errors, scale, centre, **more):
     """Two own numbers, one candidate; errors of unit variance are `errors` plus the columns."""
-    whole = np.column_stack([errors, design])
-    return Products(whole.T @ whole, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
+    full = np.column_stack([errors, design])
+    return Products(full.T @ full, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
 
 
 def drawn(size=1.0):
@@ -40,8 +40,8 @@ def test_evidence_is_that_of_a_gaussian(which):
     used = design[:, :count]
     covariance = np.eye(40) + used @ np.diag(scale[:count] ** 2) @ used.T
     exact = multivariate_normal(-used @ centre[:count], covariance).logpdf(errors)
-    found = evidence_of(columns(design, errors, scale, centre), [Candidate()], which)
-    assert found.log_evidence + -0.5 * 40 * np.log(2.0 * np.pi) == pytest.approx(exact, rel=1e-9)
+    result = evidence_of(columns(design, errors, scale, centre), [Candidate()], which)
+    assert result.log_evidence + -0.5 * 40 * np.log(2.0 * np.pi) == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e8])
@@ -50,20 +50,20 @@ def test_twins_are_parted_by_their_priors(size):
     design, errors = drawn(size)
     factor, scale, centre = -2.5, np.array([0.02, 0.2, 0.7]), np.array([0.1, 0.0, 0.05])
     design[:, 2] = factor * design[:, 0]
-    found = evidence_of(columns(design, errors, scale, centre, twins={3: (1, factor)}), [Candidate()], 0)
+    result = evidence_of(columns(design, errors, scale, centre, twins={3: (1, factor)}), [Candidate()], 0)
     wide = np.array([np.hypot(scale[0], factor * scale[2]), scale[1]])
     middle = np.array([centre[0] + factor * centre[2], centre[1]])
     alone = evidence_of(columns(design, errors, np.r_[wide, 1.0], np.r_[middle, 0.0]))
-    assert found.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
-    assert found.misfit == pytest.approx(alone.misfit, rel=1e-6)
-    value = found.numbers["value"]
-    assert found.own[0] + factor * value == pytest.approx(alone.own[0], rel=1e-9)
+    assert result.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
+    assert result.misfit == pytest.approx(alone.misfit, rel=1e-6)
+    value = result.numbers["value"]
+    assert result.own[0] + factor * value == pytest.approx(alone.own[0], rel=1e-9)
     # each is as far from its mean as its variance allows
-    assert (found.own[0] - centre[0]) / scale[0] ** 2 == pytest.approx((value - centre[2]) / (factor * scale[2] ** 2))
+    assert (result.own[0] - centre[0]) / scale[0] ** 2 == pytest.approx((value - centre[2]) / (factor * scale[2] ** 2))
     if size == 1.0:
         together = evidence_of(columns(design, errors, scale, centre), [Candidate()], 0)
-        assert found.log_evidence == pytest.approx(together.log_evidence, rel=1e-6)
-        np.testing.assert_allclose(found.own, together.own, atol=1e-6)
+        assert result.log_evidence == pytest.approx(together.log_evidence, rel=1e-6)
+        np.testing.assert_allclose(result.own, together.own, atol=1e-6)
         assert value == pytest.approx(together.numbers["value"], abs=1e-6)
 
 
@@ -71,9 +71,9 @@ def test_a_number_is_held_at_its_bound():
     """Against SciPy's bounded least squares; the other numbers, and the misfit, make the best of it."""
     design, errors = drawn()
     scale, centre = np.array([0.05, 0.5, 0.7]), np.array([0.01, 0.0, 0.0])
-    given = columns(design, errors, scale, centre)
+    inputs = columns(design, errors, scale, centre)
     free, held = (
-        evidence_of(dataclasses.replace(given, bound=np.array([one, np.inf])), [Candidate()], 0) for one in (np.inf, 0.3)
+        evidence_of(dataclasses.replace(inputs, bound=np.array([one, np.inf])), [Candidate()], 0) for one in (np.inf, 0.3)
     )
     assert abs(free.own[0] - centre[0]) > 0.3 * scale[0]
     stacked, towards = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
@@ -82,6 +82,6 @@ def test_a_number_is_held_at_its_bound():
     np.testing.assert_allclose([*held.own, held.numbers["value"]], expected, atol=1e-6)
     assert held.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
     assert held.misfit > free.misfit
-    total = np.asarray(given.products)
-    found = _least_squares(total, scale**-2.0, centre, reach)
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    total = np.asarray(inputs.products)
+    solution = _least_squares(total, scale**-2.0, centre, reach)
+    np.testing.assert_allclose(solution, expected, atol=1e-9)

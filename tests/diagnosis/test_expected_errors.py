@@ -25,8 +25,10 @@ def errors_of(folder, log, effects, noise=None):
         fitted = fit_model(new_search(setup), effects, np.zeros(len(setup.own)))
         held = setup.holdout
         if noise is not None:
-            wrong = [{side: each._replace(noise=noise) for side, each in one.smoothed.items()} for one in held.segments]
-            segments = [dataclasses.replace(one, smoothed=by) for one, by in zip(held.segments, wrong, strict=True)]
+            wrong = [
+                {side: each._replace(noise=noise) for side, each in segment.smoothed.items()} for segment in held.segments
+            ]
+            segments = [dataclasses.replace(segment, smoothed=by) for segment, by in zip(held.segments, wrong, strict=True)]
             held = dataclasses.replace(held, segments=segments)
         after = held.compare(fitted.experiment)
         expected = expected_errors(held, fitted, after, setup.input_noise, 0.5)

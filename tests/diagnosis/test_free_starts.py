@@ -34,12 +34,12 @@ def log(tmp_path_factory):
 def test_runs_are_those_of_the_fit(log, rest):
     (model, _), record = log
     windows, _ = windows_of(segments_of(record, model.sides), model, 250, rest)
-    found = best_runs(model, windows, 8, rest)
+    actual = best_runs(model, windows, 8, rest)
     expected, start = jit(projected_residual)(model, windows, 8, rest)
-    assert found.residual.shape == (8, 250, 2)
+    assert actual.residual.shape == (8, 250, 2)
     assert np.sqrt(np.mean(np.square(expected))) > 1.5
-    assert found.residual == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
-    for have, want in zip(jax.tree.leaves(found.states), jax.tree.leaves(start), strict=True):
+    assert actual.residual == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
+    for have, want in zip(jax.tree.leaves(actual.states), jax.tree.leaves(start), strict=True):
         assert have[:, 0] == pytest.approx(np.asarray(want), rel=1e-4, abs=1e-6)
 
 
@@ -50,8 +50,8 @@ def test_torques_may_be_added_sample_by_sample(log):
     windows, _ = windows_of(segments_of(record, model.sides), model, 250)
     expected = best_runs(model, windows, 4, False)
     idle = type(windows)(0.0 * windows.torque, windows.measured, windows.time, windows.start, windows.noise, windows.rest)
-    found = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
-    assert found.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
+    actual = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
+    assert actual.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("rest", [False, True])
@@ -60,7 +60,7 @@ def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(lo
     swinging = make_effect("load.flexibility", inertia=0.5, frequency=3.0)
     model = with_effects(model, (*model.effects, as_arrays(swinging, float)))
     windows, _ = windows_of(segments_of(record, model.sides, rest), model, 250, rest)
-    found = best_runs(model, windows, 4, rest)
-    for have, start in zip(found.states.effects[-1], windows.start.effects[-1], strict=True):
+    result = best_runs(model, windows, 4, rest)
+    for have, start in zip(result.states.effects[-1], windows.start.effects[-1], strict=True):
         moved = np.asarray(have)[:, 0] != np.asarray(start)
         assert not moved[1:].any() and moved[0] == (not rest)

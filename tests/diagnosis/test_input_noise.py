@@ -37,12 +37,12 @@ def test_jumps_stay_where_they_are():
     noise = 0.01
     noisy = INPUTS["steps"] + noise * np.random.default_rng(2).standard_normal(SAMPLES)
     true = (1 + np.flatnonzero(np.abs(np.diff(INPUTS["steps"])) > 10.0 * noise)).tolist()
-    assert [one for one in input_jumps(noisy, noise) if one in true] == true
+    assert [input_jump for input_jump in input_jumps(noisy, noise) if input_jump in true] == true
     smooth = smoothed_input(noisy, noise)
-    for at in true:
+    for index in true:
         assert (
-            abs(smooth[at] - INPUTS["steps"][at]) < 3.0 * noise
-            and abs(smooth[at - 1] - INPUTS["steps"][at - 1]) < 3.0 * noise
+            abs(smooth[index] - INPUTS["steps"][index]) < 3.0 * noise
+            and abs(smooth[index - 1] - INPUTS["steps"][index - 1]) < 3.0 * noise
         )
 
 
@@ -60,8 +60,8 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
     third = np.diff(np.eye(count), n=3, axis=0)
 
     def left(log_weight: float) -> float:
-        found = np.linalg.solve(np.eye(count) + 10.0**log_weight * third.T @ third, noisy)
-        return float(np.sqrt(np.mean((found - true) ** 2)))
+        solution = np.linalg.solve(np.eye(count) + 10.0**log_weight * third.T @ third, noisy)
+        return float(np.sqrt(np.mean((solution - true) ** 2)))
 
     best = minimize_scalar(left, bounds=(0.0, 11.0), method="bounded").fun
     assert np.sqrt(np.mean((_smooth_curve(noisy) - true) ** 2)) < 1.5 * best
@@ -79,11 +79,11 @@ def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
     )  # whole periods of both parts
     reading = 1e-4 * rng.standard_normal((SAMPLES, 2))
     effect = np.convolve(1e-4 * rng.standard_normal(SAMPLES), [0.2, 0.5, 0.3], "same")[:, None] * np.array([1.0, 0.0])
-    given = lacking + reading + effect * (not felt)
-    smooth = given - effect
+    inputs = lacking + reading + effect * (not felt)
+    smooth = inputs - effect
     alone = 1e-4 / np.sqrt(np.sum(effect**2))
     parts = slice(0, 3000), slice(3000, SAMPLES)
-    share, error = unfelt([given[part] for part in parts], [smooth[part] for part in parts])
+    share, error = unfelt([inputs[part] for part in parts], [smooth[part] for part in parts])
     assert share == pytest.approx(0.0 if felt else 1.0, abs=3.0 * error)
     # the given errors' spectrum holds the effect too, where that is not felt
     assert 0.9 < error / alone < 1.6

@@ -57,9 +57,9 @@ def judge(
 
 def test_a_verdict_that_held_out_data_support_stays():
     controls = [Control("wrong", NOISE, 9.0, "motor.viscous_friction"), Control("permuted", NOISE, 4.0)]
-    said = judge(controls=controls)
-    assert said.found.verdict == "explained" and said.found.findings[0].confidence == pytest.approx(0.98)
-    assert not any(getattr(said, reason) for reason in PASSED if reason != "level")
+    judgement = judge(controls=controls)
+    assert judgement.found.verdict == "explained" and judgement.found.findings[0].confidence == pytest.approx(0.98)
+    assert not any(getattr(judgement, reason) for reason in PASSED if reason != "level")
 
 
 @pytest.mark.parametrize(
@@ -76,10 +76,10 @@ def test_a_verdict_that_held_out_data_support_stays():
     ids=["errors", "numbers", "shuffled", "search", "before", "share", "logs"],
 )
 def test_one_reason_is_enough_against_it(given, reason):
-    said = judge(**given)
-    assert said.found.verdict == "unknown_effect" and said.found.findings == found().findings
+    judgement = judge(**given)
+    assert judgement.found.verdict == "unknown_effect" and judgement.found.findings == found().findings
     none = {key: value for key, value in PASSED.items() if key != "level"}
-    assert {key: getattr(said, key) for key in none} == none | reason
+    assert {key: getattr(judgement, key) for key in none} == none | reason
 
 
 def test_a_finding_is_no_surer_than_what_held_out_data_say_for_it():
@@ -98,9 +98,9 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, 
         errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
-    given = dataclasses.replace(found(), findings=(finding,), wrong=None)
-    (said,) = judged(given, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
-    assert said == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
+    inputs = dataclasses.replace(found(), findings=(finding,), wrong=None)
+    (output,) = judged(inputs, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
+    assert output == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
 def shared(z, **gains):
@@ -120,10 +120,10 @@ def test_what_the_fit_says_counts_only_if_held_out_data_agree():
 
 def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     control = [Control("wrong", NOISE, -3.0, "motor.viscous_friction")]
-    said = found()
-    assert exchanged(said, []) is None and exchanged(said, [control[0]._replace(z=3.0)]) is None
-    other = exchanged(said, control)
-    assert other is not None and (other.model, other.wrong) == (said.wrong, said.model)
+    output = found()
+    assert exchanged(output, []) is None and exchanged(output, [control[0]._replace(z=3.0)]) is None
+    other = exchanged(output, control)
+    assert other is not None and (other.model, other.wrong) == (output.wrong, output.model)
     (one,) = other.findings
     assert one.effect == "motor.viscous_friction" and one.numbers == {"torque": 0.2}
     assert one.confidence == pytest.approx(0.98 / (1.0 + np.exp(-4.5)), rel=1e-3)
@@ -142,8 +142,8 @@ def test_held_out_data_outweigh_a_better_fit_of_another_effect():
         return exchanged(found(fit_gain=-380.0), [Control("wrong", NOISE, z, "motor.viscous_friction")])
 
     assert other(5.0) is None and other(0.5) is None and other(-0.5) is not None
-    said = judge(controls=[Control("wrong", NOISE, 5.0, "motor.viscous_friction")], fit_gain=-380.0).found.findings[0]
-    assert said.confidence == pytest.approx(0.98, abs=1e-3)
+    finding = judge(controls=[Control("wrong", NOISE, 5.0, "motor.viscous_friction")], fit_gain=-380.0).found.findings[0]
+    assert finding.confidence == pytest.approx(0.98, abs=1e-3)
 
 
 def test_what_a_log_leaves_open_held_out_data_decide():
@@ -151,9 +151,9 @@ def test_what_a_log_leaves_open_held_out_data_decide():
     fitted = SimpleNamespace(names=(NAME,), theta=np.zeros(1), free=[], errors=dict, experiment=None)
 
     def said(z):
-        given = dataclasses.replace(found(fit_gain=0.0), findings=(tie,))
+        inputs = dataclasses.replace(found(fit_gain=0.0), findings=(tie,))
         controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
-        return judged(given, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
+        return judged(inputs, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
 
     assert said(5.0).confidence > 0.99 and said(5.0).alternatives == ()
     assert said(1.0) == tie

@@ -51,18 +51,18 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0
         wave = disturbed * np.cumsum(rng.standard_normal((len(record.time), 3)), axis=0)
         smoothed[side] = one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))
     segment = dataclasses.replace(segment, smoothed=smoothed)
-    at = np.full(len(free), theta)
+    point = np.full(len(free), theta)
     segments = [segment, *([dataclasses.replace(segment, torque=np.zeros(len(segment)))] * idle)]
-    return Linear(change(experiment), free, at, np.full(len(free), 0.02), segments)
+    return Linear(change(experiment), free, point, np.full(len(free), 0.02), segments)
 
 
 def errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
-    found = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
-    flat = found.reshape(-1, found.shape[2])
+    result = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
+    flat = result.reshape(-1, result.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
-    rest = flat[:, : -model.states]
-    return rest - basis @ (basis.T @ rest)
+    remainder = flat[:, : -model.states]
+    return remainder - basis @ (basis.T @ remainder)
 
 
 def size(values):
@@ -113,9 +113,9 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
     base = linear(tmp_path, 2)
     columns = errors(base, Forces(base.signals[0].of([effect])))
     expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
-    found = columns[:, -1]
+    actual = columns[:, -1]
     assert size(expected) > 0.0
-    assert size(found - expected) < 0.03 * size(expected)
+    assert size(actual - expected) < 0.03 * size(expected)
 
 
 def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
@@ -127,8 +127,8 @@ def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
     # what the state at the first sample leaves until later
     left = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
     np.testing.assert_allclose(settled - rested, left, atol=1e-12)
-    both = variants_of(base.experiment, ["actuator.lag", "actuator.saturation"], base.scales)
-    assert sorted({(one.name, one.from_rest) for one in both}) == [
+    variants = variants_of(base.experiment, ["actuator.lag", "actuator.saturation"], base.scales)
+    assert sorted({(one.name, one.from_rest) for one in variants}) == [
         ("actuator.lag", False), ("actuator.lag", True), ("actuator.saturation", False)
     ]  # fmt: skip
 
@@ -144,26 +144,26 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
         "motor.torque_ripple",
         "transmission.eccentricity",
     )
-    seen = set()
+    calls = set()
     for one in variants_of(base.experiment, waves, lambda name: LOG):
         if one.name in waves:
             (columns,) = columns_of([one], base.signals[0])
             effect = as_arrays(make_effect(one.name, **one.numbers(values)), float)
             (expected,) = base.signals[0].of([effect])
             assert columns.keys() == expected.keys()
-            for at, torque in expected.items():
-                assert size(np.tensordot(values, columns[at], 1) - torque) < 0.02 * size(torque)
-            seen.add(one.name)
-    assert seen == set(waves)
+            for point, torque in expected.items():
+                assert size(np.tensordot(values, columns[point], 1) - torque) < 0.02 * size(torque)
+            calls.add(one.name)
+    assert calls == set(waves)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
 def test_products_are_those_of_the_errors(tmp_path, sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
     model = linear(tmp_path, sides)
-    found = model.columns((), [1e-6] * sides, np.ones(sides)).products
-    every = errors(model)
-    assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))
+    products = model.columns((), [1e-6] * sides, np.ones(sides)).products
+    stride = errors(model)
+    assert products == pytest.approx(stride.T @ stride, rel=1e-6, abs=1e-9 * np.max(products))
 
 
 @pytest.mark.parametrize("coloured", [False, True])
@@ -173,19 +173,19 @@ def test_products_of_candidates_are_those_of_their_errors(tmp_path, coloured):
     variants = variants_of(model.experiment, list(SMALL), lambda name: LOG)
     own, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
-    found = model.columns(variants, smoothness, noise)
-    assert len(found.products) > own + 2 * module._TOGETHER
-    every = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
+    columns = model.columns(variants, smoothness, noise)
+    assert len(columns.products) > own + 2 * module._TOGETHER
+    stride = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
     if coloured:
-        gram = weighted_products(every[model.signals[0].real], noise)
+        gram = weighted_products(stride[model.signals[0].real], noise)
     else:
-        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, every, every)
+        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, stride, stride)
     expected = module._eliminated(gram, model.states)
     size = np.sqrt(np.diag(expected))
-    for places, offset in zip(found.places, found.offsets, strict=True):
-        at = np.array([*range(own), *places, *([offset] if offset >= 0 else [])])
-        grid = np.ix_(at, at)
-        apart = (found.products[grid] - expected[grid]) / np.outer(size[at], size[at])
+    for places, offset in zip(columns.places, columns.offsets, strict=True):
+        point = np.array([*range(own), *places, *([offset] if offset >= 0 else [])])
+        grid = np.ix_(point, point)
+        apart = (columns.products[grid] - expected[grid]) / np.outer(size[point], size[point])
         assert np.max(np.abs(apart), where=np.isfinite(apart), initial=0.0) < 1e-9
 
 
@@ -195,18 +195,18 @@ def test_torques_that_models_share_are_those_of_each(tmp_path, monkeypatch, held
     if held:
         monkeypatch.setattr(Smoothed, "held", lambda self, period: np.arange(len(self.state)) % 500 < 100)
     first = linear(tmp_path, 2)
-    every = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
-    variants = variants_of(first.experiment, every, lambda name: LOG)
+    stride = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
+    variants = variants_of(first.experiment, stride, lambda name: LOG)
     columns_of(variants, first.signals[0])
     model = linear(tmp_path, 2, theta=0.1)
-    (signals,), kept = model.signals, first.signals[0].shared
-    assert len(kept) > 100
-    shared = MotionTorques(model.experiment, model.parts[0], kept)
-    for one, with_kept, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
+    (signals,), selected = model.signals, first.signals[0].shared
+    assert len(selected) > 100
+    shared = MotionTorques(model.experiment, model.parts[0], selected)
+    for variant, with_kept, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
         assert with_kept.keys() == alone.keys()
-        for at, torque in alone.items():
+        for point, torque in alone.items():
             np.testing.assert_allclose(
-                with_kept[at], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=one.name
+                with_kept[point], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=variant.name
             )
 
 
@@ -233,10 +233,10 @@ def test_what_rounding_takes_is_known(growth):
     basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
     left = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
     true = float(left[:, 0] @ left[:, 0])
-    error, told = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
-    assert error < max(30.0 * told, 1e-9 * true)
-    assert told < module._LOST or growth > 5.0
-    assert told > module._LOST or growth < 20.0
+    error, loss_estimate = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
+    assert error < max(30.0 * loss_estimate, 1e-9 * true)
+    assert loss_estimate < module._LOST or growth > 5.0
+    assert loss_estimate > module._LOST or growth < 20.0
 
 
 def test_a_gain_under_which_rounding_would_decide_is_left_out(tmp_path, monkeypatch):
@@ -252,5 +252,5 @@ def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
     travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
     assert least < 10  # twice a motor turn, with a gear ratio of 5
-    tried = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(model.scales("transmission.eccentricity"))
-    assert tuple(tried) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)
+    trials = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(model.scales("transmission.eccentricity"))
+    assert tuple(trials) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)

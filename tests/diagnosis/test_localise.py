@@ -28,9 +28,9 @@ POLE = 0.9
 def coordinates(**more):
     crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
     near = np.zeros(COUNT, int)
-    for at in crossing:
-        near[max(at - 12, 0) : at + 12] = 1 if VELOCITY[at + 1] > 0.0 else 2
-    found = {
+    for index in crossing:
+        near[max(index - 12, 0) : index + 12] = 1 if VELOCITY[index + 1] > 0.0 else 2
+    result = {
         "all": CoordinateValues(np.zeros(COUNT, int), classes=("everywhere",)),
         "direction": CoordinateValues((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
         "reversals": CoordinateValues(
@@ -42,7 +42,7 @@ def coordinates(**more):
         "position": CoordinateValues(POSITION, "rad", symbol="θe"),
         "time": CoordinateValues(TIME, "s", symbol="t"),
     }
-    return found | more
+    return result | more
 
 
 def noise(seed, pole=0.0):
@@ -155,15 +155,18 @@ def test_weak_torques_are_found_below_the_noise_of_a_sample():
 
 def test_parts_of_a_record_are_counted_together():
     torque = -0.1 * np.sign(VELOCITY) + 0.1 * noise(3)
-    whole = residual(torque)
+    full_residual = residual(torque)
     rows = slice(0, 1500), slice(1700, COUNT)
     parts = [
-        dataclasses.replace(whole, time=TIME[r], torque=torque[r], deviation=whole.deviation[r]) for r in rows
+        dataclasses.replace(full_residual, time=TIME[r], torque=torque[r], deviation=full_residual.deviation[r])
+        for r in rows
     ]  # fmt: skip
-    each = [{name: one._replace(values=one.values[r]) for name, one in coordinates().items()} for r in rows]
-    one = locate(parts, each)
-    assert one.coordinates["direction"].explained > 0.85
-    assert sum(region.time_share for region in one.coordinates["speed"].regions) == pytest.approx(1.0)
+    each = [
+        {name: coordinate._replace(values=coordinate.values[r]) for name, coordinate in coordinates().items()} for r in rows
+    ]
+    coordinate = locate(parts, each)
+    assert coordinate.coordinates["direction"].explained > 0.85
+    assert sum(region.time_share for region in coordinate.coordinates["speed"].regions) == pytest.approx(1.0)
 
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
@@ -184,13 +187,13 @@ def residuals_of(true, model):
 def test_a_geared_drive_with_hidden_friction_on_its_load():
     hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
     experiment, residuals, segment = residuals_of(small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED))
-    found = localise(experiment, residuals, [segment], all_coordinates(experiment, [segment], residuals, ()))
-    assert not found["motor"].significant
-    assert "by the direction of motion" in sentence_of(found["load"])
-    backward, *_, forward = found["load"].coordinates["direction"].regions
+    location = localise(experiment, residuals, [segment], all_coordinates(experiment, [segment], residuals, ()))
+    assert not location["motor"].significant
+    assert "by the direction of motion" in sentence_of(location["load"])
+    backward, *_, forward = location["load"].coordinates["direction"].regions
     assert backward.mean == pytest.approx(0.8, rel=0.15) and forward.mean == pytest.approx(-0.8, rel=0.15)
-    assert {"gap", "load sign", "twist", "twist rate"} <= set(found["motor"].coordinates)
-    assert json.loads(json.dumps(dataclasses.asdict(found["load"])))["name"] == "load"
+    assert {"gap", "load sign", "twist", "twist rate"} <= set(location["motor"].coordinates)
+    assert json.loads(json.dumps(dataclasses.asdict(location["load"])))["name"] == "load"
 
 
 def test_coordinates_know_turning_from_sliding():

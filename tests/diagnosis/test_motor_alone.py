@@ -29,20 +29,20 @@ STUDY = {
 def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     path = tmp_path / "motor.csv"
     replace(geared()[0], theta_s=None).write(path)
-    found = diagnose(path, STUDY)
-    assert found.summary["verdict"] == "explained"
-    numbers = {one["effect"]: one["parameters"] for one in found.summary["findings"]}
+    diagnosis = diagnose(path, STUDY)
+    assert diagnosis.summary["verdict"] == "explained"
+    numbers = {finding["effect"]: finding["parameters"] for finding in diagnosis.summary["findings"]}
     assert numbers["transmission.backlash"]["half_gap"]["value"] == pytest.approx(0.08, rel=0.01)
     assert numbers["load.coulomb_friction"]["torque"]["value"] == pytest.approx(6.0, rel=0.02)
     assert numbers["motor.coulomb_friction"]["torque"]["value"] == pytest.approx(0.1, rel=0.05)
-    before, after = (found.summary["gap"][f"holdout_rmse_{which}"]["theta_e"] for which in ("before", "after"))
+    before, after = (diagnosis.summary["gap"][f"holdout_rmse_{name}"]["theta_e"] for name in ("before", "after"))
     assert after < 0.01 * before
-    lines = write_diagnosis_report(found, tmp_path)
+    lines = write_diagnosis_report(diagnosis, tmp_path)
     assert lines[0].startswith("No load position")
     assert any("predicted one sample ahead" in line for line in lines)
     assert json.loads((tmp_path / "diagnosis.json").read_text())["backlash"]["shown"]
-    assert {one.name for one in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
-    assert {effect.kind for effect in found.model.effects} == set(numbers)
+    assert {finding.name for finding in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
+    assert {effect.kind for effect in diagnosis.model.effects} == set(numbers)
 
 
 SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
@@ -63,11 +63,11 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     part(log, np.r_[1560:2060]).write(other)
     done = []
     task = read_diagnosis_task(path, EXACT, holdout=other)
-    found = run_diagnosis(task, lambda *counted: done.append(counted))
-    assert (found.summary["verdict"], found.summary["findings"]) == ("no_discrepancy", [])
-    assert found.summary["explained_share"] is None
+    diagnosis = run_diagnosis(task, lambda *counted: done.append(counted))
+    assert (diagnosis.summary["verdict"], diagnosis.summary["findings"]) == ("no_discrepancy", [])
+    assert diagnosis.summary["explained_share"] is None
     first = 50 + DELAY_SAMPLES
-    assert np.isnan(found.trace["torque"][:first]).all() and np.isfinite(found.trace["torque"][first:]).all()
+    assert np.isnan(diagnosis.trace["torque"][:first]).all() and np.isfinite(diagnosis.trace["torque"][first:]).all()
     assert done == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -91,20 +91,20 @@ def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
 def test_one_crossing_shows_a_gap(tmp_path):
     path = tmp_path / "motor.csv"
     driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
-    found = diagnose(path, EXACT).summary
-    assert found["backlash"]["crossings"] == 1
-    (finding,) = found["findings"]
-    assert finding["parameters"]["half_gap"]["value"] == found["backlash"]["half_gap"] == pytest.approx(0.08, rel=1e-3)
-    assert not any("No gap is shown" in line for line in diagnosis_lines(found))
+    summary = diagnose(path, EXACT).summary
+    assert summary["backlash"]["crossings"] == 1
+    (finding,) = summary["findings"]
+    assert finding["parameters"]["half_gap"]["value"] == summary["backlash"]["half_gap"] == pytest.approx(0.08, rel=1e-3)
+    assert not any("No gap is shown" in line for line in diagnosis_lines(summary))
 
 
 def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
     path = tmp_path / "motor.csv"
     driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
     monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
-    found = diagnose(path, EXACT).summary
-    assert (found["verdict"], found["findings"]) == ("unknown_effect", [])
-    lines = diagnosis_lines(found)
+    summary = diagnose(path, EXACT).summary
+    assert (summary["verdict"], summary["findings"]) == ("unknown_effect", [])
+    lines = diagnosis_lines(summary)
     assert any(
         line.startswith("Unknown: a gap might explain what is missing, but this log does not show it") for line in lines
     )
@@ -116,8 +116,8 @@ def test_what_a_model_has_is_not_sought():
     assert sought(bare, ["load.coulomb_friction", "drive.gear_ratio"]) == ["motor.coulomb_friction", "transmission.backlash"]
     assert set(sought(bare)) == {"motor.coulomb_friction", "load.coulomb_friction", "transmission.backlash"}
     gap = {"law": "dead_zone", "stiffness": 61.0, "half_gap": 0.05}
-    known = read_model(STUDY | {"transmission": gap, "effects": [FRICTIONS[1]]})[0].build()
-    assert sought(known) == ["motor.coulomb_friction"]
+    nominal = read_model(STUDY | {"transmission": gap, "effects": [FRICTIONS[1]]})[0].build()
+    assert sought(nominal) == ["motor.coulomb_friction"]
 
 
 def test_a_gap_of_a_given_size_in_a_study():

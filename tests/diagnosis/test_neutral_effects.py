@@ -28,17 +28,17 @@ def model(sides):
 @pytest.mark.parametrize("sides", [1, 2])
 def test_neutral_effects_do_nothing(sides):
     bare = model(sides)
-    every = complete(bare, candidates(bare))
+    stride = complete(bare, candidates(bare))
     torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
     runs = []
-    for one in (bare, every):
+    for one in (bare, stride):
         start = one.plant.init(one.initial)
         runs.append(jit(plant_trajectory)(one, start, torque))
     for side in bare.sides:
         assert np.ptp(runs[0].position[side]) > 0.0
         for name in ("position", "velocity"):
-            found, expected = (np.asarray(getattr(one, name)[side]) for one in (runs[1], runs[0]))
-            assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
+            actual, expected = (np.asarray(getattr(one, name)[side]) for one in (runs[1], runs[0]))
+            assert actual == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
@@ -47,14 +47,14 @@ def test_all_effects_are_there_once(sides):
     lacking = candidates(bare)
     stateful = [name for name in lacking if has_state(name)]
     assert "actuator.lag" in stateful and not has_state("motor.cogging")
-    names = [one.name for one in complete(bare, lacking).effects]
+    names = [effect.name for effect in complete(bare, lacking).effects]
     assert len(set(names)) == len(names)
     assert set(names) == {*lacking, "motor.coulomb_friction"}
     if sides == 2:
         assert set(names) == set(EFFECTS) - GIVEN_ONLY
     # those with a state of their own are there if they act, in the same place as if they had been there from the first
-    assert [one.name for one in complete(bare).effects] == [name for name in names if name not in stateful]
-    assert [one.name for one in complete(complete(bare), lacking).effects] == names
+    assert [effect.name for effect in complete(bare).effects] == [name for name in names if name not in stateful]
+    assert [effect.name for effect in complete(complete(bare), lacking).effects] == names
     # a second time there is nothing to add
     assert candidates(complete(bare)) == stateful and candidates(complete(bare, lacking)) == []
 
@@ -77,9 +77,9 @@ def test_buckets_are_few_and_large_enough():
 def test_given_effects_keep_their_order():
     data = small()
     saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
-    every = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
-    acting = [one.name for one in every.effects if one.place == "actuator"]
+    stride = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
+    acting = [effect.name for effect in stride.effects if effect.place == "actuator"]
     assert acting == ["actuator.saturation", "actuator.gain_error", "actuator.lag"]
     late = complete(complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float)), ["actuator.lag"])
-    acting = [one.name for one in late.effects if one.place == "actuator"]
+    acting = [effect.name for effect in late.effects if effect.place == "actuator"]
     assert acting == ["actuator.gain_error", "actuator.saturation", "actuator.lag"]

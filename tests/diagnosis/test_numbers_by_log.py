@@ -29,19 +29,19 @@ class Torques:
     def missing(self, experiment, name="torque"):
         if name == "deviation":
             return {"motor": np.full(len(self.segments) * SAMPLES, self.noise)}
-        found = []
-        for one in self.segments:
-            i = one.rows.start // SAMPLES
+        result = []
+        for segment in self.segments:
+            i = segment.rows.start // SAMPLES
             time = 1e-3 * np.arange(SAMPLES)
             speed, change = self.turned * 30.0 * np.sin(5.0 * time + i), self.turned * 150.0 * np.cos(5.0 * time + i)
             noise = self.rough * self.noise * np.random.default_rng(i).standard_normal(SAMPLES)
             drive = experiment.drive
-            found.append(
+            result.append(
                 (self.truth[i] - float(drive.motor_inertia)) * change
                 + (VISCOUS - float(drive.motor_viscous)) * speed
                 + noise
             )
-        return {"motor": np.concatenate(found)}
+        return {"motor": np.concatenate(result)}
 
 
 def found(
@@ -55,7 +55,7 @@ def found(
 ):
     rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
     names = list(zip(map(Path, files), rows, strict=True))
-    segments = tuple(SimpleNamespace(rows=one) for one in rows)
+    segments = tuple(SimpleNamespace(rows=row) for row in rows)
     task = SimpleNamespace(
         record=SimpleNamespace(logs=names[: 1 if separate else 2]),
         separate=separate,

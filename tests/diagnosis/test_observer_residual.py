@@ -68,15 +68,18 @@ def late(torque, period):
 
 
 def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
-    experiment, residuals, found = seen(logs, "geared", model(drive=GEARED, transmission=GAP))
+    experiment, residuals, result = seen(logs, "geared", model(drive=GEARED, transmission=GAP))
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
-        (one,) = found[side]
+        (one,) = result[side]
         assert one.converged and one.stuck < 0.02
         assert len(one.residual.time) + one.skipped == 1500 - DELAY_SAMPLES and 50 <= one.skipped < 60
-        about = compared(experiment, found[side], residuals[side], 30.0)
-        assert about["correlation"] > 0.99
-        assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.03) and about["rms"] > 10.0 * about["noise"]
-        assert about["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
+        description = compared(experiment, result[side], residuals[side], 30.0)
+        assert description["correlation"] > 0.99
+        assert (
+            description["rms"] == pytest.approx(description["smoother_rms"], rel=0.03)
+            and description["rms"] > 10.0 * description["noise"]
+        )
+        assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
         missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + one.skipped : 1500]
         low, _ = narrowed(one.residual, 10.0)
@@ -91,11 +94,11 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretis
     tables = {"drive": DRIVE, "effects": [FRICTION]}
     if which == "geared":
         tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
-    _, _, found = seen(logs, which, model(observer={"discretisation": discretisation}, **tables))
-    for side, (one,) in found.items():
-        scores = [rms(one.residual.torque / one.residual.deviation)]
+    _, _, result = seen(logs, which, model(observer={"discretisation": discretisation}, **tables))
+    for side, (name,) in result.items():
+        scores = [rms(name.residual.torque / name.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
-            low, _ = narrowed(one.residual, cutoff)
+            low, _ = narrowed(name.residual, cutoff)
             scores.append(rms(low.torque / low.deviation))
         # the explicit one has a lag of its own, which shows behind narrow low-passes
         if discretisation == "implicit":
@@ -105,28 +108,28 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretis
 
 
 def test_a_rigid_drive_has_one_witness(logs):
-    experiment, residuals, found = seen(logs, "direct", model())
-    assert list(found) == ["motor"]
-    about = compared(experiment, found["motor"], residuals["motor"], 30.0)
-    assert about["correlation"] > 0.98 and about["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
+    experiment, residuals, result = seen(logs, "direct", model())
+    assert list(result) == ["motor"]
+    description = compared(experiment, result["motor"], residuals["motor"], 30.0)
+    assert description["correlation"] > 0.98 and description["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.5])
 def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
     """What is missing is 3 rad/s^2."""
-    experiment, residuals, found = seen(logs, "direct", model(), {"motor": (2.0, alpha)})
-    (one,) = found["motor"]
+    experiment, residuals, result = seen(logs, "direct", model(), {"motor": (2.0, alpha)})
+    (one,) = result["motor"]
     assert one.stuck > 0.5 and not one.converged
-    about = compared(experiment, found["motor"], residuals["motor"], 30.0)
-    assert about["converged"] is False and {about[name] for name in ("rms", "noise", "correlation")} == {None}
+    description = compared(experiment, result["motor"], residuals["motor"], 30.0)
+    assert description["converged"] is False and {description[name] for name in ("rms", "noise", "correlation")} == {None}
 
 
 def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
     real = under_test._controls
 
-    def controls(*given):
-        return {side: values.at[0, -1].set(np.inf) for side, values in real(*given).items()}
+    def controls(*inputs):
+        return {side: values.at[0, -1].set(np.inf) for side, values in real(*inputs).items()}
 
     monkeypatch.setattr(under_test, "_controls", controls)
-    _, _, found = seen(logs, "direct", model())
-    assert not found["motor"][0].converged and np.isnan(found["motor"][0].residual.deviation).all()
+    _, _, result = seen(logs, "direct", model())
+    assert not result["motor"][0].converged and np.isnan(result["motor"][0].residual.deviation).all()

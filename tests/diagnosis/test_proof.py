@@ -15,7 +15,7 @@ POSITION, TORQUE = 1e-4, 1e-2
 def compared(position, torque, *, gain=1.0, floor=TORQUE):
     """A model whose errors are so many times the noise; `floor`: noise of the torques by its own inertia, N m."""
     samples = {"theta_e": POSITION * position, "torque_motor": gain * TORQUE * torque}
-    return Comparison({name: float(np.std(one)) for name, one in samples.items()}, {"motor": floor}, samples, gain)
+    return Comparison({name: float(np.std(sample)) for name, sample in samples.items()}, {"motor": floor}, samples, gain)
 
 
 LOG = SimpleNamespace(noise_floor=lambda torques: {"theta_e": POSITION, "torque_motor": torques["motor"]})
@@ -64,14 +64,14 @@ def accepted(monkeypatch, errors, shares, gain):
     fitted = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
     monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fitted)
     monkeypatch.setattr(Proof, "_gain", lambda self, search, model, after, name: gain(name, model.names))
-    found = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
-    return proof.accepted(None, found)
+    search_result = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
+    return proof.accepted(None, search_result)
 
 
 def test_a_wave_in_time_has_to_go_on_in_other_data(monkeypatch, errors):
     shares = {"load.periodic_disturbance": 0.002, "motor.cogging": 0.01}
-    said = accepted(monkeypatch, errors, shares, lambda name, names: 1.4)
-    assert said.withdrawn == ["load.periodic_disturbance"] and said.fitted.names == ("motor.cogging",)
+    output = accepted(monkeypatch, errors, shares, lambda name, names: 1.4)
+    assert output.withdrawn == ["load.periodic_disturbance"] and output.fitted.names == ("motor.cogging",)
 
 
 def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, errors):
@@ -82,9 +82,9 @@ def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, err
         alone = "actuator.delay" not in names
         return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
 
-    said = accepted(monkeypatch, errors, shares, gain)
-    assert said.withdrawn == ["actuator.delay"]
-    assert said.fitted.names == ("motor.cogging", "motor.coulomb_friction")
+    output = accepted(monkeypatch, errors, shares, gain)
+    assert output.withdrawn == ["actuator.delay"]
+    assert output.fitted.names == ("motor.cogging", "motor.coulomb_friction")
 
 
 @pytest.mark.parametrize(("error", "apart"), [(0.02, True), (0.2, False)])
@@ -104,8 +104,8 @@ def test_a_way_shorter_than_the_noise_of_its_position_is_not_known(noise, apart)
         experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
         errors=lambda: {f"effects.{name}.length": 1e-3},
     )
-    found = special_case(fitted, name, {"motor": 1.0, "load": noise})  # type: ignore[arg-type]
-    assert found == (None if apart else "load.coulomb_friction")
+    result = special_case(fitted, name, {"motor": 1.0, "load": noise})  # type: ignore[arg-type]
+    assert result == (None if apart else "load.coulomb_friction")
 
 
 @pytest.mark.parametrize(("z", "named"), [(1.5, False), (0.5, True)])
@@ -125,7 +125,7 @@ def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, na
         worse=lambda *_: False, _gain=lambda *_: 7.0,
     )  # fmt: skip
     accepted = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
-    found = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]
-    assert (found is not None) == named
-    if found is not None:
-        assert found.fitted.numbers == {plain: {"torque": 0.1}} and found.gains == {plain: 7.0}
+    plainer = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]
+    assert (plainer is not None) == named
+    if plainer is not None:
+        assert plainer.fitted.numbers == {plain: {"torque": 0.1}} and plainer.gains == {plain: 7.0}

@@ -39,9 +39,9 @@ def explained(log, study):
 def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     """Published: M 95.1 kg, F_v 203.5 N s/m, F_c 20.39 N, and F_v 166.7 N s/m forwards, 240.4 backwards; force error 66 %
     with the mass alone, 4.7 % with all of these."""
-    found = diagnose(real("emps/DATA_EMPS.mat"), emps(), holdout=real("emps/DATA_EMPS_PULSES.mat"))
-    summary = found.summary
-    numbers = {one["effect"]: one["parameters"] for one in summary["findings"]}
+    diagnosis = diagnose(real("emps/DATA_EMPS.mat"), emps(), holdout=real("emps/DATA_EMPS_PULSES.mat"))
+    summary = diagnosis.summary
+    numbers = {finding["effect"]: finding["parameters"] for finding in summary["findings"]}
     assert set(numbers) == {"motor.viscous_friction", "motor.coulomb_friction", "motor.asymmetric_friction"}
     assert numbers["motor.viscous_friction"]["viscous"]["value"] == pytest.approx(203.5, rel=0.04)
     assert numbers["motor.coulomb_friction"]["torque"]["value"] == pytest.approx(20.39, rel=0.04)
@@ -49,22 +49,22 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     assert summary["parameters"]["drive.motor_inertia"]["value"] == pytest.approx(95.1, rel=0.01)
     # behind the 100 Hz of the published figures
     driving = summary["gap"]["driving"]["motor"]
-    ((before, after, held),) = found.pairs["motor"]
-    error = [np.sqrt(np.mean(narrowed(one, 100.0)[0].torque ** 2)) / driving for one in (before, after)]
+    ((before, after, held),) = diagnosis.pairs["motor"]
+    error = [np.sqrt(np.mean(narrowed(finding, 100.0)[0].torque ** 2)) / driving for finding in (before, after)]
     assert held
     assert error[0] == pytest.approx(0.66, abs=0.03)
     assert error[1] < 0.058
     assert summary["verdict"] == "unknown_effect"
     assert summary["where_after"]["motor"]["sentence"]
     # the rest is no known effect; a table of it makes the model better
-    rest = summary["torque_tables"]["holdout_rmse"]
-    assert all(rest[name] < summary["gap"]["holdout_rmse_after"][name] for name in ("theta_e", "torque_motor"))
+    holdout_rmse = summary["torque_tables"]["holdout_rmse"]
+    assert all(holdout_rmse[name] < summary["gap"]["holdout_rmse_after"][name] for name in ("theta_e", "torque_motor"))
 
 
 def test_emps_an_effect_that_is_taken_out_is_named_again():
-    found = explained(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET))
-    assert found.findings[0].effect == COULOMB["kind"]
-    assert found.findings[0].numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
+    result = explained(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET))
+    assert result.findings[0].effect == COULOMB["kind"]
+    assert result.findings[0].numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
 
 
 def test_xl330_gravity_and_then_dry_friction_are_named():
@@ -77,13 +77,13 @@ def test_xl330_gravity_and_then_dry_friction_are_named():
         | {"absent": ["u"], "where": {"torque_enable": False}, "resample": 3.5e-3},
     )
     logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
-    found = explained(logs, study)
-    assert found.findings[0].effect == "load.gravity"
+    result = explained(logs, study)
+    assert result.findings[0].effect == "load.gravity"
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
-    assert 0.25 < found.findings[0].numbers["torque"] < 0.49 * 0.1 * 9.81
+    assert 0.25 < result.findings[0].numbers["torque"] < 0.49 * 0.1 * 9.81
     # small beside a swing of 10 to 20 Hz that no effect accounts for; all of the friction, as the model has no viscous one
     # with contacts that bend by some milliradians, which nobody has published of it
-    assert found.findings[1].effect == "motor.presliding_friction"
-    assert found.findings[1].numbers["length"] < 5e-3
-    assert 0.005 < found.findings[1].numbers["torque"] < 0.02
-    assert len(found.findings) == 2
+    assert result.findings[1].effect == "motor.presliding_friction"
+    assert result.findings[1].numbers["length"] < 5e-3
+    assert 0.005 < result.findings[1].numbers["torque"] < 0.02
+    assert len(result.findings) == 2

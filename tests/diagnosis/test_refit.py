@@ -30,9 +30,9 @@ def setting(tmp_path_factory):
     bare = on_record(task.config, task.record)
     experiment = with_numbers(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
     torque = float(np.std(task.record.torque))
-    own = make_free_parameters(bare, default_paths(task.config, bare), torque)
-    free = (*own, *make_free_parameters(experiment, paths_of([NAME]), torque))
-    width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
+    free_parameters = make_free_parameters(bare, default_paths(task.config, bare), torque)
+    free = (*free_parameters, *make_free_parameters(experiment, paths_of([NAME]), torque))
+    width = np.array([*[task.config.uncertainty.relative] * len(free_parameters), 3.0])
     return experiment, free, width, segments_of(task.record, bare.sides)
 
 
@@ -40,21 +40,21 @@ def test_prediction_errors_are_least(setting):
     """Of the same predictor, by a search without derivatives that begins elsewhere."""
     experiment, free, width, segments = setting
     (segment,) = segments
-    found = refined(experiment, free, np.zeros(len(free)), width, segments)
-    gain = {"motor": Linear.gain_of(found.smoothness, segment.period)[0]}
+    result = refined(experiment, free, np.zeros(len(free)), width, segments)
+    gain = {"motor": Linear.gain_of(result.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
-    def predicted(given):
-        one = set_free_parameters(experiment, free, given[2:] * 0.01)
-        start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))
+    def predicted(inputs):
+        one = set_free_parameters(experiment, free, inputs[2:] * 0.01)
+        start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(one, torque[0]))
         return plant_trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
-    def cost(given):
-        errors = np.asarray(reading - predicted(jnp.asarray(given)))
-        return len(errors) * np.log(np.sum(errors**2)) + np.sum((given[2:] * 0.01 / width) ** 2)
+    def cost(inputs):
+        errors = np.asarray(reading - predicted(jnp.asarray(inputs)))
+        return len(errors) * np.log(np.sum(errors**2)) + np.sum((inputs[2:] * 0.01 / width) ** 2)
 
-    here = np.concatenate([found.start[0], 100.0 * found.theta])
+    here = np.concatenate([result.start[0], 100.0 * result.theta])
     options = {"xatol": 1e-5, "fatol": 1e-4, "maxfev": 2000, "adaptive": True}
     best = minimize(cost, here + np.array([1e-6, 1e-4, 0.3, -0.3, 0.3]), method="Nelder-Mead", options=options)
     # twice the logarithm of the likelihood: far less than what the noise leaves open
@@ -72,12 +72,12 @@ def test_deviations_are_those_of_repetitions(tmp_path):
         bare = on_record(task.config, task.record)
         experiment = with_numbers(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
         torque = float(np.std(task.record.torque))
-        own = make_free_parameters(bare, default_paths(task.config, bare), torque)
-        free = (*own, *make_free_parameters(experiment, paths_of([NAME]), torque))
-        width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
-        found = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
-        values.append(found.theta[-1])
-        stated.append(found.deviation[-1])
+        free_parameters = make_free_parameters(bare, default_paths(task.config, bare), torque)
+        free = (*free_parameters, *make_free_parameters(experiment, paths_of([NAME]), torque))
+        width = np.array([*[task.config.uncertainty.relative] * len(free_parameters), 3.0])
+        result = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
+        values.append(result.theta[-1])
+        stated.append(result.deviation[-1])
     errors = np.array(values) / np.array(stated)
     assert 0.6 < np.sqrt(np.mean(errors**2)) < 1.5
     assert np.max(np.abs(errors)) < 3.5

@@ -52,14 +52,14 @@ def scores(residual, cutoff=None):
 @pytest.mark.parametrize("sides", [1, 2])
 @pytest.mark.parametrize("effects", [[], [FRICTION]], ids=["smooth", "friction"])
 def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, effects):
-    found = {}
+    result = {}
     experiment = prepare(read_config(study(sides, effects)))
     for seed in range(3):
         _, segment = record(study(sides, effects), seed)
         for name, (one,) in residual_torques(experiment, [segment]).items():
-            found.setdefault(name, []).append([scores(one), scores(one, 20.0), scores(one, 8.0)])
-    assert set(found) == set(experiment.sides)
-    for each in found.values():
+            result.setdefault(name, []).append([scores(one), scores(one, 20.0), scores(one, 8.0)])
+    assert set(result) == set(experiment.sides)
+    for each in result.values():
         np.testing.assert_allclose(np.mean(each, axis=0), [1.0, 1.0, 1.05], atol=0.15)
 
 
@@ -68,8 +68,8 @@ def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
     experiment = prepare(read_config(study(1)))
     (one,) = residual_torques(experiment, [segment])["motor"]
     missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    seen = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
-    assert rms((one.torque - seen) / one.deviation) == pytest.approx(1.0, abs=0.1)
+    calls = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
+    assert rms((one.torque - calls) / one.deviation) == pytest.approx(1.0, abs=0.1)
     assert scores(one) > 3.0
     # the other way round as the balance
     left = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
@@ -81,9 +81,9 @@ def test_a_measured_torque_takes_the_place_of_the_models():
     _, segment = record(study(2), transmitted=noise)
     for stiffness in (60.0, 50.0):
         experiment = prepare(read_config(study(2) | {"transmission": GAP | {"stiffness": stiffness}}))
-        found = residual_torques(experiment, [segment])
-        assert list(found) == ["motor", "load"]
-        for (one,) in found.values():
+        result = residual_torques(experiment, [segment])
+        assert list(result) == ["motor", "load"]
+        for (one,) in result.values():
             assert scores(one) == pytest.approx(1.0, abs=0.12)
 
 
@@ -92,10 +92,10 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     time = 1e-3 * np.arange(20000)
     slow = np.sin(2.0 * np.pi * 0.7 * time)
     white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(1), 500.0)
-    low, at = narrowed(white, 5.0)
+    low, kept_rows = narrowed(white, 5.0)
     assert len(low.time) < 2000 and low.bandwidth == 5.0
-    np.testing.assert_array_equal(low.time, time[at])
-    assert rms((low.torque - slow[at]) / low.deviation) == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_array_equal(low.time, time[kept_rows])
+    assert rms((low.torque - slow[kept_rows]) / low.deviation) == pytest.approx(1.0, abs=0.1)
     again, _ = narrowed(low, 2.5)
     direct, _ = narrowed(white, 2.3)
     assert again.deviation[50] == pytest.approx(direct.deviation[50], rel=0.1)

@@ -38,9 +38,9 @@ def tables(*effects):
 
 
 def test_a_torque_over_position_is_found_with_its_error():
-    found = tables(WAVE)
-    assert set(found) in ({"position"}, {"turn"})
-    (one,) = found.values()
+    result = tables(WAVE)
+    assert set(result) in ({"position"}, {"turn"})
+    (one,) = result.values()
     truth = 0.05 * np.sin(3.0 * one.points + 0.4)
     # points at the ends of the travel are hardly visited
     inner = slice(2, -2)
@@ -49,9 +49,9 @@ def test_a_torque_over_position_is_found_with_its_error():
 
 
 def test_a_torque_over_speed_is_found():
-    found = tables(DRAG)
-    assert set(found) == {"speed"}
-    one = found["speed"]
+    result = tables(DRAG)
+    assert set(result) == {"speed"}
+    one = result["speed"]
     np.testing.assert_allclose(one.torques[1:-1], (0.004 * one.points * np.abs(one.points))[1:-1], atol=0.01)
 
 
@@ -68,11 +68,11 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     with jax.enable_x64(True):
         setup = set_up(task)
         proof = Proof(setup)
-        found = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
-    assert found is not None and found.z > 2.0
+        result = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
+    assert result is not None and result.z > 2.0
     for name in ("theta_e", "torque_motor"):
-        assert found.after.errors[name] < 0.6 * proof.before.errors[name]
-    longer = extended_study(task.config, {}, {}, found.effects())
+        assert result.after.errors[name] < 0.6 * proof.before.errors[name]
+    longer = extended_study(task.config, {}, {}, result.effects())
     (effect,) = longer.effects
     assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)
     assert read_config(longer.to_dict()).build().effects[0].positions == pytest.approx(effect.positions)

@@ -23,14 +23,14 @@ def test_white_noise_has_no_colour(samples):
 
 
 def test_the_spectrum_of_first_order_noise():
-    found = spectrum_of([correlated(20000, 1), correlated(7001, 2)])
-    assert found.coloured
-    at = found.at(1000)[:, 0]
+    actual = spectrum_of([correlated(20000, 1), correlated(7001, 2)])
+    assert actual.coloured
+    index = actual.at(1000)[:, 0]
     frequency = np.fft.rfftfreq(1000)
     expected = 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency)) ** 2
-    np.testing.assert_allclose(at[2:], expected[2:], rtol=0.25)
+    np.testing.assert_allclose(index[2:], expected[2:], rtol=0.25)
     # worth what the innovations' variance is less than the noise's own
-    assert found.gain == pytest.approx(-0.5 * 27001 * np.log(1.0 - POLE**2), rel=0.05)
+    assert actual.gain == pytest.approx(-0.5 * 27001 * np.log(1.0 - POLE**2), rel=0.05)
 
 
 def test_a_flat_spectrum_gives_sums_of_products():
@@ -49,11 +49,11 @@ def test_products_are_those_of_generalised_least_squares():
     spectrum = Spectrum(frequency, 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency))[:, None] ** 2, 0.0)
     covariance = POLE**time / (1.0 - POLE**2)
     expected = columns.T @ solve_toeplitz(covariance, columns)
-    found = weighted_products(columns[:, None], spectrum)
-    np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.01 * expected.max())
+    actual = weighted_products(columns[:, None], spectrum)
+    np.testing.assert_allclose(actual, expected, rtol=0.05, atol=0.01 * expected.max())
 
 
 def test_a_log_in_many_short_parts():
-    found = spectrum_of([np.random.default_rng(i).standard_normal((100, 1)) for i in range(30)])
-    assert np.isfinite(found.at(100)).all()
-    assert not found.coloured
+    result = spectrum_of([np.random.default_rng(i).standard_normal((100, 1)) for i in range(30)])
+    assert np.isfinite(result.at(100)).all()
+    assert not result.coloured

@@ -40,7 +40,7 @@ def harness(summary, header=True):
             f"void go({name}_state *s, long n, const {real} *in, {real} *out)",
             f"{{ long i; {name}_outputs o; for (i = 0; i < n; i++) {{",
             f"  {name}_step(s, {', '.join(f'in[i * {inputs} + {k}]' for k in range(inputs))}, &o);",
-            *(f"  out[i * {outputs} + {k}] = ({real})o.{one['name']};" for k, one in enumerate(summary["outputs"])),
+            *(f"  out[i * {outputs} + {k}] = ({real})o.{output['name']};" for k, output in enumerate(summary["outputs"])),
             "} }",
             "",
         ]

@@ -34,7 +34,7 @@ class Strict:
 
     def __init__(self, block):
         self.single = block.dtype == np.float32
-        numbers = [self.real(one.value) for one in block.study_numbers.values()]
+        numbers = [self.real(number.value) for number in block.study_numbers.values()]
         count, known = len(block.state), len(numbers)
         self._start = self._made(block.start, known, [])(*numbers)
         self._step = self._made(block.step, known, [])(*numbers)
@@ -47,8 +47,8 @@ class Strict:
         return list(self._start(*map(self.real, first)))
 
     def step(self, state, inputs):
-        found = self._step(*state, *inputs)
-        return list(found[: self._count]), list(found[self._count :])
+        result = self._step(*state, *inputs)
+        return list(result[: self._count]), list(result[self._count :])
 
     def _made(self, closed, known, _):
         """A function of known numbers, which gives that of the others."""
@@ -114,8 +114,8 @@ class Strict:
             self._put(varies, f"{', '.join(state)}, = {', '.join(texts[fixed:])},", indent)
             self._put(varies, f"for _ in range({times}):", indent)
             inside = [*((one, varies) for one in texts[:fixed]), *((one, varies) for one in state)]
-            made = self._body(body, inside, varies, indent)
-            self._put(varies, f"{', '.join(state)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
+            result = self._body(body, inside, varies, indent)
+            self._put(varies, f"{', '.join(state)}, = {', '.join(one for one, _ in result)},", f"{indent}    ")
             return [(one, varies) for one in state]
         if name == "cond" and not eqn.outvars:
             return []
@@ -123,8 +123,8 @@ class Strict:
             outs = [self._new() for _ in eqn.outvars]
             for i, branch in enumerate(cond_branches(eqn)):
                 self._put(varies, f"if {texts[0]} == {i}:", indent)
-                made = self._body(branch, [(one, varies) for one in texts[1:]], varies, indent)
-                self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
+                result = self._body(branch, [(one, varies) for one in texts[1:]], varies, indent)
+                self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in result)},", f"{indent}    ")
             return [(one, varies) for one in outs]
         out = self._new()
         self._put(varies, f"{out} = {self._expression(eqn, name, dtype, texts)}", indent)
@@ -133,12 +133,12 @@ class Strict:
     def _body(self, closed, given, varies, indent):
         """Lines of a loop or a choice: what stands in one that varies stays there."""
         before, self._within = self._within, self._within or varies
-        made = self._write(closed, given, f"{indent}    ")
+        write_statement = self._write(closed, given, f"{indent}    ")
         self._within = before
-        return made
+        return write_statement
 
     def _expression(self, eqn, name, dtype, x):
-        one = self._constant(1.0, dtype) if dtype.kind == "f" else "1"
+        constant = self._constant(1.0, dtype) if dtype.kind == "f" else "1"
         if name in _INFIX:
             return f"{x[0]} {_INFIX[name]} {x[1]}"
         if name == "div":
@@ -148,7 +148,7 @@ class Strict:
         if name == "integer_pow":
             power = equation_parameter(eqn, "y")
             product = " * ".join([x[0]] * abs(power))
-            return product if power > 0 else f"{one} / ({product})"
+            return product if power > 0 else f"{constant} / ({product})"
         if name == "select_n":
             return f"{x[2]} if {x[0]} else {x[1]}"
         if name == "convert_element_type":
@@ -160,16 +160,16 @@ class Strict:
             cast = f"cast({x[0]}, {str(dtype)!r}, {str(eqn.outvars[0].aval.dtype)!r})"
             return f"f32({cast})" if eqn.outvars[0].aval.dtype == np.float32 else cast
         if name == "round":
-            found = (
+            result = (
                 "nearest({})"
                 if int(equation_parameter(eqn, "rounding_method"))
                 else "math.copysign(math.floor(abs({0}) + 0.5), {0})"
             )
-            return f"f32({found.format(x[0])})" if self.single else found.format(x[0])
+            return f"f32({result.format(x[0])})" if self.single else result.format(x[0])
         if name == "clamp":
             return f"min(max({x[1]}, {x[0]}), {x[2]})"
         if name == "sign":
-            return f"({one} if {x[0]} > 0 else -{one} if {x[0]} < 0 else {x[0]})"
+            return f"({constant} if {x[0]} > 0 else -{constant} if {x[0]} < 0 else {x[0]})"
         rules = {
             "neg": "-{0}",
             "abs": "abs({0})",

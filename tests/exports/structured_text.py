@@ -52,12 +52,12 @@ class FunctionBlock:
         return {name: self.values[name] for name in self.outputs}
 
     def _declared(self, node):
-        constant = any(one.type == "var_qualifier_list" for one in node.children)
+        constant = any(child.type == "var_qualifier_list" for child in node.children)
         names = []
-        for one in node.children:
-            if one.type != "variable_declaration":
+        for child in node.children:
+            if child.type != "variable_declaration":
                 continue
-            name, kind, *first = one.named_children
+            name, kind, *first = child.named_children
             names.append(name.text.decode())
             self.types[names[-1]] = TYPES[kind.text.decode()]
             self.values[names[-1]] = self._constant(first[0]) if first else self.types[names[-1]](0)
@@ -78,7 +78,7 @@ class FunctionBlock:
         indent = "    " * depth
         if node.type in ("comment", "empty_statement"):
             return
-        named = [one for one in node.named_children if one.type != "comment"]
+        named = [clause for clause in node.named_children if clause.type != "comment"]
         if node.type == "assignment_statement":
             name = named[0].text.decode()
             assert name in self.types and name not in self.constants and name not in self.inputs, name
@@ -86,10 +86,10 @@ class FunctionBlock:
         elif node.type in ("if_statement", "elsif_clause", "while_statement"):
             word = {"if_statement": "if", "elsif_clause": "elif", "while_statement": "while"}[node.type]
             self._lines.append(f"{indent}{word} of(BOOL, {self._expression(named[0])}):")
-            clauses = [one for one in named[1:] if one.type in ("elsif_clause", "else_clause")]
-            self._body([one for one in named[1:] if one not in clauses], depth + 1)
-            for one in clauses:
-                self._statement(one, depth)
+            clauses = [clause for clause in named[1:] if clause.type in ("elsif_clause", "else_clause")]
+            self._body([clause for clause in named[1:] if clause not in clauses], depth + 1)
+            for clause in clauses:
+                self._statement(clause, depth)
         elif node.type == "else_clause":
             self._lines.append(f"{indent}else:")
             self._body(named, depth + 1)
@@ -103,8 +103,8 @@ class FunctionBlock:
 
     def _body(self, nodes, depth):
         assert nodes
-        for one in nodes:
-            self._statement(one, depth)
+        for node in nodes:
+            self._statement(node, depth)
 
     def _expression(self, node):
         """As an expression in Python."""
@@ -128,7 +128,7 @@ class FunctionBlock:
 
 def _first_fault(node):
     while not (node.is_error or node.is_missing):
-        node = next(one for one in node.children if one.has_error or one.is_missing)
+        node = next(child for child in node.children if child.has_error or child.is_missing)
     return f"line {node.start_point.row + 1}: {node.text.decode()[:200]}"
 
 

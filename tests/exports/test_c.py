@@ -58,9 +58,9 @@ def outputs(native, inputs):
 def test_all_compilers_and_levels_give_the_same_bits(code, compiler, level, precision):
     inputs, (folder, plain) = samples(3000, 2), code(precision)
     first = outputs(plain, inputs)
-    found = outputs(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
-    assert np.isfinite(found).all()
-    assert (bits(found) == bits(first)).all()
+    result = outputs(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
+    assert np.isfinite(result).all()
+    assert (bits(result) == bits(first)).all()
 
 
 def strictly(data, precision, inputs):
@@ -80,8 +80,8 @@ def test_every_kind_is_the_traced_step_bit_for_bit(code, kind, precision):
     inputs = samples(1500, 2)
     _, native = code(precision, kind)
     assert native.size == native.summary["state_bytes"]
-    found, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
-    assert (bits(found) == bits(expected)).all()
+    actual, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
+    assert (bits(actual) == bits(expected)).all()
 
 
 @pytest.mark.program("gcc")
@@ -106,7 +106,7 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
     sides = ("motor",) if law is None else ("motor", "load")
     inputs = samples(4000, len(sides))
     native = exported(tmp_path, data)
-    found = outputs(native, inputs)
+    actual = outputs(native, inputs)
     with jax.enable_x64(True):
         experiment = as_arrays(read_config(data).build(), jnp.float64)
         measured = {side: jnp.asarray(inputs[:, 1 + i]) for i, side in enumerate(sides)}
@@ -117,11 +117,11 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
             }
 
         expected = jax.jit(lambda u, y: replay(experiment, u, y, record=keep)[1])(jnp.asarray(inputs[:, 0]), measured)
-    names = [one["name"] for one in native.summary["outputs"]]
+    names = [output["name"] for output in native.summary["outputs"]]
     for name, values in expected.items():
         # a switching term takes the other side where rounding decides
         tolerance = 1e-9 if not explicit else 2e-2
-        own, other = found[:, names.index(name)], np.asarray(values)
+        own, other = actual[:, names.index(name)], np.asarray(values)
         assert np.sqrt(np.mean((own - other) ** 2)) <= tolerance * np.sqrt(np.mean(other**2)), name
 
 
@@ -131,17 +131,17 @@ def test_the_example_filter_reads_and_writes_csv(tmp_path):
     ran("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)
     inputs = samples(200, 2)
     rows = "\n".join(f"{i * 1e-3!r},{','.join(map(repr, row.tolist()))}" for i, row in enumerate(inputs))
-    said = ran("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}\n").stdout.splitlines()
+    lines = ran("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}\n").stdout.splitlines()
     native = Native(tmp_path)
-    found = np.array([[float(x) for x in line.split(",")] for line in said[1:]])
-    assert said[0].split(",")[1:] == [one["name"] for one in native.summary["outputs"]]
-    np.testing.assert_allclose(found[:, 1:], outputs(native, inputs), rtol=1e-12, atol=1e-300)
+    result = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
+    assert lines[0].split(",")[1:] == [output["name"] for output in native.summary["outputs"]]
+    np.testing.assert_allclose(result[:, 1:], outputs(native, inputs), rtol=1e-12, atol=1e-300)
 
 
 def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path):
-    made = jaxbl.export(study(), tmp_path, name="drive")
+    export = jaxbl.export(study(), tmp_path, name="drive")
     source = (tmp_path / "drive.c").read_text()
-    assert set(made.files) >= {"drive.c", "drive.h", "drive_filter.c", "export.json"}
+    assert set(export.files) >= {"drive.c", "drive.h", "drive_filter.c", "export.json"}
     for word in ("malloc", "pow(", " exp(", "tanh(", " cos(", "fma("):
         assert word not in source
     # gains can be recognised
@@ -168,4 +168,4 @@ def test_another_folder_is_not_overwritten(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty and holds no export"):
         jaxbl.export(study(), tmp_path, name="drive")
-    assert [one.name for one in tmp_path.iterdir()] == ["mine.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]

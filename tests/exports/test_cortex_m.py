@@ -54,11 +54,11 @@ def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     ran(*build, "drive.c", "board.c", "-lm", "-o", "board.elf", cwd=tmp_path)
     done = ran(*_MACHINE, "-kernel", "board.elf", cwd=tmp_path, stdin=-3, timeout=60)
     words = (done.stdout + done.stderr).split()
-    found = np.array([int(word, 16) for word in words], np.uint32).view(np.float32).reshape(-1, 2)
+    view = np.array([int(word, 16) for word in words], np.uint32).view(np.float32).reshape(-1, 2)
     native = Native(tmp_path)
-    names = [one["name"] for one in native.summary["outputs"]]
+    names = [output["name"] for output in native.summary["outputs"]]
     expected = outputs(native, inputs)[:, [names.index("motor_torque_estimate"), names.index("load_velocity_estimate")]]
-    assert (found.view(np.uint32) == np.ascontiguousarray(expected).view(np.uint32)).all()
+    assert (view.view(np.uint32) == np.ascontiguousarray(expected).view(np.uint32)).all()
 
 
 @pytest.mark.program("arm-none-eabi-gcc")
@@ -74,5 +74,5 @@ def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
     check = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")
     assert "misra-c2012" in ran(*check, "wrong.c", cwd=tmp_path).stderr
     jaxbl.export(study(kind), tmp_path / kind, precision=precision, name="drive")
-    said = ran(*check, "drive.c", "drive.h", cwd=tmp_path / kind)
-    assert said.stdout + said.stderr == ""
+    output = ran(*check, "drive.c", "drive.h", cwd=tmp_path / kind)
+    assert output.stdout + output.stderr == ""

@@ -45,8 +45,8 @@ MOVED = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "
 def study(*places, base=small, **tables):
     """A drive that swings for 1.5 s, with the effects of some places; encoders with noise and counts."""
     effects = [one for one in EFFECT if one["kind"].startswith(places)] if places else []
-    given = {"effects": effects, "excitation": EXCITATION, "encoders": {"noise": 1e-3, "motor_resolution": 1e-3}}
-    return base({"run.duration": 1.5, "run.substeps": 4}, **given | tables)
+    inputs = {"effects": effects, "excitation": EXCITATION, "encoders": {"noise": 1e-3, "motor_resolution": 1e-3}}
+    return base({"run.duration": 1.5, "run.substeps": 4}, **inputs | tables)
 
 
 ALL = "all effects"
@@ -73,17 +73,17 @@ def windows_too(_for_this_machine, monkeypatch):
 
 def written(data, folder, fmi=3, **options):
     """The path of a study's FMU, and what `export.json` says."""
-    made = jaxbl.export(data, folder, "fmu", fmi=fmi, **options)
-    return str(made.folder / made.files[0]), made.summary
+    export = jaxbl.export(data, folder, "fmu", fmi=fmi, **options)
+    return str(export.folder / export.files[0]), export.summary
 
 
 def free_run(path, summary, trace, start=None, **options):
     """By FMPy, under the trace's input."""
     period = summary["sample_period"]
-    given = np.zeros(len(trace), [("time", float), ("u", float)])
-    given["time"], given["u"] = np.arange(len(trace)) * period, trace.u
-    times = {"stop_time": given["time"][-1], "step_size": period, "output_interval": period}
-    return fmpy.simulate_fmu(path, input=given, start_values=start or {}, **times, **options)
+    inputs = np.zeros(len(trace), [("time", float), ("u", float)])
+    inputs["time"], inputs["u"] = np.arange(len(trace)) * period, trace.u
+    times = {"stop_time": inputs["time"][-1], "step_size": period, "output_interval": period}
+    return fmpy.simulate_fmu(path, input=inputs, start_values=start or {}, **times, **options)
 
 
 def agrees(found, trace, tolerance=TOLERANCE):
@@ -110,8 +110,10 @@ class Instance:
         self.two = self.about.fmiVersion == "2.0"
         if token is not None:
             self.about.guid = token
-        self._references = {one.name: one.valueReference for one in self.about.modelVariables}
-        logger = (lambda *given: self.said.append(given[-1].decode())) if self.two else self._logged
+        self._references = {
+            model_variable.name: model_variable.valueReference for model_variable in self.about.modelVariables
+        }
+        logger = (lambda *inputs: self.said.append(inputs[-1].decode())) if self.two else self._logged
         self.unit = fmpy.instantiate_fmu(self.folder, self.about, "CoSimulation", logger=logger)
 
     def _logged(self, environment, status, category, message):
@@ -135,7 +137,9 @@ class Instance:
         return (self.unit.getReal if self.two else self.unit.getFloat64)([self._references[name] for name in names])
 
     def outputs(self):
-        return self.get(*(one.name for one in self.about.modelVariables if one.causality == "output"))
+        return self.get(
+            *(model_variable.name for model_variable in self.about.modelVariables if model_variable.causality == "output")
+        )
 
     def time(self):
         last_successful = 2
@@ -214,16 +218,16 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
     torques = (5.0 * np.sin(8.0 * np.arange(3000) * 1e-3)).astype(dtype)
     plant = build_plant_program(read_config(data), "drive", dtype)
     block = Strict(plant.program.block)
-    given = {one: block.real(plant.parameter_info[path][0]) for one, path in plant.parameters.items()}
+    inputs = {instance: block.real(plant.parameter_info[path][0]) for instance, path in plant.parameters.items()}
     first, later = plant.program.block.start_inputs, plant.program.block.inputs[1:]
-    found = block.start([given[one.name] for one in first])
-    state, rows = found[: len(plant.program.block.state)], []
+    start = block.start([inputs[instance.name] for instance in first])
+    state, rows = start[: len(plant.program.block.state)], []
     for torque in torques:
-        state, out = block.step(state, [block.real(torque), *(given[one.name] for one in later)])
+        state, out = block.step(state, [block.real(torque), *(inputs[instance.name] for instance in later)])
         rows.append(out)
-    with Instance(path) as one:
-        own = one.begin().run(torques.astype(float))
-    assert (bits(own) == bits(np.array(rows, dtype).astype(float))).all()
+    with Instance(path) as instance:
+        trial = instance.begin().run(torques.astype(float))
+    assert (bits(trial) == bits(np.array(rows, dtype).astype(float))).all()
 
 
 @pytest.fixture(scope="module")
@@ -250,17 +254,17 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     assert content[int.from_bytes(content[60:64], "little") + 8 :][:4] == bytes(4)
     ran("x86_64-w64-mingw32-gcc", "-O1", Path(__file__).parent / "run_on_windows.c", "-o", "run.exe", cwd=tmp_path)
     torques = [5.0 * np.sin(8.0 * i * 1e-3) for i in range(1000)]
-    with Instance(path) as one:
-        expected = one.begin().run(torques)
+    with Instance(path) as torque:
+        expected = torque.begin().run(torques)
         with pytest.raises(FMICallException):
-            one.step(1.0, 0.3e-3)
+            torque.step(1.0, 0.3e-3)
     arguments = library, fmi, summary["token"], summary["sample_period"], expected.shape[1]
-    given = "\n".join(repr(float(one)) for one in torques)
-    said = ran("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=given).stdout
-    *rows, refusal = said.splitlines()
-    assert refusal == one.said[-1]
-    found = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
-    assert (found.view(np.int64) == bits(expected)).all()
+    input_lines = "\n".join(repr(float(torque)) for torque in torques)
+    stdout = ran("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=input_lines).stdout
+    *rows, refusal = stdout.splitlines()
+    assert refusal == torque.said[-1]
+    actual = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
+    assert (actual.view(np.int64) == bits(expected)).all()
 
 
 @COMPILED
@@ -284,18 +288,18 @@ def test_parameters_are_those_of_the_study(tmp_path, fmi):
     path, summary = written(data, tmp_path, fmi)
     other = study("load.gra", "motor.cou", transmission=GAP | {"half_gap": 0.05}, initial={"motor_velocity": 2.0})
     other["drive"] |= {"motor_inertia": 0.08}
-    other["effects"] = [one | ({"phase": 1.1} if "phase" in one else {}) for one in other["effects"]]
+    other["effects"] = [instance | ({"phase": 1.1} if "phase" in instance else {}) for instance in other["effects"]]
     trace = jaxbl.run(other).trace
     assert agrees(free_run(path, summary, trace, changed), trace)
-    with Instance(path) as one:
-        one.begin()
-        before = one.run([1.0] * 5)
-        one.set(drive__motor_viscous=3.0)
-        slow = one.run([1.0], 5)
-        one.unit.reset()
-        one.begin()
-        assert (one.run([1.0] * 5) == before).all()
-        assert not (one.run([1.0], 5) == slow).all()
+    with Instance(path) as instance:
+        instance.begin()
+        before = instance.run([1.0] * 5)
+        instance.set(drive__motor_viscous=3.0)
+        slow = instance.run([1.0], 5)
+        instance.unit.reset()
+        instance.begin()
+        assert (instance.run([1.0] * 5) == before).all()
+        assert not (instance.run([1.0], 5) == slow).all()
 
 
 @COMPILED
@@ -303,29 +307,29 @@ def test_parameters_are_those_of_the_study(tmp_path, fmi):
 def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
     path, _ = written(study("actuator.", "load.", transmission=GAP), tmp_path, fmi)
     torques = 3.0 * np.sin(0.02 * np.arange(600))
-    with Instance(path) as one, Instance(path) as two:
-        one.begin(), two.begin()
-        one.run(torques[:300])
-        kept = one.state()
-        first = one.run(torques[300:], 300)
-        one.restore(kept)
-        assert (one.run(torques[300:], 300) == first).all()
+    with Instance(path) as instance, Instance(path) as two:
+        instance.begin(), two.begin()
+        instance.run(torques[:300])
+        stored_state = instance.state()
+        first = instance.run(torques[300:], 300)
+        instance.restore(stored_state)
+        assert (instance.run(torques[300:], 300) == first).all()
         # what the other one did changed nothing here
-        both = []
-        one.restore(kept)
+        pair = []
+        instance.restore(stored_state)
         for i, torque in enumerate(torques[300:], 300):
-            both.append(one.run([torque], i)[0])
+            pair.append(instance.run([torque], i)[0])
             two.run([-torque], i - 300)
-        assert (np.array(both) == first).all()
-        found = one.bytes_of(kept)
-        there = two.state_of(found)
+        assert (np.array(pair) == first).all()
+        bytes_of = instance.bytes_of(stored_state)
+        there = two.state_of(bytes_of)
         two.restore(there)
         assert (two.run(torques[300:], 300) == first).all()
-        for other in (found[:-1], found + b"x", b"x" + found[1:]):
+        for other in (bytes_of[:-1], bytes_of + b"x", b"x" + bytes_of[1:]):
             with pytest.raises(FMICallException):
                 two.state_of(other)
-        assert two.said[-1] == f"these {len(found)} bytes are no state of this model"
-        one.release(kept), two.release(there)
+        assert two.said[-1] == f"these {len(bytes_of)} bytes are no state of this model"
+        instance.release(stored_state), two.release(there)
 
 
 @COMPILED
@@ -333,18 +337,18 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
 def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
     path, _ = written(study(transmission=GAP, initial=MOVED), tmp_path, fmi)
     # of several instances of FMI 2, FMPy gives the log to the last one
-    with Instance(path) as two, Instance(path) as one:
-        one.begin(10.0), two.begin()
-        assert one.get("motor.position", "load.velocity", "z") == [0.3, 0.4, 0.3 - 5.0 * 0.02]
-        assert one.time() == 10.0
-        one.set(u=1.5), two.set(u=1.5)
+    with Instance(path) as two, Instance(path) as instance:
+        instance.begin(10.0), two.begin()
+        assert instance.get("motor.position", "load.velocity", "z") == [0.3, 0.4, 0.3 - 5.0 * 0.02]
+        assert instance.time() == 10.0
+        instance.set(u=1.5), two.set(u=1.5)
         # as sums of decimal numbers give it
-        one.step(10.0, 0.1 + 0.2 - 0.29)
+        instance.step(10.0, 0.1 + 0.2 - 0.29)
         for i in range(10):
             two.step(i * 1e-3, 1e-3)
-        assert one.outputs() == two.outputs()
-        assert one.time() == 10.01
-        before = one.outputs()
+        assert instance.outputs() == two.outputs()
+        assert instance.time() == 10.01
+        before = instance.outputs()
         for time, length, message in (
             (10.01, 1.5e-3, "the communication step size 0.0015 s should be a multiple of the sample period 0.001 s"),
             (10.01, 5e-4, "should be a multiple"),
@@ -354,10 +358,10 @@ def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
             (0.01, 1e-3, "but the instance is at 10.01 s"),
         ):
             with pytest.raises(FMICallException, match="status 3"):
-                one.step(time, length)
-            assert message in one.said[-1]
-        assert one.outputs() == before
-        one.step(10.01, 1e-3)
+                instance.step(time, length)
+            assert message in instance.said[-1]
+        assert instance.outputs() == before
+        instance.step(10.01, 1e-3)
 
 
 @COMPILED
@@ -365,20 +369,20 @@ def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
 def test_no_step_leads_past_the_stop_time(tmp_path, fmi):
     """FMI 2.0 and 3.0: "if the environment tries to compute past stopTime", an error."""
     path, _ = written(study(transmission=GAP), tmp_path, fmi)
-    with Instance(path) as one:
+    with Instance(path) as instance:
         # as a sum of decimal numbers gives it
-        one.begin(0.1, stop=0.1 + 0.2 - 0.29 + 0.1)
-        one.step(0.1, 9e-3)
+        instance.begin(0.1, stop=0.1 + 0.2 - 0.29 + 0.1)
+        instance.step(0.1, 9e-3)
         with pytest.raises(FMICallException, match="status 3"):
-            one.step(0.109, 2e-3)
-        assert one.said == ["a step to 0.111 s, past the stop time 0.11 s"]
-        one.step(0.109, 1e-3)
-        assert one.time() == pytest.approx(0.11)
+            instance.step(0.109, 2e-3)
+        assert instance.said == ["a step to 0.111 s, past the stop time 0.11 s"]
+        instance.step(0.109, 1e-3)
+        assert instance.time() == pytest.approx(0.11)
         with pytest.raises(FMICallException, match="status 3"):
-            one.step(0.11, 1e-3)
+            instance.step(0.11, 1e-3)
         # the next run has a stop time of its own, or none
-        one.unit.reset()
-        one.begin().run([1.0] * 200)
+        instance.unit.reset()
+        instance.begin().run([1.0] * 200)
 
 
 @COMPILED
@@ -386,34 +390,34 @@ def test_no_step_leads_past_the_stop_time(tmp_path, fmi):
 def test_tools_are_told_that_steps_do_not_vary(tmp_path, fmi):
     """FMPy ends before a stop time between samples, and does not stop at events of the input between them."""
     path, _ = written(study(transmission=GAP), tmp_path, fmi)
-    given = np.array([(0.0, 0.0), (0.0105, 0.0), (0.0105, 1.0), (0.1, 1.0)], [("time", float), ("u", float)])
-    found = fmpy.simulate_fmu(path, input=given, stop_time=0.0995, output_interval=1e-3)
-    assert found["time"][-1] == pytest.approx(0.099) and found["motor.velocity"][-1] > 0.0
+    inputs = np.array([(0.0, 0.0), (0.0105, 0.0), (0.0105, 1.0), (0.1, 1.0)], [("time", float), ("u", float)])
+    fmu = fmpy.simulate_fmu(path, input=inputs, stop_time=0.0995, output_interval=1e-3)
+    assert fmu["time"][-1] == pytest.approx(0.099) and fmu["motor.velocity"][-1] > 0.0
 
 
 @COMPILED
 @VERSIONS
 def test_what_a_phase_does_not_allow_is_refused(tmp_path, fmi):
     path, _ = written(study(transmission=GAP), tmp_path, fmi)
-    with Instance(path) as one:
+    with Instance(path) as instance:
         with pytest.raises(FMICallException):
-            one.unit.terminate()
-        assert one.said[-1] == "only what has been initialized can be terminated"
+            instance.unit.terminate()
+        assert instance.said[-1] == "only what has been initialized can be terminated"
         with pytest.raises(FMICallException):
-            one.unit.exitInitializationMode()
-        one.begin()
-        for again in (one.begin, one.unit.exitInitializationMode):
+            instance.unit.exitInitializationMode()
+        instance.begin()
+        for again in (instance.begin, instance.unit.exitInitializationMode):
             with pytest.raises(FMICallException):
                 again()
-        outputs = one.run([1.0] * 3)[-1]
-        one.unit.terminate()
+        outputs = instance.run([1.0] * 3)[-1]
+        instance.unit.terminate()
         with pytest.raises(FMICallException):
-            one.set(u=2.0)
-        assert one.said[-1] == "nothing can be set after termination"
-        for no_more in (one.unit.terminate, lambda: one.step(3e-3, 1e-3)):
+            instance.set(u=2.0)
+        assert instance.said[-1] == "nothing can be set after termination"
+        for no_more in (instance.unit.terminate, lambda: instance.step(3e-3, 1e-3)):
             with pytest.raises(FMICallException):
                 no_more()
-        assert one.outputs() == list(outputs)
+        assert instance.outputs() == list(outputs)
 
 
 @COMPILED
@@ -426,8 +430,8 @@ def test_missing_arguments_are_refused(tmp_path, fmi):
 
         def call(name, instance):
             # items of a library, unlike its attributes, are not those that FMPy calls
-            given = instance, None, ctypes.c_size_t(1), None, ctypes.c_size_t(1)
-            return one.unit.dll[f"fmi{fmi}{name}"](*given)
+            inputs = instance, None, ctypes.c_size_t(1), None, ctypes.c_size_t(1)
+            return one.unit.dll[f"fmi{fmi}{name}"](*inputs)
 
         for name in ("Reset", "Terminate", "ExitInitializationMode", f"Get{state}", f"Set{state}", *values):
             assert call(name, None) == 3
@@ -439,57 +443,59 @@ def test_missing_arguments_are_refused(tmp_path, fmi):
 @COMPILED
 def test_event_mode_is_refused(tmp_path):
     path, _ = written(study(), tmp_path)
-    with Instance(path) as one, pytest.raises(Exception, match="Failed to instantiate"):
-        one.unit.instantiate(eventModeUsed=True)
+    with Instance(path) as instance, pytest.raises(Exception, match="Failed to instantiate"):
+        instance.unit.instantiate(eventModeUsed=True)
 
 
 @COMPILED
 @VERSIONS
 def test_what_is_refused_has_a_line_in_the_log(tmp_path, fmi):
     path, _ = written(study(transmission=GAP), tmp_path, fmi)
-    with Instance(path) as one:
+    with Instance(path) as instance:
         with pytest.raises(FMICallException):
-            one.set(drive__motor_inertia=0.0)
-        assert one.said == ["drive.motor_inertia: 0 is out of range (min 0, exclusive, max inf)"]
+            instance.set(drive__motor_inertia=0.0)
+        assert instance.said == ["drive.motor_inertia: 0 is out of range (min 0, exclusive, max inf)"]
         with pytest.raises(FMICallException):
-            one.set(drive__motor_viscous=0.3, drive__load_viscous=-1.0)
-        assert one.get("drive.motor_viscous") == [0.15]
+            instance.set(drive__motor_viscous=0.3, drive__load_viscous=-1.0)
+        assert instance.get("drive.motor_viscous") == [0.15]
         with pytest.raises(FMICallException):
-            one.set(u=float("nan"))
+            instance.set(u=float("nan"))
         with pytest.raises(FMICallException):
-            one.step(0.0, 1e-3)
-        assert one.said[-1] == "a step needs an initialized instance"
-        one.begin()
-        for name in ("initial__motor_position", "motor__position", *(() if one.two else ("time",))):
+            instance.step(0.0, 1e-3)
+        assert instance.said[-1] == "a step needs an initialized instance"
+        instance.begin()
+        for name in ("initial__motor_position", "motor__position", *(() if instance.two else ("time",))):
             with pytest.raises(FMICallException):
-                one.set(**{name: 1.0})
-            assert one.said[-1].startswith(f"{name.replace('__', '.')} cannot be set")
-        one.set(transmission__stiffness=1e12)
+                instance.set(**{name: 1.0})
+            assert instance.said[-1].startswith(f"{name.replace('__', '.')} cannot be set")
+        instance.set(transmission__stiffness=1e12)
         with pytest.raises(FMICallException):
-            one.run([1.0] * 300)
-        assert "the motion diverged" in one.said[-1]
-        one.unit.reset()
-        assert np.isfinite(one.begin().run([1.0] * 10)).all()
+            instance.run([1.0] * 300)
+        assert "the motion diverged" in instance.said[-1]
+        instance.unit.reset()
+        assert np.isfinite(instance.begin().run([1.0] * 10)).all()
     with pytest.raises(Exception, match="Failed to instantiate"):
         Instance(path, token="another")
 
 
 def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
     only(monkeypatch)
-    made = jaxbl.export(study(), tmp_path, "fmu", name="axis")
-    assert made.lines == [
+    export = jaxbl.export(study(), tmp_path, "fmu", name="axis")
+    assert export.lines == [
         "axis.fmu: FMI 3.0, co-simulation, steps of 0.001 s, 12 parameters; the sources alone: no C compiler (cc) was found."
     ]
-    assert made.summary["binaries"] == []
+    assert export.summary["binaries"] == []
     names = zipfile.ZipFile(tmp_path / "axis.fmu").namelist()
     assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi-3.c"} <= {*names}
-    assert not [one for one in names if one.startswith("binaries")]
+    assert not [name for name in names if name.startswith("binaries")]
     assert validate_fmu(str(tmp_path / "axis.fmu")) == []
 
 
 def only(monkeypatch, *programs):
     """No other programs are found."""
-    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", {one: shutil.which(one) or one for one in programs}.get)
+    monkeypatch.setattr(
+        "jaxbl.exports.fmu.shutil.which", {program: shutil.which(program) or program for program in programs}.get
+    )
 
 
 @pytest.mark.parametrize(
@@ -511,10 +517,10 @@ def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, mac
 @pytest.mark.usefixtures("windows_too")
 def test_with_a_compiler_for_windows_alone_it_says_which_binary_is_missing(tmp_path, monkeypatch):
     only(monkeypatch, "x86_64-w64-mingw32-gcc")
-    made = jaxbl.export(study(), tmp_path, "fmu")
-    assert made.lines[0].endswith("; a binary for x86_64-windows, and the sources.")
-    assert made.lines[1:] == ["One more binary is missing: no C compiler (cc) was found."]
-    assert made.summary["binaries"] == ["x86_64-windows"]
+    export = jaxbl.export(study(), tmp_path, "fmu")
+    assert export.lines[0].endswith("; a binary for x86_64-windows, and the sources.")
+    assert export.lines[1:] == ["One more binary is missing: no C compiler (cc) was found."]
+    assert export.summary["binaries"] == ["x86_64-windows"]
 
 
 def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
@@ -522,8 +528,8 @@ def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     broken.write_text("#!/bin/sh\necho 'no headers' >&2\nexit 1\n")
     broken.chmod(0o755)
     monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", {"cc": str(broken)}.get)
-    made = jaxbl.export(study(), tmp_path / "new", "fmu")
-    assert f"the sources alone: {broken} failed: no headers." in made.lines[0]
+    export = jaxbl.export(study(), tmp_path / "new", "fmu")
+    assert f"the sources alone: {broken} failed: no headers." in export.lines[0]
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
@@ -536,9 +542,9 @@ def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, comp
     for file in sources.glob("*.c"):
         ran(compiler, *STRICT, "-O2", "-c", file, "-o", file.with_suffix(".o"))
     # kinds of symbols: of data that can be written there is none
-    found = [line[17:18] for line in ran("nm", *sources.glob("*.o")).stdout.splitlines()]
-    assert {"T", "r"} <= {*found}
-    assert not {*found} & {*"dDbBC"}
+    result = [line[17:18] for line in ran("nm", *sources.glob("*.o")).stdout.splitlines()]
+    assert {"T", "r"} <= {*result}
+    assert not {*result} & {*"dDbBC"}
 
 
 ODD_CALLS = """
@@ -655,14 +661,14 @@ def test_the_same_study_with_other_code_has_another_token(tmp_path, monkeypatch)
 
 def test_a_motor_fed_by_voltage_has_an_input_in_volts(tmp_path):
     path, _ = written(study("actuator."), tmp_path)
-    units = {one.name: one.unit for one in fmpy.read_model_description(path).modelVariables}
+    units = {model_variable.name: model_variable.unit for model_variable in fmpy.read_model_description(path).modelVariables}
     assert (units["u"], units["torque"]) == ("V", "N.m")
 
 
 def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):
     waves = [{"kind": "motor.cogging", "amplitude": 0.1, "harmonic": n} for n in (6.0, 12.0)]
     path, summary = written(study() | {"effects": waves}, tmp_path)
-    names = [one["name"] for one in summary["variables"] if one["name"].startswith("effects")]
+    names = [variable["name"] for variable in summary["variables"] if variable["name"].startswith("effects")]
     assert names[::3] == ["effects[0].amplitude", "effects[1].amplitude"]
     assert validate_fmu(path) == []
 
@@ -674,8 +680,8 @@ def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):
 def test_any_name_that_is_allowed_compiles(tmp_path, name):
     path, summary = written(study(transmission=GAP), tmp_path, name=name)
     assert summary["binaries"]
-    with Instance(path) as one:
-        assert np.isfinite(one.begin().run([1.0] * 3)).all()
+    with Instance(path) as instance:
+        assert np.isfinite(instance.begin().run([1.0] * 3)).all()
 
 
 @pytest.mark.parametrize(

@@ -50,11 +50,11 @@ def study(*effects, **tables):
 
 def compiled(config, linear=()):
     """The model at the study's initial state, and what it has of the study."""
-    text, _, said = write_mjcf(config, linear=linear)
+    text, _, output = write_mjcf(config, linear=linear)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    return model, data, said
+    return model, data, output
 
 
 def numbered(found):
@@ -69,8 +69,8 @@ def test_accelerations_are_those_of_the_plant(case):
     if effect["kind"] == "actuator.delay":
         effect = effect | {"delay": 0.004}
     config = study(effect, transmission=law)
-    model, data, said = compiled(config, linear)
-    (how, text) = said[f"effects.{effect['kind']}"]
+    model, data, output = compiled(config, linear)
+    (how, text) = output[f"effects.{effect['kind']}"]
     assert text
     plant = as_arrays(config.build().plant, jnp.float64)
     off = []
@@ -96,18 +96,18 @@ def test_accelerations_are_those_of_the_plant(case):
         if model.actuator_delay[0]:
             mujoco.mj_initCtrlHistory(model, data, 0, None, np.full(model.actuator_history[0][0], u))
         mujoco.mj_forward(model, data)
-        found = [data.joint(side).qacc[0] for side in ("motor", "load")]
-        off.append(np.abs((np.array(found) - expected) / (1.0 + np.abs(expected))))
+        accelerations = [data.joint(side).qacc[0] for side in ("motor", "load")]
+        off.append(np.abs((np.array(accelerations) - expected) / (1.0 + np.abs(expected))))
     if how != "not said":
         # weak constraints take 1e-4 of what acts beside them
-        assert np.max(off) < (1e-9 if how == said["transmission"].fidelity == "exactly" else 2e-3)
+        assert np.max(off) < (1e-9 if how == output["transmission"].fidelity == "exactly" else 2e-3)
 
 
 @pytest.mark.parametrize("kind", bench.KINDS)
 def test_free_runs_over_ten_seconds(kind):
     # one drive reaches what the exporter has of its kind; benchmarks/mjcf.py has fifty
-    (found,), _ = bench.free_runs(kind, 1)
-    assert found < (0.03 if kind == bench.COARSE else 0.01)
+    (result,), _ = bench.free_runs(kind, 1)
+    assert result < (0.03 if kind == bench.COARSE else 0.01)
 
 
 def test_smooth_gap_by_chords_is_as_near_as_said():
@@ -115,11 +115,11 @@ def test_smooth_gap_by_chords_is_as_near_as_said():
     parts = MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4)
     _, text = to_mujoco(law, parts)
     z = np.linspace(-1.0, 1.0, 4001)
-    springs = sum(one.linear * (z - np.clip(z, one.low, one.high)) for one in parts.springs)
+    springs = sum(spring.linear * (z - np.clip(z, spring.low, spring.high)) for spring in parts.springs)
     off = np.max(np.abs(springs - law.torque(jnp.asarray(z))))
-    said = float(text.split(" N m off")[0].split()[-1])
-    assert 0.5 * said < off < 1.05 * said
-    assert said < 1e-3 * 4.0 * 0.03 * 2.0
+    part = float(text.split(" N m off")[0].split()[-1])
+    assert 0.5 * part < off < 1.05 * part
+    assert part < 1e-3 * 4.0 * 0.03 * 2.0
 
 
 def test_every_part_is_listed_with_its_path(tmp_path):
@@ -131,16 +131,16 @@ def test_every_part_is_listed_with_its_path(tmp_path):
     ]
     config = study(*effects, title="rough -- new")
     out = jaxbl.export(config, tmp_path / "out", "mjcf")
-    about = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert out.summary.items() <= about.items()
-    written, step, said = write_mjcf(config)
-    groups = {how: set(about[how]) for how in ("exactly", "approximated", "not said")}
+    content = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert out.summary.items() <= content.items()
+    written, step, output = write_mjcf(config)
+    groups = {how: set(content[how]) for how in ("exactly", "approximated", "not said")}
     assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
     assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
     gone = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
     assert groups["not said"] == gone
-    assert set(said) == set().union(*groups.values())
-    assert about["time_step"] == step
+    assert set(output) == set().union(*groups.values())
+    assert content["time_step"] == step
     text = (out.folder / "model.xml").read_text(encoding="utf-8")
     assert text == written
     assert "drive.motor_inertia = 0.05 kg m²" in text

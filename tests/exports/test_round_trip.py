@@ -50,18 +50,18 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     command("export", tuned, "--target", "c", "--precision", "double", "--name", "axis", "--out", code, "--quiet")
     ran("gcc", *STRICT, *UNCONTRACTED, "-O2", "axis.c", "axis_filter.c", "-lm", "-o", "axis_filter", cwd=code)
     ran("./axis_filter", log, "found.csv", cwd=code)
-    found = pd.read_csv(code / "found.csv")
+    frame = pd.read_csv(code / "found.csv")
 
     with jax.enable_x64(True):
         record = read_logs(config, log)
         experiment = on_record(config, record)
         columns, identified = observer_chain(experiment, segments_of(record, experiment.sides, False), len(record.time))
-    assert len(found) == len(record.time)
+    assert len(frame) == len(record.time)
     for side in ("motor", "load"):
         torque = columns[f"{side}.torque_estimate"]
         rms = float(np.sqrt(np.mean(torque**2)))
         assert rms > 0.1
-        np.testing.assert_allclose(found[f"{side}_torque_estimate"], torque, rtol=0.0, atol=1e-9 * rms)
-        assert found[f"{side}_identified"].iloc[-1] == 1
+        np.testing.assert_allclose(frame[f"{side}_torque_estimate"], torque, rtol=0.0, atol=1e-9 * rms)
+        assert frame[f"{side}_identified"].iloc[-1] == 1
         for name in ("stiffness", "half_gap"):
-            assert found[f"{side}_{name}"].iloc[-1] == pytest.approx(identified[name][side], rel=1e-7)
+            assert frame[f"{side}_{name}"].iloc[-1] == pytest.approx(identified[name][side], rel=1e-7)

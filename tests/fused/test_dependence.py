@@ -15,8 +15,8 @@ def begin(values):
 def step(values, carry, given):
     # `led` becomes a lane's only by way of `own`
     shared = carry["shared"] + jnp.tanh(given) * carry["kept"]
-    own = jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + shared * values[1], carry["own"])
-    return {"shared": shared, "own": own, "kept": carry["kept"], "led": carry["led"] + carry["own"]}
+    own_state = jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + shared * values[1], carry["own"])
+    return {"shared": shared, "own": own_state, "kept": carry["kept"], "led": carry["led"] + carry["own"]}
 
 
 @pytest.fixture
@@ -37,14 +37,14 @@ def test_parts_make_the_whole(parts):
     values = [jnp.asarray(0.3), jnp.asarray(-1.2)]
     carry = begin(values)
     leaves, tree = jax.tree.flatten(carry)
-    own = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind == Dependence.LANE]
+    lane_leaves = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind == Dependence.LANE]
     state = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind != Dependence.LANE]
-    for given in jnp.linspace(0.1, 2.0, 5):
-        carry = step(values, carry, given)
-        state, handed = shared(state, given)
-        own = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *own, *handed)
-    found = iter(own), iter(state)
-    together = tree.unflatten([next(found[0] if kind == Dependence.LANE else found[1]) for kind in kinds])
+    for inputs in jnp.linspace(0.1, 2.0, 5):
+        carry = step(values, carry, inputs)
+        state, handed = shared(state, inputs)
+        lane_leaves = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *lane_leaves, *handed)
+    result = iter(lane_leaves), iter(state)
+    together = tree.unflatten([next(result[0] if kind == Dependence.LANE else result[1]) for kind in kinds])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
 
 
@@ -56,23 +56,23 @@ def test_the_lanes_part_leaves_the_shared_work_to_the_other(parts):
 def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
     table = jnp.linspace(-1.0, 1.0, 7)
 
-    def sample(state, given):
-        index, noise = given
+    def sample(state, inputs):
+        index, noise = inputs
         driving = jnp.sin(0.3 * index) + table[index % 7]
         speed = state[0] + 0.1 * (driving - jnp.tanh(state[1]) + noise)
         return [speed, state[1] + 0.1 * speed], [driving, state[1], index > 3, speed > 0.0]
 
     state = [jnp.asarray(0.2), jnp.asarray(-0.1)]
-    given = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
-    parts = split_by_state(sample, state, jax.tree.map(lambda x: x[0], given))
+    inputs = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
+    parts = split_by_state(sample, state, jax.tree.map(lambda x: x[0], inputs))
     assert parts.is_stateless == [True, False, True, False]
     # neither the table nor a sine is left to the loop
     assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}
-    direct, read = jax.vmap(parts.compute_stateless)(given)
-    last, handed = jax.lax.scan(sample, state, given)
+    direct, read = jax.vmap(parts.compute_stateless)(inputs)
+    last, handed = jax.lax.scan(sample, state, inputs)
     for i in range(9):
         new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(one[i] for one in read))
         state, ways = new[:2], {True: iter(one[i] for one in direct), False: iter(new[2:])}
-        for alone, whole in zip(parts.is_stateless, handed, strict=True):
-            np.testing.assert_allclose(next(ways[alone]), whole[i], rtol=1e-6)
+        for alone, full in zip(parts.is_stateless, handed, strict=True):
+            np.testing.assert_allclose(next(ways[alone]), full[i], rtol=1e-6)
     np.testing.assert_allclose(state, last, rtol=1e-6)

@@ -68,36 +68,36 @@ def looped():
 
 
 def test_a_sweep_is_scanned(swept, unknown, caplog):
-    said = unknown()
+    output = unknown()
     result = jaxbl.sweep(SWEPT)
-    (why,) = result.fallback_reasons
+    (reason,) = result.fallback_reasons
     np.testing.assert_array_equal(result.frame[NAME], swept[NAME])
-    assert re.fullmatch(said, why)
+    assert re.fullmatch(output, reason)
     with pytest.raises(
-        jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {said}; use --backend scan"
+        jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {output}; use --backend scan"
     ):
         jaxbl.sweep(SWEPT, backend="fused")
     assert not caplog.messages
 
 
 def test_a_run_is_scanned(looped, unknown, caplog):
-    said = unknown()
-    found = [jaxbl.run(STUDY, every=7) for _ in range(2)]
-    for one in found:
+    output = unknown()
+    trials = [jaxbl.run(STUDY, every=7) for _ in range(2)]
+    for one in trials:
         assert one.summary["metrics"][NAME] == pytest.approx(looped.summary["metrics"][NAME], rel=1e-6)
         np.testing.assert_allclose(one.trace["theta_e"], looped.trace["theta_e"], rtol=1e-6, atol=1e-9)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCAN_MESSAGE % said, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % output, line)
 
 
 def test_a_plant_is_scanned(unknown, caplog):
     with jax.enable_x64(True):
-        one = prepare(jaxbl.read_config(STUDY))
-        start, torque = one.plant.init(one.initial), np.ones(50)
-        expected, said = single_plant.simulate_plant(one, start, torque), unknown()
+        experiment = prepare(jaxbl.read_config(STUDY))
+        start, torque = experiment.plant.init(experiment.initial), np.ones(50)
+        expected, output = single_plant.simulate_plant(experiment, start, torque), unknown()
         single_plant._trajectory_loop.cache_clear()
-        found = [single_plant.simulate_plant(one, start, torque) for _ in range(2)]
-    for path in found:
+        plants = [single_plant.simulate_plant(experiment, start, torque) for _ in range(2)]
+    for path in plants:
         np.testing.assert_allclose(path.position["motor"], expected.position["motor"], rtol=1e-9, atol=1e-12)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCAN_MESSAGE % said, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % output, line)

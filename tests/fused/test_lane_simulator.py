@@ -75,9 +75,13 @@ class Parts(LaneSimulator):
 def parts(half, precision):
     """Parts of a short run with half of the effects, and with all metrics or one."""
     names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
-    whole = experiment(names, law, steps=200, precision=precision)
+    full_experiment = experiment(names, law, steps=200, precision=precision)
     return Parts(
-        whole, (metrics_reducer(asked),), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES
+        full_experiment,
+        (metrics_reducer(asked),),
+        tuple(path for path in leaf_paths(full_experiment) if path.startswith("effects.")),
+        5,
+        LANES,
     )
 
 
@@ -93,14 +97,14 @@ def parts(half, precision):
 def test_figures_are_those_of_the_scan(names, law, options):
     """By threads that get different numbers of lanes, and in the kernel of accelerators, interpreted: two programs of the
     grid, the last lanes filled up, blocks of samples with a rest."""
-    whole = experiment(names, law, **options)
-    effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
-    values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
+    full_experiment = experiment(names, law, **options)
+    effects = [path for path in leaf_paths(full_experiment) if path.startswith("effects.")]
+    values = spread(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
     fused, expected = (
-        HostSimulator(whole, (ALL_METRICS,), tuple(values), 150, 2)(values, 3),
-        scanned(whole, values, ALL_METRICS, 3),
+        HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3),
+        scanned(full_experiment, values, ALL_METRICS, 3),
     )
-    device = DeviceSimulator(whole, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
+    device = DeviceSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
@@ -109,26 +113,26 @@ def test_figures_are_those_of_the_scan(names, law, options):
 
 
 def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
-    whole = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
-    values = spread(whole, [path for path in leaf_paths(whole) if path.startswith("effects.")], 37)
+    full_experiment = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
+    values = spread(full_experiment, [path for path in leaf_paths(full_experiment) if path.startswith("effects.")], 37)
     asked = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
-    every, some = (HostSimulator(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
-    assert len(some) < len(every)
-    for name, figure in some.items():
-        np.testing.assert_array_equal(figure, every[name], err_msg=name)
+    stride, selection = (HostSimulator(full_experiment, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
+    assert len(selection) < len(stride)
+    for name, figure in selection.items():
+        np.testing.assert_array_equal(figure, stride[name], err_msg=name)
 
 
 def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
-    whole = experiment([], DeadZone(60.0, 0.05))
-    values = spread(whole, ["observer.motor.alpha", "observer.motor.lambda"], 7)
-    simulator = HostSimulator(whole, (ALL_METRICS,), tuple(values), 7, 1)
-    varied = Parts(whole, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
+    full_experiment = experiment([], DeadZone(60.0, 0.05))
+    values = spread(full_experiment, ["observer.motor.alpha", "observer.motor.lambda"], 7)
+    simulator = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 7, 1)
+    varied = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
     assert simulator.carry_count < varied.carry_count
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(simulator._run_shared_part, SharedPartLoop)
     assert simulator._run_shared_part._loop is not None
-    expected = scanned(whole, values, ALL_METRICS, 3)
+    expected = scanned(full_experiment, values, ALL_METRICS, 3)
     for name, figure in simulator(values, 3).items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-9, err_msg=name)
 
@@ -138,9 +142,9 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     work = Workload(40, 1500, precision)
     values = work.values()
     with jax.enable_x64(precision == "float64"):
-        whole = work.experiment()
-        fused = HostSimulator(whole, (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)(values, SEED)
-        expected = scanned(whole, values, CHAIN_METRICS, SEED)
+        full_experiment = work.experiment()
+        fused = HostSimulator(full_experiment, (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)(values, SEED)
+        expected = scanned(full_experiment, values, CHAIN_METRICS, SEED)
     for name, figure in fused.items():
         assert figure.dtype == precision
         if precision == "float64":
@@ -154,10 +158,10 @@ def test_the_benchmarks_work_in_both_precisions(precision):
 def test_the_kernel_of_accelerators_in_single_precision():
     work = Workload(150, 263, "float32")
     with jax.enable_x64(False):
-        whole = work.experiment()
+        full_experiment = work.experiment()
         simulators = [
-            HostSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, 1),
-            DeviceSimulator(whole, (ALL_METRICS,), tuple(RANGES), work.lanes, interpret=True),
+            HostSimulator(full_experiment, (ALL_METRICS,), tuple(RANGES), work.lanes, 1),
+            DeviceSimulator(full_experiment, (ALL_METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (simulator(work.values(), SEED) for simulator in simulators)
     for name, figure in device.items():
@@ -172,8 +176,8 @@ def test_the_kernel_of_accelerators_in_single_precision():
 def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
     with jax.enable_x64(precision == "float64"):
-        made = parts(half, precision)
-        kernel = Kernel(made._step, made._hooks, len(made._paths), 2 * LANES, 200, 64)
+        result = parts(half, precision)
+        kernel = Kernel(result._step, result._hooks, len(result._paths), 2 * LANES, 200, 64)
         # from JAX 0.11 on it has to be told which GPU
         device = AbstractDevice("NVIDIA H100", None, "gpu")
         with use_abstract_mesh(AbstractMesh((), (), abstract_device=device)):
@@ -191,19 +195,19 @@ def test_a_processor_has_no_kernel_of_accelerators():
 
 @pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
 def test_what_is_joined_for_a_gpu_computes_the_same(half):
-    made, joined = parts(half, "float64"), []
+    result, joined = parts(half, "float64"), []
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
         joined.append(a)
         return (-a if minus_product else a) * b + (-c if minus_rest else c)
 
     random = np.random.default_rng(1)
-    for part in (made._step, *made._hooks):
-        given = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
+    for part in (result._step, *result._hooks):
+        dtypes = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
         other = join_multiply_add(replace_primitives(part, {}), multiply_add)
-        pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*given)
-        for one, expected in zip(*pairs, strict=True):
-            np.testing.assert_allclose(one, expected, rtol=1e-12)
+        pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*dtypes)
+        for pair, expected in zip(*pairs, strict=True):
+            np.testing.assert_allclose(pair, expected, rtol=1e-12)
     assert len(joined) > 50
 
 
@@ -243,12 +247,12 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
     stiffness = np.concatenate([np.full(100, 60.0), np.geomspace(1e5, 1e7, 200)])
     orders = np.arange(lanes), np.random.default_rng(0).permutation(lanes)
     with jax.enable_x64(precision == "float64"):
-        whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness}
         staying = ALL_METRICS._replace(done=None)
-        expected = HostSimulator(whole, (staying,), tuple(values), lanes, 1)(values, 3)
+        expected = HostSimulator(full_experiment, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        simulator = HostSimulator(whole, (ALL_METRICS,), tuple(values), lanes, threads)
+        simulator = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), lanes, threads)
         assert len(simulator._pools) == threads
         loop = simulator._loop
 
@@ -260,13 +264,13 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         monkeypatch.setattr(simulator, "_loop", counted)
         for order in orders:
             samples.clear()
-            found = simulator({"transmission.stiffness": stiffness[order]}, 3)
-            assert set(found) == set(expected)
-            for name, figure in found.items():
+            actual = simulator({"transmission.stiffness": stiffness[order]}, 3)
+            assert set(actual) == set(expected)
+            for name, figure in actual.items():
                 assert figure.dtype == expected[name].dtype
                 np.testing.assert_array_equal(figure, expected[name][order], err_msg=name)
             # some two thirds of the lanes leave; the last of a thread's vectors need not be full
-            assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * whole.run.steps
+            assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * full_experiment.run.steps
 
 
 @pytest.mark.parametrize(("precision", "threads"), [("float32", 1), ("float64", 2)])
@@ -280,21 +284,22 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     stiffness = np.concatenate([np.full(64, 60.0), *late, np.full(64, 1e6)])
     tolerance = np.where(np.arange(lanes) % 4 == 0, 1e3, 1e-12)
     with jax.enable_x64(precision == "float64"):
-        whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness, "run.velocity_tolerance": tolerance}
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
         asked = metrics_reducer(("converged", "convergence_time"))
-        every, staying = (
-            HostSimulator(whole, (one,), tuple(values), lanes, 1) for one in (ALL_METRICS, asked._replace(done=None))
+        stride, staying = (
+            HostSimulator(full_experiment, (one,), tuple(values), lanes, 1)
+            for one in (ALL_METRICS, asked._replace(done=None))
         )
-        assert staying.carry_count < every.carry_count
-        expected, stayed = every(values, 3), staying(values, 3)
+        assert staying.carry_count < stride.carry_count
+        expected, stayed = stride(values, 3), staying(values, 3)
         assert 0 < np.count_nonzero(expected["motor.converged"]) < lanes
         assert set(stayed) < set(expected)
         # a side is not followed once its answer is known: what overflows later is not seen
         assert (stayed["finite"] >= expected["finite"]).all()
         assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        simulator = HostSimulator(whole, (asked,), tuple(values), lanes, threads)
+        simulator = HostSimulator(full_experiment, (asked,), tuple(values), lanes, threads)
         loop = simulator._loop
 
         def counted(arrays, upto, first, last, loop=loop, **options):
@@ -305,11 +310,11 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         counted.signature, counted.lanes = loop.signature, loop.lanes
         monkeypatch.setattr(simulator, "_loop", counted)
         samples.clear()
-        found = simulator(values, 3)
+        actual = simulator(values, 3)
         # in the last block, those are left that keep the tolerance
         assert samples[-1] < lanes // 4
-        assert set(found) == set(stayed)
-        for name, figure in found.items():
+        assert set(actual) == set(stayed)
+        for name, figure in actual.items():
             np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
             if name != "finite":
                 np.testing.assert_array_equal(figure, expected[name], err_msg=name)
@@ -317,12 +322,12 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
 
 def test_all_lanes_may_leave(monkeypatch):
     monkeypatch.setattr(module, "_CALL_WORK", 1)
-    whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
-    simulator = HostSimulator(whole, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
-    found = simulator({"transmission.stiffness": np.full(5, 1e8)}, 3)
-    assert not found["finite"].any()
-    assert not found["load.converged"].any()
-    assert np.isnan(found["load.velocity_rmse"]).all()
+    full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
+    simulator = HostSimulator(full_experiment, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
+    result = simulator({"transmission.stiffness": np.full(5, 1e8)}, 3)
+    assert not result["finite"].any()
+    assert not result["load.converged"].any()
+    assert np.isnan(result["load.velocity_rmse"]).all()
 
 
 def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
@@ -331,7 +336,7 @@ def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
     drawn = []
     ahead = simulator._run_shared_part
     monkeypatch.setattr(
-        simulator, "_run_shared_part", lambda state, seed, *rest: drawn.append(seed) or ahead(state, seed, *rest)
+        simulator, "_run_shared_part", lambda state, seed, *remainder: drawn.append(seed) or ahead(state, seed, *remainder)
     )
     first = simulator(work.values(), 1)
     for seed in (1, 2, 1):
@@ -352,18 +357,18 @@ def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
 
 
 def test_an_unknown_operation_is_refused_by_name():
-    whole = experiment([], DeadZone(60.0, 0.05), steps=100)
+    full_experiment = experiment([], DeadZone(60.0, 0.05), steps=100)
     odd = Reducer(
         lambda e: jnp.zeros_like(e.run.sample_period),
         lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),
         lambda e, total, state: {"odd": total},
     )
     with pytest.raises(Unsupported, match="erf"):
-        HostSimulator(whole, (odd,), ("transmission.half_gap",), 9, 1)
+        HostSimulator(full_experiment, (odd,), ("transmission.half_gap",), 9, 1)
     truth = Reducer(
         lambda e: jnp.asarray(False),
         lambda e, total, index, signals: total | (signals.motor.measured > 1.0),
         lambda e, total, state: {"truth": total},
     )
     with pytest.raises(Unsupported, match="carry other numbers"):
-        HostSimulator(whole, (truth,), ("transmission.half_gap",), 9, 1)
+        HostSimulator(full_experiment, (truth,), ("transmission.half_gap",), 9, 1)

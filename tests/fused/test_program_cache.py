@@ -38,19 +38,19 @@ print(len(traced), repr(float(np.sum(needed))), repr(float(np.sum(states.positio
 
 def test_another_process_does_not_trace(tmp_path, monkeypatch):
     monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
-    said = []
+    output = []
     for _ in range(2):
         done = run_python("-c", SCRIPT, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        said.append(done.stdout.split())
-    assert said[0][0] == "1" and said[1][0] == "0"
-    assert said[0][1:] == said[1][1:]
+        output.append(done.stdout.split())
+    assert output[0][0] == "1" and output[1][0] == "0"
+    assert output[0][1:] == output[1][1:]
 
 
 def test_names_tell_structures_apart(tmp_path, monkeypatch):
     monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     drag, lag = make_effect("motor.quadratic_drag", drag=1.0), make_effect("actuator.lag", time_constant=1.0)
-    given = [
+    inputs = [
         drag,
         lag,
         make_effect("load.quadratic_drag", drag=1.0),
@@ -60,7 +60,7 @@ def test_names_tell_structures_apart(tmp_path, monkeypatch):
         1,
         1.0,
     ]
-    keys = [program_cache.program_key("program", one) for one in given]
+    keys = [program_cache.program_key("program", one) for one in inputs]
     assert None not in keys and len(set(keys)) == len(keys)
     # of arrays what they are, not what they hold
     assert program_cache.program_key("program", jnp.ones(3)) == program_cache.program_key("program", jnp.zeros(3))

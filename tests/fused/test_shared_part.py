@@ -15,7 +15,7 @@ from jaxbl.sweeps.metrics import ALL_METRICS
 
 
 def experiment(excitation, dtype):
-    whole = Experiment(
+    full_experiment = Experiment(
         drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
         transmission=LinearShaft(60.0),
         effects=(),
@@ -27,7 +27,7 @@ def experiment(excitation, dtype):
         identifier=None,
         run=Run(1e-3, 600, 2),
     )
-    return as_arrays(whole, dtype)
+    return as_arrays(full_experiment, dtype)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -40,34 +40,34 @@ def experiment(excitation, dtype):
     ids=["shared plant", "plants of their own"],
 )
 def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, path, states):
-    made = []
+    result = []
 
     class Noted(SharedPartLoop):
         def __init__(self, shared):
             super().__init__(shared)
-            made.append((self, SharedPartScan(shared), shared))
+            result.append((self, SharedPartScan(shared), shared))
 
     monkeypatch.setattr(module, "SharedPartLoop", Noted)
     with jax.enable_x64(precision == "float64"):
         length = HostSimulator(experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._block_length
-        ((looped, scanned, shared),) = made
+        ((looped, scanned, shared),) = result
         assert (looped._loop is not None) >= states
         # the plant's four states are not carried by each lane
         assert (len(shared.state) >= 4) == states
         ours = theirs = [np.zeros((), leaf.dtype) for leaf in shared.state]
         for first in range(0, 600, length):
             ours, last, handed = looped(ours, 3, first, length)
-            theirs, *others = scanned(theirs, 3, first, length)
-            for found, expected in zip((ours, last, handed), (theirs, *others), strict=True):
-                for one, other in zip(found, expected, strict=True):
+            theirs, *further = scanned(theirs, 3, first, length)
+            for actual, expected in zip((ours, last, handed), (theirs, *further), strict=True):
+                for one, other in zip(actual, expected, strict=True):
                     assert np.asarray(one).dtype == other.dtype
                     # rounding, which a stiff shaft amplifies
                     tolerance = 1e-9 if precision == "float64" else 1e-2
                     size = np.max(np.abs(np.asarray(other, float))) + 1e-30
                     np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * size)
         # both blocks in one stretch: the loop settles its state between them
-        whole, twice, _ = looped([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
-        np.testing.assert_array_equal(whole, ours)
+        full, twice, _ = looped([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
+        np.testing.assert_array_equal(full, ours)
         assert [one[-1] for one in twice] == [one[0] for one in last]
         assert len(handed) > 0
         assert any(np.ptp(np.asarray(one, float)) > 0.0 for one in handed)

@@ -24,10 +24,10 @@ def experiment(names, rigid=False, substeps=1, extra=()):
     drive = Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
     effects = (*(make_effect(name, **VALUES[name]) for name in names), *extra)
     law = LinearShaft(60.0) if "transmission.backlash" in names else SigmoidBacklash(1.0, 0.02, 20.0)
-    found = Experiment(
+    result = Experiment(
         drive, None if rigid else law, effects, Initial(), Sine(1.0, 1.0), None, None, None, None, Run(1e-3, STEPS, substeps)
     )
-    return as_arrays(found, np.float64)
+    return as_arrays(result, np.float64)
 
 
 MODELS = {
@@ -60,9 +60,9 @@ def test_the_path_is_that_of_the_scan(name, observed):
         more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
     expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
     assert module._trajectory_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
-    found = simulate_plant(one, start, torque, 0.7, **more)
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for have, want in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    plant = simulate_plant(one, start, torque, 0.7, **more)
+    assert jax.tree.structure(plant) == jax.tree.structure(expected)
+    for have, want in zip(jax.tree.leaves(plant), jax.tree.leaves(expected), strict=True):
         assert have.shape == (STEPS,)
         assert np.ptp(want) > 0.0
         assert have == pytest.approx(np.asarray(want), rel=1e-9, abs=1e-10)
@@ -70,10 +70,10 @@ def test_the_path_is_that_of_the_scan(name, observed):
 
 def directions(one, start):
     """Each state, the input, each number of the plant."""
-    found = [Direction(state=row) for row in np.eye(len(jax.tree.leaves(start))).tolist()]
-    found.append(Direction(torque=1.0))
+    result = [Direction(state=row) for row in np.eye(len(jax.tree.leaves(start))).tolist()]
+    result.append(Direction(torque=1.0))
     numbers = [path for path in leaf_paths(one) if path.split(".")[0] in ("drive", "transmission", "effects")]
-    return found + [Direction({path: 1.0}) for path in numbers]
+    return result + [Direction({path: 1.0}) for path in numbers]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -96,20 +96,20 @@ def test_slopes_are_those_of_differences(name):
     @jax.jit
     @jax.vmap
     def moved(way, by):
-        own, *given = jax.tree.map(lambda x, c: x + by * c, (one, states, torque), way)
-        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(own.plant, own.run, *x))(*given, time)))
+        own, *arguments = jax.tree.map(lambda x, c: x + by * c, (one, states, torque), way)
+        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(own.plant, own.run, *x))(*arguments, time)))
 
-    numbers, every = jax.tree.leaves((one, states, torque)), [whole(way) for way in ways]
+    numbers, tree = jax.tree.leaves((one, states, torque)), [whole(way) for way in ways]
     # of the number's own size
-    sizes = [np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3 for way in every]
-    by, every = 3e-5 * np.array(sizes), jax.tree.map(lambda *x: np.array(x, float), *every)
-    expected = (moved(every, by) - moved(every, -by)) / (2.0 * by[:, None, None])
+    sizes = [np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3 for way in tree]
+    by, tree = 3e-5 * np.array(sizes), jax.tree.map(lambda *x: np.array(x, float), *tree)
+    expected = (moved(tree, by) - moved(tree, -by)) / (2.0 * by[:, None, None])
     error = np.abs(changes - expected) / (np.max(np.abs(expected), axis=(1, 2), keepdims=True) + 1e-9)
     assert (np.median(error, axis=(1, 2)) < 1e-6).all()
     assert (np.mean(error > 1e-3, axis=(1, 2)) < 0.02).all()
     # the saturation is not reached everywhere
     assert np.count_nonzero(np.any(expected, axis=(1, 2))) >= len(ways) - 1
-    assert new == pytest.approx(np.asarray(moved(every, 0.0 * by)[0]), rel=1e-10, abs=1e-12)
+    assert new == pytest.approx(np.asarray(moved(tree, 0.0 * by)[0]), rel=1e-10, abs=1e-12)
 
 
 class _Tabled(SideEffect):
@@ -127,15 +127,15 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     assert module._trajectory_loop(plant, ()) is None
     assert module._derivatives_loop(plant) is None
     expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque))
-    found = simulate_plant(one, start, torque)
+    actual = simulate_plant(one, start, torque)
     for side in one.sides:
-        assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
-    changes, new = step_derivatives(one, found, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
+        assert actual.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
+    changes, new = step_derivatives(one, actual, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
     assert changes.shape == (1, 4, STEPS)
     inertia = float(one.drive.motor_inertia)
     motor = sorted(one.sides).index("motor") + 2
     assert changes[0, motor] == pytest.approx(1e-3 / inertia, rel=0.05)
-    assert new[motor, :-1] == pytest.approx(found.velocity["motor"][1:], rel=1e-10)
+    assert new[motor, :-1] == pytest.approx(actual.velocity["motor"][1:], rel=1e-10)
 
 
 def test_tables_that_no_step_reads_are_no_obstacle():
@@ -146,14 +146,14 @@ def test_tables_that_no_step_reads_are_no_obstacle():
     other = eqx.tree_at(lambda e: e.excitation, one, recorded)
     assert module._trajectory_loop(module._PlantStructure.of(other, start), ()) is not None
     assert module._derivatives_loop(module._PlantStructure.of(other, start)) is not None
-    expected, found = simulate_plant(one, start, torque), simulate_plant(other, start, torque)
-    assert np.array_equal(found.position["motor"], expected.position["motor"])
+    expected, plant = simulate_plant(one, start, torque), simulate_plant(other, start, torque)
+    assert np.array_equal(plant.position["motor"], expected.position["motor"])
     ways = [directions(e, start)[:6] for e in (one, other)]
-    both = [
+    pair = [
         step_derivatives(e, expected, torque, 1e-3 * np.arange(STEPS), way)[0]
         for e, way in zip((one, other), ways, strict=True)
     ]
-    assert np.array_equal(*both)
+    assert np.array_equal(*pair)
 
 
 def test_columns_of_other_lengths_are_refused():

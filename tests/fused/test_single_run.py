@@ -51,8 +51,8 @@ def row(state, signals):
 @functools.cache
 def scanned(excitation):
     """An experiment, and figures and record of it by the scan."""
-    whole = experiment(excitation, 523, "float64")
-    return whole, *jax.jit(lambda seed: scan(whole, seed, (ALL_METRICS, ODD), row, 1))(jnp.asarray(3))
+    full_experiment = experiment(excitation, 523, "float64")
+    return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD), row, 1))(jnp.asarray(3))
 
 
 @pytest.mark.parametrize(
@@ -66,22 +66,22 @@ def scanned(excitation):
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
 def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
-    whole, figures, record = scanned(excitation)
-    found, kept = record_run(whole, 3, reducers, row, every)
-    assert list(kept) == ["u", "torque", "moving", "t"]
-    assert set(found) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
-    for name, column in kept.items():
+    full, figures, record = scanned(excitation)
+    result, selected = record_run(full, 3, reducers, row, every)
+    assert list(selected) == ["u", "torque", "moving", "t"]
+    assert set(result) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
+    for name, column in selected.items():
         assert column.dtype == record[name].dtype
         np.testing.assert_allclose(column, record[name][::every], rtol=1e-8, atol=1e-12, err_msg=name)
-    for name, figure in found.items():
+    for name, figure in result.items():
         np.testing.assert_allclose(figure, figures[name], rtol=1e-7, err_msg=name)
 
 
 def test_a_run_in_single_precision():
     with jax.enable_x64(False):
-        whole = experiment(Multisine(5.0, 0.8), 500, "float32")
-        found, kept = record_run(whole, 3, (ALL_METRICS,), row)
-        figures, record = jax.jit(lambda seed: scan(whole, seed, (ALL_METRICS,), row))(jnp.asarray(3, jnp.uint32))
-    assert {column.dtype.name for column in kept.values()} == {"float32", "bool"}
-    np.testing.assert_allclose(kept["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))
-    np.testing.assert_allclose(found["motor.velocity_rmse"], figures["motor.velocity_rmse"], rtol=1e-3)
+        full_experiment = experiment(Multisine(5.0, 0.8), 500, "float32")
+        result, selected = record_run(full_experiment, 3, (ALL_METRICS,), row)
+        figures, record = jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS,), row))(jnp.asarray(3, jnp.uint32))
+    assert {column.dtype.name for column in selected.values()} == {"float32", "bool"}
+    np.testing.assert_allclose(selected["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))
+    np.testing.assert_allclose(result["motor.velocity_rmse"], figures["motor.velocity_rmse"], rtol=1e-3)

@@ -123,15 +123,15 @@ def test_report_has_every_number_and_figure(found, tmp_path):
 def test_a_direction_that_the_log_does_not_show_is_refused(log):
     """Torque, inertias, frictions and stiffness scaled alike."""
     effects = [*FRICTION, {"kind": "actuator.gain_error", "relative": 0.0}]
-    found = identify(log, geared(effects=effects)).summary
-    (refusal,) = found["refused"]
+    summary = identify(log, geared(effects=effects)).summary
+    (refusal,) = summary["refused"]
     assert "effects.actuator.gain_error.relative" in refusal["direction"]
     assert "transmission.stiffness" in refusal["direction"]
     assert "transmission.half_gap" not in refusal["direction"]
     assert "what would help: " in refusal["why"] and "a load or an inertia that is known" in refusal["why"]
-    assert len(found["held"]) == 1
-    assert found["held"][0] not in found["parameters"]
-    half_gap = found["parameters"]["transmission.half_gap"]
+    assert len(summary["held"]) == 1
+    assert summary["held"][0] not in summary["parameters"]
+    half_gap = summary["parameters"]["transmission.half_gap"]
     assert abs(half_gap["value"] - 0.08) < 4.0 * half_gap["standard_error"]
 
 
@@ -168,20 +168,20 @@ def test_a_measured_torque_is_regressed_directly(everything):
     regression = everything.summary["method"]["regression"]
     assert regression["measured_transmitted_torque"]
     for path in ("transmission.stiffness", "transmission.half_gap"):
-        one = regression["parameters"][path]
-        assert abs(one["value"] - TRUTH[path]) < 4.0 * one["standard_error"], path
-        assert one["standard_error"] < 0.01 * TRUTH[path]
+        parameters = regression["parameters"][path]
+        assert abs(parameters["value"] - TRUTH[path]) < 4.0 * parameters["standard_error"], path
+        assert parameters["standard_error"] < 0.01 * TRUTH[path]
     assert regression["torque"]["transmission"]["rms"] < 0.02
     assert np.array_equal(everything.trace["transmitted"], everything.record.transmitted)
 
 
 def test_prediction_errors_find_the_numbers_too(everything):
     assert everything.summary["method"]["trajectory"]["kind"] == "prediction_error"
-    for path, one in everything.summary["parameters"].items():
-        assert abs(one["value"] - TRUTH[path]) < 4.0 * one["standard_error"], path
-        low, high = one["interval"]
-        np.testing.assert_allclose(one["profile_interval"], one["interval"], atol=0.1 * (high - low), rtol=0.0)
-        assert len(one["profile"]) == 9
+    for path, parameter in everything.summary["parameters"].items():
+        assert abs(parameter["value"] - TRUTH[path]) < 4.0 * parameter["standard_error"], path
+        low, high = parameter["interval"]
+        np.testing.assert_allclose(parameter["profile_interval"], parameter["interval"], atol=0.1 * (high - low), rtol=0.0)
+        assert len(parameter["profile"]) == 9
 
 
 def test_gains_are_chosen_on_the_log_where_the_study_has_none(everything):
@@ -198,9 +198,9 @@ def test_numbers_are_tried_out_on_another_log(everything):
     holdout = everything.summary["holdout"]
     assert holdout["file"].endswith("log1.csv")
     for side, noise in (("motor", 1e-4), ("load", 2e-5)):
-        one = holdout["position"][side]
-        assert one["rms"] == pytest.approx(noise, rel=0.1)
-        assert one["nominal_rms"] > 5.0 * noise
+        position = holdout["position"][side]
+        assert position["rms"] == pytest.approx(noise, rel=0.1)
+        assert position["nominal_rms"] > 5.0 * noise
     torque = holdout["torque"]["transmission"]
     assert torque["relative"] < 0.3 * torque["nominal_relative"]
 
@@ -223,10 +223,10 @@ def test_several_logs_are_one_record(measured, found, tmp_path):
     halves = [tmp_path / "half0.csv", tmp_path / "half1.csv"]
     for i, half in enumerate(halves):
         pd.read_csv(measured / f"log{i}.csv").iloc[:750].to_csv(half, index=False)
-    both = identify(halves, study)
-    assert len(both.trace) == 1500
-    assert both.summary["method"]["trajectory"]["windows"] == 6
-    errors = [x.summary["parameters"]["transmission.half_gap"]["standard_error"] for x in (both, found)]
+    identification = identify(halves, study)
+    assert len(identification.trace) == 1500
+    assert identification.summary["method"]["trajectory"]["windows"] == 6
+    errors = [x.summary["parameters"]["transmission.half_gap"]["standard_error"] for x in (identification, found)]
     assert errors[0] == pytest.approx(errors[1], rel=0.3)
     with pytest.raises(InputError, match="no log: at least one is needed"):
         identify([], study)
@@ -280,8 +280,8 @@ def test_emps_agrees_with_what_was_published():
         log=EMPS,
         identify={"starts": 1},
     )
-    found = identify(real("emps/DATA_EMPS.mat"), study, holdout=real("emps/DATA_EMPS_PULSES.mat")).summary
-    parameters = found["parameters"]
+    summary = identify(real("emps/DATA_EMPS.mat"), study, holdout=real("emps/DATA_EMPS_PULSES.mat")).summary
+    parameters = summary["parameters"]
     published = {
         "drive.motor_inertia": 95.109,
         "drive.motor_viscous": 203.50,
@@ -293,10 +293,10 @@ def test_emps_agrees_with_what_was_published():
         low, high = parameters[path]["interval"]
         assert low <= value <= high, (path, low, high)
         assert high - low < 0.25 * abs(value)
-    torque = found["torque"]["motor"]
+    torque = summary["torque"]["motor"]
     assert torque["relative"] < 0.042
     assert torque["unit"] == "N"
-    assert found["holdout"]["torque"]["motor"]["relative"] < 0.054
+    assert summary["holdout"]["torque"]["motor"]["relative"] < 0.054
 
 
 def test_xl330_pendulum_swings_freely():
@@ -310,9 +310,9 @@ def test_xl330_pendulum_swings_freely():
         identify={"starts": 1, "window": 3.9},
     )
     logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
-    found = identify(logs, study)
-    assert found.summary["residual"]["motor"]["rms"] < 0.019
-    parameters = found.summary["parameters"]
+    identification = identify(logs, study)
+    assert identification.summary["residual"]["motor"]["rms"] < 0.019
+    parameters = identification.summary["parameters"]
     assert set(parameters) == {
         "drive.motor_viscous",
         "effects.load.gravity.torque",
@@ -321,7 +321,7 @@ def test_xl330_pendulum_swings_freely():
     }
     low, high = parameters["effects.motor.coulomb_friction.torque"]["interval"]
     assert 0.0 < low < high < 0.02
-    assert any("taken to move freely" in note for note in found.summary["notes"])
+    assert any("taken to move freely" in note for note in identification.summary["notes"])
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
     assert 0.3 < parameters["effects.load.gravity.torque"]["value"] < 0.49 * 0.1 * 9.81
 

@@ -29,24 +29,24 @@ def record(seed=0, size=0.2, drag=0.15):
         x = np.array([x[0] + moved * x[1] + torque[i] / drag * (PERIOD - moved),
                       decay * x[1] + torque[i] / drag * (1.0 - decay)])  # fmt: skip
     readings = {"motor": positions + NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)}
-    rest = PlantState({"motor": jnp.zeros(SAMPLES)}, {"motor": jnp.zeros(SAMPLES)}, ())
-    return cut(torque, readings, PERIOD, rest, {"motor": NOISE}, SAMPLES)
+    plant_state = PlantState({"motor": jnp.zeros(SAMPLES)}, {"motor": jnp.zeros(SAMPLES)}, ())
+    return cut(torque, readings, PERIOD, plant_state, {"motor": NOISE}, SAMPLES)
 
 
 def fitted(paths, windows):
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
     free = make_free_parameters(experiment, paths, 1.0)
-    found = _fit(experiment, free, windows, jnp.zeros(len(free)))
-    return experiment, free, found
+    result = _fit(experiment, free, windows, jnp.zeros(len(free)))
+    return experiment, free, result
 
 
 def test_where_the_fit_is_quadratic_both_intervals_agree():
     windows = record(size=2.0)
-    experiment, free, found = fitted(["drive.motor_inertia", "drive.motor_viscous"], windows)
-    width = spread(found)
-    profiles = profile(experiment, free, windows, found, width)
+    experiment, free, result = fitted(["drive.motor_inertia", "drive.motor_viscous"], windows)
+    width = spread(result)
+    profiles = profile(experiment, free, windows, result, width)
     for i, one in enumerate(free):
-        theta, deviation = float(found.theta[i]), float(jnp.sqrt(width.covariance[i, i]))
+        theta, deviation = float(result.theta[i]), float(jnp.sqrt(width.covariance[i, i]))
         low, high = interval(one, theta, deviation)
         np.testing.assert_allclose(profiles[one.path].interval, (low, high), atol=0.05 * (high - low), rtol=0.0)
         assert np.all(np.diff(profiles[one.path].values) >= 0.0)
@@ -57,21 +57,21 @@ def test_where_it_is_not_the_profile_follows_the_likelihood():
     """Weak excitation: the friction is hardly seen. The reference is a root of the cost with all else fitted anew."""
     windows = record(size=0.003, seed=3)
     paths = ["drive.motor_inertia", "drive.motor_viscous"]
-    experiment, free, found = fitted(paths, windows)
-    width = spread(found)
-    ends = profile(experiment, free, windows, found, width)["drive.motor_viscous"].interval
+    experiment, free, result = fitted(paths, windows)
+    width = spread(result)
+    ends = profile(experiment, free, windows, result, width)["drive.motor_viscous"].interval
     scale = float(width.variance) * float(width.inflation[1]) ** 2
     again = jit(lambda theta: fit(experiment, free, windows, theta, 60, jnp.array([False, True])).cost)
 
     def excess(value):
-        theta = jnp.array([float(found.theta[0]), np.log(value / 0.15)])
-        return 2.0 * (float(again(theta)) - float(found.cost)) / scale - 3.841
+        theta = jnp.array([float(result.theta[0]), np.log(value / 0.15)])
+        return 2.0 * (float(again(theta)) - float(result.cost)) / scale - 3.841
 
-    best = 0.15 * np.exp(float(found.theta[1]))
+    best = 0.15 * np.exp(float(result.theta[1]))
     assert ends[1] == pytest.approx(brentq(excess, best, 20.0 * best, xtol=1e-6), rel=0.03)
     low = brentq(excess, best * np.exp(-2.99), best, xtol=1e-6) if excess(best * np.exp(-2.99)) > 0.0 else 0.0
     assert ends[0] == pytest.approx(low, rel=0.03)
     # far from symmetric: here the covariance's interval is another one
-    theta, deviation = float(found.theta[1]), float(jnp.sqrt(width.covariance[1, 1]))
+    theta, deviation = float(result.theta[1]), float(jnp.sqrt(width.covariance[1, 1]))
     wald = interval(free[1], theta, deviation)
     assert abs(wald[1] / ends[1] - 1.0) > 0.05

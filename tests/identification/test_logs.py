@@ -35,8 +35,8 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 def ahead(record: Record, paths: list[Path]) -> list[float]:
     """By how much the positions of each log of a record were turned, rad."""
-    read = np.concatenate([pd.read_csv(one)["theta_e"] for one in paths])
-    return [float(np.mean(one)) for one in np.split(record.positions["motor"] - read, len(paths))]
+    read = np.concatenate([pd.read_csv(part)["theta_e"] for part in paths])
+    return [float(np.mean(part)) for part in np.split(record.positions["motor"] - read, len(paths))]
 
 
 def test_logs_with_other_zeros_are_turned_to_that_of_the_first(paths: list[Path]):

@@ -74,9 +74,9 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
         predicted, smoothness = predictor(experiment, windows)
         np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
         for name, one in (("free", windows), ("predicted", predicted)):
-            found = fitted(experiment, free, one)
-            errors[name].append(found.theta)
-            widths[name].append(np.sqrt(np.diag(spread(found).covariance)))
+            result = fitted(experiment, free, one)
+            errors[name].append(result.theta)
+            widths[name].append(np.sqrt(np.diag(spread(result).covariance)))
     size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}
     assert np.all(size["predicted"] < 0.7 * size["free"]), size
     # errors are about as large as they say
@@ -90,5 +90,5 @@ def test_without_a_disturbance_the_predictor_runs_freely():
     predicted, smoothness = predictor(experiment, windows)
     assert smoothness["motor"] < 1e-9
     assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)
-    found = fitted(experiment, free, predicted)
-    np.testing.assert_allclose(found.theta, 0.0, atol=0.005)
+    result = fitted(experiment, free, predicted)
+    np.testing.assert_allclose(result.theta, 0.0, atol=0.005)

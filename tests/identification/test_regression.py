@@ -52,7 +52,7 @@ def test_balance_is_the_equations_of_motion():
     experiment = prepare(read_config(small(transmission=LAW, effects=effects)))
     position, velocity, acceleration = motion((1.0, 0.2), (5.0, 4.0))
     u = jnp.cos(3.0 * T)
-    found = balance(experiment, Kinematics(T, u, position, velocity, acceleration))
+    result = balance(experiment, Kinematics(T, u, position, velocity, acceleration))
     ratio = experiment.drive.gear_ratio
     z, rate = position["motor"] - ratio * position["load"], velocity["motor"] - ratio * velocity["load"]
     touching = jnp.abs(z) > 0.08
@@ -62,10 +62,10 @@ def test_balance_is_the_equations_of_motion():
     )
     motor = 1.1 * u - c - f_e * velocity["motor"] - 0.3 * jnp.sign(velocity["motor"]) - j_e * acceleration["motor"]
     load = ratio * c - f_s * velocity["load"] - 2.0 * jnp.sin(position["load"] - 0.1) - (j_s + 0.7) * acceleration["load"]
-    np.testing.assert_allclose(found["motor"].residual, motor, atol=1e-10)
-    np.testing.assert_allclose(found["load"].residual, load, atol=1e-9)
-    np.testing.assert_allclose(found["motor"].drive, 1.1 * u)
-    np.testing.assert_allclose(found["load"].drive, ratio * c, atol=1e-9)
+    np.testing.assert_allclose(result["motor"].residual, motor, atol=1e-10)
+    np.testing.assert_allclose(result["load"].residual, load, atol=1e-9)
+    np.testing.assert_allclose(result["motor"].drive, 1.1 * u)
+    np.testing.assert_allclose(result["load"].drive, ratio * c, atol=1e-9)
     # a measured torque takes the place of the law's, and has an equation of its own
     measured = c + 0.01
     with_it = balance(experiment, Kinematics(T, u, position, velocity, acceleration, measured))
@@ -86,17 +86,17 @@ def test_a_lag_of_the_actuator_is_followed():
     effects = [{"kind": "actuator.lag", "time_constant": 0.05}]
     experiment = prepare(read_config(rigid({"run.sample_period": 5e-4}, effects=effects)))
     still = {"motor": jnp.zeros_like(T)}
-    found = balance(experiment, Kinematics(T, jnp.ones_like(T), still, still, still, before=jnp.zeros(1)))
-    np.testing.assert_allclose(found["motor"].residual, 1.0 - jnp.exp(-T / 0.05), atol=0.011)
+    result = balance(experiment, Kinematics(T, jnp.ones_like(T), still, still, still, before=jnp.zeros(1)))
+    np.testing.assert_allclose(result["motor"].residual, 1.0 - jnp.exp(-T / 0.05), atol=0.011)
 
 
 @pytest.mark.parametrize("factor", [1, 4, 10])
 def test_decimation_keeps_what_is_slow(factor):
     slow, fast = np.sin(2.0 * np.pi * 2.0 * T), 0.3 * np.sin(2.0 * np.pi * 900.0 * T)
-    kept = decimate(jnp.asarray(slow + fast), factor)
+    decimated = decimate(jnp.asarray(slow + fast), factor)
     edge = shortest(factor) // 2
     expected = (slow + (fast if factor == 1 else 0.0))[edge : len(T) - edge : factor]
-    np.testing.assert_allclose(kept, expected, atol=2e-3)
+    np.testing.assert_allclose(decimated, expected, atol=2e-3)
     reference = signal.decimate(np.asarray(slow), factor, ftype="fir") if factor > 1 else slow
     np.testing.assert_allclose(decimate(jnp.asarray(slow), factor)[5:-5].mean(), np.mean(reference), atol=0.02)
 
@@ -126,10 +126,10 @@ def test_a_measured_torque_gives_stiffness_and_gap_directly():
         measured = c + 0.05 * random.standard_normal(len(t))
         part = Kinematics(jnp.asarray(t), jnp.zeros(len(t)), position, none, none, jnp.asarray(measured))
         part = jax.tree.map(lambda x: x[in_contact], part)
-        found = regress(experiment, free, [part], 1)
-        width = spread(found)
+        result = regress(experiment, free, [part], 1)
+        width = spread(result)
         for i, true in enumerate((60.0, 0.08)):
-            low, high = interval(free[i], float(found.theta[i]), float(jnp.sqrt(width.covariance[i, i])))
+            low, high = interval(free[i], float(result.theta[i]), float(jnp.sqrt(width.covariance[i, i])))
             hits[i] += low <= true <= high
             assert (high - low) < 0.01 * true
     assert np.all(hits >= 34), hits
@@ -149,10 +149,10 @@ def test_emps_by_the_published_method_and_measure():
     free = make_free_parameters(experiment, paths, 50.0)
     records = [read_record(real(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
     parts = [differentiate(r.time, r.torque, r.positions, 100.0) for r in records]
-    found = regress(experiment, free, parts[:1], 10)
-    values = [float(one.value(found.theta[i])) for i, one in enumerate(free)]
+    result = regress(experiment, free, parts[:1], 10)
+    values = [float(one.value(result.theta[i])) for i, one in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
-    fitted = set_free_parameters(experiment, free, found.theta)
+    fitted = set_free_parameters(experiment, free, result.theta)
     assert errors(fitted, parts[:1], 10)["motor"]["relative"] < 0.042
     assert errors(fitted, parts[1:], 10)["motor"]["relative"] < 0.054
     # the smoother in place of the filter says the same

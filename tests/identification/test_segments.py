@@ -39,17 +39,17 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
     keep = np.exp(-2e-3 / LAG["time_constant"])
     made = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
     made[0] = record.torque[0]
-    ((found,),) = windows.start.effects
-    np.testing.assert_allclose(found, made[firsts], atol=1e-3 * np.max(np.abs(made)))
+    ((result,),) = windows.start.effects
+    np.testing.assert_allclose(result, made[firsts], atol=1e-3 * np.max(np.abs(made)))
     np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[jnp.asarray(firsts)])
 
 
 def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
-    whole, _, _ = setting
-    record = replace(whole, segments=(slice(0, 100), slice(100, 900), slice(1000, 2000)))
+    full, _, _ = setting
+    record = replace(full, segments=(slice(0, 100), slice(100, 900), slice(1000, 2000)))
     # nothing is known before the first part, which is too short to give up any; the others follow on known inputs
     assert led_in(record, False).segments == record.segments
-    record = replace(record, time=whole.time + 0.5 * (np.arange(2000) >= 1000))
+    record = replace(record, time=full.time + 0.5 * (np.arange(2000) >= 1000))
     led = led_in(record, False)
     assert led.segments == (slice(0, 100), slice(100, 900), slice(1000 + DELAY_SAMPLES, 2000)) == led_in(led, False).segments
     first, second, third = segments_of(led, ["motor"])
@@ -57,10 +57,10 @@ def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
     np.testing.assert_array_equal(second.before, record.torque[100 - DELAY_SAMPLES : 100])
     np.testing.assert_array_equal(third.before, record.torque[1000 : 1000 + DELAY_SAMPLES])
     # at rest nothing had been commanded
-    assert led_in(whole, True).segments == whole.segments and led_in(whole, False).segments == (slice(DELAY_SAMPLES, 2000),)
-    np.testing.assert_array_equal(segments_of(whole, ["motor"], True)[0].before, np.zeros(DELAY_SAMPLES))
-    free = replace(whole, torque=np.zeros(2000))
-    assert led_in(free, False).segments == whole.segments
+    assert led_in(full, True).segments == full.segments and led_in(full, False).segments == (slice(DELAY_SAMPLES, 2000),)
+    np.testing.assert_array_equal(segments_of(full, ["motor"], True)[0].before, np.zeros(DELAY_SAMPLES))
+    free = replace(full, torque=np.zeros(2000))
+    assert led_in(free, False).segments == full.segments
 
 
 def test_effects_begin_with_what_the_inputs_before_left(setting):
@@ -72,10 +72,12 @@ def test_effects_begin_with_what_the_inputs_before_left(setting):
     time, torque = record.time[:200], np.cos(30.0 * record.time[:200])
     states, acting = effect_path(experiment, Path(time, torque, still, still))
     for first in (5, 40):
-        rest = {"motor": np.zeros(200 - first)}
-        later, torques = effect_path(experiment, Path(time[first:], torque[first:], rest, rest, before=torque[:first]))
+        remainder = {"motor": np.zeros(200 - first)}
+        later, torques = effect_path(
+            experiment, Path(time[first:], torque[first:], remainder, remainder, before=torque[:first])
+        )
         np.testing.assert_allclose(torques, acting[first:], atol=1e-12)
-        np.testing.assert_allclose(jax.tree.leaves(later), [one[first:] for one in jax.tree.leaves(states)], atol=1e-12)
+        np.testing.assert_allclose(jax.tree.leaves(later), [leaf[first:] for leaf in jax.tree.leaves(states)], atol=1e-12)
 
 
 def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):

@@ -36,9 +36,9 @@ def batch(readings):
         rows[i, 3 * i] = 1.0 / NOISE
         right[i] = readings[i] / NOISE
     for i in range(1, samples):
-        at = samples + 3 * (i - 1)
-        rows[at : at + 3, 3 * i : 3 * i + 3] = root
-        rows[at : at + 3, 3 * i - 3 : 3 * i] = -root @ F
+        index = samples + 3 * (i - 1)
+        rows[index : index + 3, 3 * i : 3 * i + 3] = root
+        rows[index : index + 3, 3 * i - 3 : 3 * i] = -root @ F
     rows = rows * np.tile(size, samples)
     triangle = np.linalg.qr(rows, mode="r")
     solution = np.linalg.lstsq(rows, right, rcond=None)[0].reshape(samples, 3) * size
@@ -49,27 +49,27 @@ def batch(readings):
 
 def test_agrees_with_least_squares_over_all_states():
     _, readings = motion(1, 120)
-    found = smooth(readings, PERIOD, known=(NOISE, JERK))
+    result = smooth(readings, PERIOD, known=(NOISE, JERK))
     state, covariance = batch(readings)
     deviation = np.sqrt(np.einsum("tii->ti", covariance))
     # a hundredth of the backward filter's information counts twice at the first sample
-    assert np.abs((found.state - state) / deviation).max() < 0.02
-    assert np.abs((found.state - state) / deviation)[40:].max() < 1e-4
-    np.testing.assert_allclose(np.sqrt(np.einsum("tii->ti", found.covariance)), deviation, rtol=0.01)
-    np.testing.assert_allclose(np.einsum("tii->ti", found.covariance)[40:], deviation[40:] ** 2, rtol=1e-4)
-    both = np.outer(deviation[60], deviation[60])
-    np.testing.assert_allclose(found.covariance[60] / both, covariance[60] / both, atol=1e-4)
+    assert np.abs((result.state - state) / deviation).max() < 0.02
+    assert np.abs((result.state - state) / deviation)[40:].max() < 1e-4
+    np.testing.assert_allclose(np.sqrt(np.einsum("tii->ti", result.covariance)), deviation, rtol=0.01)
+    np.testing.assert_allclose(np.einsum("tii->ti", result.covariance)[40:], deviation[40:] ** 2, rtol=1e-4)
+    outer = np.outer(deviation[60], deviation[60])
+    np.testing.assert_allclose(result.covariance[60] / outer, covariance[60] / outer, atol=1e-4)
 
 
 def test_finds_noise_and_jerk_and_knows_its_errors():
     state, readings = motion(2, 6000)
-    found = smooth(readings, PERIOD)
-    assert float(found.noise) == pytest.approx(NOISE, rel=0.05)
-    assert float(found.jerk) == pytest.approx(JERK, rel=0.5)
+    result = smooth(readings, PERIOD)
+    assert float(result.noise) == pytest.approx(NOISE, rel=0.05)
+    assert float(result.jerk) == pytest.approx(JERK, rel=0.5)
     for order in range(3):
-        errors = (np.asarray(found.state)[:, order] - state[:, order]) / np.asarray(found.deviation(order))
+        errors = (np.asarray(result.state)[:, order] - state[:, order]) / np.asarray(result.deviation(order))
         assert 0.85 < np.sqrt(np.mean(errors**2)) < 1.15
-    white = np.asarray(found.innovations)[10:]
+    white = np.asarray(result.innovations)[10:]
     assert abs(np.mean(white[1:] * white[:-1])) < 0.05
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.06)
 
@@ -77,34 +77,34 @@ def test_finds_noise_and_jerk_and_knows_its_errors():
 @pytest.mark.parametrize("noise", [1e-8, 1e-5])
 def test_covariance_stays_positive_where_readings_are_fine(noise):
     t = PERIOD * np.arange(2000)
-    found = smooth(np.sin(5.0 * t) + noise * np.random.default_rng(0).standard_normal(2000), PERIOD)
+    result = smooth(np.sin(5.0 * t) + noise * np.random.default_rng(0).standard_normal(2000), PERIOD)
     assert np.all(
-        np.linalg.eigvalsh(np.asarray(found.covariance) / np.asarray(found.covariance).max(axis=(1, 2), keepdims=True))
+        np.linalg.eigvalsh(np.asarray(result.covariance) / np.asarray(result.covariance).max(axis=(1, 2), keepdims=True))
         > -1e-12
     )
-    assert np.all(np.asarray(found.deviation(2)) > 0.0)
-    errors = np.asarray(found.velocity) - 5.0 * np.cos(5.0 * t)
+    assert np.all(np.asarray(result.deviation(2)) > 0.0)
+    errors = np.asarray(result.velocity) - 5.0 * np.cos(5.0 * t)
     # a sine is smoother than white jerk
-    assert 0.1 < np.sqrt(np.mean((errors / np.asarray(found.deviation(1))) ** 2)) < 1.3
+    assert 0.1 < np.sqrt(np.mean((errors / np.asarray(result.deviation(1))) ** 2)) < 1.3
 
 
 def test_units_and_offsets_do_not_matter():
     _, readings = motion(3, 400)
-    found = smooth(readings, PERIOD)
+    result = smooth(readings, PERIOD)
     other = smooth(7.0 + 1e3 * readings, PERIOD)
     np.testing.assert_allclose(
-        other.velocity, 1e3 * found.velocity, rtol=1e-6, atol=1e-6 * 1e3 * np.abs(found.velocity).max()
+        other.velocity, 1e3 * result.velocity, rtol=1e-6, atol=1e-6 * 1e3 * np.abs(result.velocity).max()
     )
-    np.testing.assert_allclose(other.deviation(1), 1e3 * found.deviation(1), rtol=1e-5)
+    np.testing.assert_allclose(other.deviation(1), 1e3 * result.deviation(1), rtol=1e-5)
 
 
 def test_quantised_readings():
     t = PERIOD * np.arange(3000)
     step = 1e-3
     readings = step * np.round(np.stack([np.sin(4.0 * t), np.cos(3.0 * t)]) / step)
-    found = [smooth(one, PERIOD) for one in readings]
-    np.testing.assert_allclose([one.noise for one in found], step / np.sqrt(12.0), rtol=0.2)
-    assert np.sqrt(np.mean((found[0].velocity - 4.0 * np.cos(4.0 * t)) ** 2)) < 0.02
+    smoothed_readings = [smooth(reading, PERIOD) for reading in readings]
+    np.testing.assert_allclose([reading.noise for reading in smoothed_readings], step / np.sqrt(12.0), rtol=0.2)
+    assert np.sqrt(np.mean((smoothed_readings[0].velocity - 4.0 * np.cos(4.0 * t)) ** 2)) < 0.02
 
 
 @pytest.mark.parametrize(("columns", "machine_code"), [(1, True), (3, True), (21, True), (3, False)])
@@ -112,7 +112,7 @@ def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monke
     if not machine_code:
         monkeypatch.setattr(signal_scan, "_compile_loop", lambda *_: None)
     readings = np.stack([(1.0 + seed) * motion(seed, 300)[1] for seed in range(columns)], axis=1)
-    found = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
-    for one, position in zip(found.T, readings.T, strict=True):
+    result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
+    for one, position in zip(result.T, readings.T, strict=True):
         alone = smooth(position, PERIOD, known=(NOISE, JERK)).acceleration
         np.testing.assert_allclose(one, alone, rtol=1e-9, atol=1e-9 * np.max(np.abs(alone)))

@@ -63,8 +63,8 @@ def recorded(kind, samples, period=PERIOD):
 
 
 def windows_of(torque, readings, noise, samples, period=PERIOD):
-    found = {side: smooth(values, period) for side, values in readings.items()}
-    start = PlantState({s: x.position for s, x in found.items()}, {s: x.velocity for s, x in found.items()}, ())
+    result = {side: smooth(values, period) for side, values in readings.items()}
+    start = PlantState({s: x.position for s, x in result.items()}, {s: x.velocity for s, x in result.items()}, ())
     return cut(torque, readings, period, start, noise, samples)
 
 
@@ -77,11 +77,11 @@ def noisy(states, noise, key):
 
 def realisations(torque, states, noise, keys, samples, period=PERIOD):
     """Windows of one motion under several realisations of the noise, with a leading axis."""
-    seen = {side: np.asarray(x) for side, x in jax.vmap(lambda key: noisy(states, noise, key))(keys).items()}
+    calls = {side: np.asarray(x) for side, x in jax.vmap(lambda key: noisy(states, noise, key))(keys).items()}
     # initial states are guessed by the first
-    one = windows_of(torque, {side: x[0] for side, x in seen.items()}, noise, samples, period)
-    each = jax.tree.map(lambda x: np.broadcast_to(x, (len(keys), *np.shape(x))), one)
-    return dataclasses.replace(each, measured={side: x.reshape(len(keys), -1, samples) for side, x in seen.items()})
+    one = windows_of(torque, {side: x[0] for side, x in calls.items()}, noise, samples, period)
+    tree = jax.tree.map(lambda x: np.broadcast_to(x, (len(keys), *np.shape(x))), one)
+    return dataclasses.replace(tree, measured={side: x.reshape(len(keys), -1, samples) for side, x in calls.items()})
 
 
 @jit
@@ -104,23 +104,23 @@ def fitted(kind):
 
 def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     """SciPy's own over the parameters and the states of all windows at once, derivatives by JAX."""
-    experiment, free, *each = fitted("multisine")
-    windows, found = (jax.tree.map(lambda x: x[0], one) for one in each)
+    experiment, free, *each_ = fitted("multisine")
+    windows, result = (jax.tree.map(lambda x: x[0], one) for one in each_)
     noise = windows.noise
-    assert bool(found.converged)
+    assert bool(result.converged)
 
     @jit
-    def residual(both):
-        at = set_free_parameters(experiment, free, both[:6])
-        starts = both[6:].reshape(2, 4)
+    def residual(pair):
+        candidate = set_free_parameters(experiment, free, pair[:6])
+        starts = pair[6:].reshape(2, 4)
 
         def one(x, u, motor, load):
             start = PlantState({"motor": x[0], "load": x[1]}, {"motor": x[2], "load": x[3]}, ())
-            simulated = plant_trajectory(at, start, u).position
+            simulated = plant_trajectory(candidate, start, u).position
             return jnp.stack([(motor - simulated["motor"]) / noise["motor"], (load - simulated["load"]) / noise["load"]], -1)
 
-        each = jax.vmap(one)(starts, windows.torque, windows.measured["motor"], windows.measured["load"])
-        return jnp.concatenate([each.ravel(), both[:6] / 3.0])
+        each_ = jax.vmap(one)(starts, windows.torque, windows.measured["motor"], windows.measured["load"])
+        return jnp.concatenate([each_.ravel(), pair[:6] / 3.0])
 
     guess = windows.start
     first = np.stack([guess.position["motor"], guess.position["load"], guess.velocity["motor"], guess.velocity["load"]], -1)
@@ -130,17 +130,17 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     )
     covariance = np.linalg.inv(joint.jac[:-6].T @ joint.jac[:-6])[:6, :6]
     deviation = np.sqrt(np.diag(covariance))
-    assert np.abs((found.theta - joint.x[:6]) / deviation).max() < 0.02
-    plain = np.linalg.inv(np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian))
+    assert np.abs((result.theta - joint.x[:6]) / deviation).max() < 0.02
+    plain = np.linalg.inv(np.einsum("wtsp,wtsq->pq", result.jacobian, result.jacobian))
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
 @pytest.mark.parametrize("kind", ["multisine", "steps"])
 def test_intervals_cover_the_truth_as_often_as_they_say(kind):
-    *_, found = fitted(kind)
+    *_, result = fitted(kind)
     theta, covariance = (
-        found.theta,
-        np.stack([spread(jax.tree.map(lambda x, i=i: x[i], found)).covariance for i in range(200)]),
+        result.theta,
+        np.stack([spread(jax.tree.map(lambda x, i=i: x[i], result)).covariance for i in range(200)]),
     )
     deviation = np.sqrt(np.einsum("rii->ri", covariance))
     covered = np.mean(np.abs(theta / deviation) < 1.96, axis=0)
@@ -186,8 +186,8 @@ def test_scales_that_one_record_cannot_part_are_refused():
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1}, effects=effects)))
     t = PERIOD * np.arange(1000)
     torque = 0.1 * np.sin(9.0 * t) + 0.05 * np.sin(31.0 * t)
-    rest = experiment.plant.init(experiment.initial)
-    simulated = plant_trajectory(experiment, rest, jnp.asarray(torque)).position["motor"]
+    state = experiment.plant.init(experiment.initial)
+    simulated = plant_trajectory(experiment, state, jnp.asarray(torque)).position["motor"]
     readings = {"motor": simulated + 1e-5 * jax.random.normal(jax.random.key(2), (1000,))}
     paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     paths.append("effects.actuator.gain_error.relative")
@@ -195,18 +195,18 @@ def test_scales_that_one_record_cannot_part_are_refused():
     smoothed = smooth(readings["motor"], PERIOD)
     start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
     windows = cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250)
-    found = jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
-    refused, condition = refusals(free, spread(found))
+    result = jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
+    refused, condition = refusals(free, spread(result))
     assert condition > 1e4
     (direction,) = refused
     assert set(direction.direction) == set(paths)
     np.testing.assert_allclose(list(direction.direction.values()), 1.0, rtol=0.05)
     # without the gain's column
     known = np.arange(3)
-    refused, condition = refusals(free[:3], spread(found.only(known)))
+    refused, condition = refusals(free[:3], spread(result.only(known)))
     assert refused == []
     assert condition < 1e3
-    np.testing.assert_allclose(found.theta[known], np.log1p(found.theta[3]), rtol=0.0, atol=0.05)
+    np.testing.assert_allclose(result.theta[known], np.log1p(result.theta[3]), rtol=0.0, atol=0.05)
 
 
 def test_residual_correlation_widens_intervals():
@@ -216,11 +216,13 @@ def test_residual_correlation_widens_intervals():
     residual = np.zeros(samples)
     for i in range(1, samples):
         residual[i] = rho * residual[i - 1] + draws[i]
-    ones = jnp.ones((10, samples // 10, 1, 1))
-    rest = PlantState({"motor": jnp.zeros(10)}, {"motor": jnp.zeros(10)}, ())
-    found = spread(Fit(jnp.zeros(1), rest, jnp.asarray(residual).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.ones(())))
-    np.testing.assert_allclose(found.inflation, np.sqrt((1.0 + rho) / (1.0 - rho)), rtol=0.1)
-    white = spread(Fit(jnp.zeros(1), rest, jnp.asarray(draws).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.ones(())))
+    group = jnp.ones((10, samples // 10, 1, 1))
+    plant_state = PlantState({"motor": jnp.zeros(10)}, {"motor": jnp.zeros(10)}, ())
+    result = spread(
+        Fit(jnp.zeros(1), plant_state, jnp.asarray(residual).reshape(10, -1, 1), group, jnp.zeros(()), jnp.ones(()))
+    )
+    np.testing.assert_allclose(result.inflation, np.sqrt((1.0 + rho) / (1.0 - rho)), rtol=0.1)
+    white = spread(Fit(jnp.zeros(1), plant_state, jnp.asarray(draws).reshape(10, -1, 1), group, jnp.zeros(()), jnp.ones(())))
     np.testing.assert_allclose(white.inflation, 1.0, rtol=0.05)
 
 
@@ -252,12 +254,12 @@ def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
     for steps in (2, 5, 9):
         solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
         other = optx.least_squares(residual, solver, start, max_steps=steps, throw=False)
-        found = _solve(point, start, nothing, jnp.asarray(steps), 2)
-        assert int(found.steps) == steps
-        np.testing.assert_allclose(found.theta, other.value, rtol=1e-12)
-    found = _solve(point, start, nothing, jnp.asarray(100), 2)
-    assert bool(found.converged) and int(found.steps) < 100
-    np.testing.assert_allclose(found.theta, 1.0, atol=1e-4)
+        solution = _solve(point, start, nothing, jnp.asarray(steps), 2)
+        assert int(solution.steps) == steps
+        np.testing.assert_allclose(solution.theta, other.value, rtol=1e-12)
+    solution = _solve(point, start, nothing, jnp.asarray(100), 2)
+    assert bool(solution.converged) and int(solution.steps) < 100
+    np.testing.assert_allclose(solution.theta, 1.0, atol=1e-4)
 
 
 def test_a_number_stays_within_what_a_study_may_say():

@@ -53,10 +53,10 @@ def test_gap_and_friction_behind_the_gear_are_found(found):
     assert found.summary["backlash"]["shown"]
     assert found.summary["backlash"]["crossings"] >= 10
     for path, true in TRUTH.items():
-        one = found.summary["parameters"][path]
-        assert one["value"] == pytest.approx(true, rel=0.02), path
-        assert one["interval"][0] <= true <= one["interval"][1], path
-        assert one["interval"][1] / one["interval"][0] < 1.1, path
+        parameters = found.summary["parameters"][path]
+        assert parameters["value"] == pytest.approx(true, rel=0.02), path
+        assert parameters["interval"][0] <= true <= parameters["interval"][1], path
+        assert parameters["interval"][1] / parameters["interval"][0] < 1.1, path
     assert found.model.transmission.half_gap == pytest.approx(0.08, rel=1e-3)
 
 
@@ -96,9 +96,9 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     assert "No gap is shown: without one the motor's readings are met as well" in called.stdout
     assert "To show a half gap of" in called.stdout
     assert "next.csv" in called.stdout
-    said = json.loads((tmp_path / "out" / "identification.json").read_text())
-    assert said["backlash"]["at_most"] < 0.01
-    assert not {"transmission.dead_zone", "transmission.half_gap"} & set(said["parameters"])
+    content = json.loads((tmp_path / "out" / "identification.json").read_text())
+    assert content["backlash"]["at_most"] < 0.01
+    assert not {"transmission.dead_zone", "transmission.half_gap"} & set(content["parameters"])
     assert (tmp_path / "next.csv").read_text().startswith("t,u\n")
 
 
@@ -109,9 +109,9 @@ def test_a_load_that_may_never_be_met_has_no_numbers(tmp_path):
     (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=3e-3, seed=2)])
     assert np.ptp(trace.states[2]) == 0.0
     study = STUDY | {"drive": light, "effects": [FRICTIONS[0], FRICTIONS[1] | {"torque": 0.3}]}
-    said = identify(motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
-    assert "by a motor that, within a gap, never meets the load" in said["backlash"]["why"]
-    assert {one["interval"][1] for one in said["parameters"].values()} == {None}
+    summary = identify(motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
+    assert "by a motor that, within a gap, never meets the load" in summary["backlash"]["why"]
+    assert {parameter["interval"][1] for parameter in summary["parameters"].values()} == {None}
 
 
 def test_changes_of_sign_count_beyond_a_size():

@@ -28,8 +28,8 @@ def log_of(data, gaps, seed=0):
 
     @jax.jit
     def simulated(gaps):
-        def sample(state, given):
-            index, gap, noise = given
+        def sample(state, inputs):
+            index, gap, noise = inputs
             own = eqx.tree_at(lambda e: e.transmission.half_gap, experiment, size * gap)
             state, signals = step(own, state, Sample(index * experiment.run.sample_period, noise=noise))
             return state, (signals.input, signals.motor.measured, signals.load.measured)

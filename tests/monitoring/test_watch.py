@@ -50,8 +50,8 @@ def logs(tmp_path_factory):
 def grown(logs):
     """The watch of the gap that grows, and the values it told of."""
     heard = []
-    found = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
-    return found, heard
+    watch = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
+    return watch, heard
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +74,9 @@ def command(*words):
 
 
 def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
-    found, heard = grown
-    values = found.values
-    assert list(values.columns) == watch_columns(found.task)
+    result, heard = grown
+    values = result.values
+    assert list(values.columns) == watch_columns(result.task)
     assert [one["t"] for one in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
     before, after = values[values["t"] <= 5.0], values[values["t"] >= 13.5]
     for part, size in ((before, HALF_GAP), (after, 2.0 * HALF_GAP)):
@@ -91,8 +91,8 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
     passed, raised = 6.0, values["t"][values["alarm"]]
     assert passed < raised.iloc[0] < passed + 6.0
     assert len(raised) == (values["t"] >= raised.iloc[0]).sum()
-    assert found.summary["alarm"]["t"] == raised.iloc[0]
-    assert found.summary["alarm"]["half_gap"] > LIMIT
+    assert result.summary["alarm"]["t"] == raised.iloc[0]
+    assert result.summary["alarm"]["half_gap"] > LIMIT
 
 
 def test_a_gap_that_stays_raises_none(same):
@@ -112,18 +112,18 @@ def test_the_paper_s_law_is_watched(tmp_path):
     """Its half gap is 4 j_0."""
     data = swung(6.0, transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 40.0})
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
-    found = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
-    assert found.summary["last"]["half_gap"] == pytest.approx(0.08, rel=0.02)
-    assert found.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
+    watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
+    assert watch.summary["last"]["half_gap"] == pytest.approx(0.08, rel=0.02)
+    assert watch.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
 
 
 def test_a_law_without_a_gap_has_its_stiffness_watched(tmp_path):
     data = swung(6.0, transmission={"law": "linear_shaft", "stiffness": 60.0})
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
-    found = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
-    assert found.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
-    assert "half_gap" not in found.values
-    assert [one.name for one in jaxbl.draw(found)] == ["watch"]
+    watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
+    assert watch.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
+    assert "half_gap" not in watch.values
+    assert [one.name for one in jaxbl.draw(watch)] == ["watch"]
     with pytest.raises(InputError, match="law linear_shaft has no gap for --alarm-gap"):
         jaxbl.watch(tmp_path / "log.csv", data, alarm_gap=0.1, **WINDOW)
 
@@ -134,8 +134,8 @@ def test_friction_beyond_the_model_is_found(tmp_path):
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
     model = axis(10.0)
     model["drive"]["motor_viscous"] = 0.1
-    found = jaxbl.watch(tmp_path / "log.csv", model, window=8.0, interval=2.0)
-    last = found.summary["last"]
+    watch = jaxbl.watch(tmp_path / "log.csv", model, window=8.0, interval=2.0)
+    last = watch.summary["last"]
     assert last["load.coulomb"] == pytest.approx(3.0, rel=0.05)
     assert last["motor.viscous"] == pytest.approx(0.15, rel=0.05)
     assert last["half_gap"] == pytest.approx(HALF_GAP, rel=0.01)
@@ -145,12 +145,12 @@ def test_an_inertia_that_is_wrong_is_seen_and_leaves_the_gap_as_it_is(logs):
     """The load's stiffness is half as large again then, and the motor's observer has the gap."""
     data = axis()
     data["drive"]["load_inertia"] *= 1.5
-    found = jaxbl.watch(logs / "same.csv", data, alarm_gap=1.05 * HALF_GAP, **WINDOW)
-    assert found.summary["contradictions"] == 12
-    assert found.summary["alarm"] is None
-    assert found.summary["last"]["side"] == "motor"
-    assert found.summary["last"]["half_gap"] == pytest.approx(HALF_GAP, rel=0.01)
-    assert found.summary["last"]["load.stiffness"] == pytest.approx(1.5 * STIFFNESS, rel=0.02)
+    watch = jaxbl.watch(logs / "same.csv", data, alarm_gap=1.05 * HALF_GAP, **WINDOW)
+    assert watch.summary["contradictions"] == 12
+    assert watch.summary["alarm"] is None
+    assert watch.summary["last"]["side"] == "motor"
+    assert watch.summary["last"]["half_gap"] == pytest.approx(HALF_GAP, rel=0.01)
+    assert watch.summary["last"]["load.stiffness"] == pytest.approx(1.5 * STIFFNESS, rel=0.02)
 
 
 def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
@@ -158,11 +158,11 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
         read_watch_task("udp://127.0.0.1:1", logs / "axis.toml", alarm_gap=LIMIT, **WINDOW), lambda values: None
     )
     for motor, load, alarm, contrary in ((0.13, 0.131, True, False), (0.13, 0.09, False, True), (0.09, 0.13, False, True)):
-        found = {
+        result = {
             side: SimpleNamespace(numbers={"half_gap": Number(gap, 1e-3 + i * 1e-4), "stiffness": Number(60.0, 1.0)})
             for i, (side, gap) in enumerate((("motor", motor), ("load", load)))
         }
-        values = watcher._judge_gap(found)
+        values = watcher._judge_gap(result)
         assert (values["alarm"], values["contradiction"], values["side"]) == (alarm, contrary, "motor")
         assert values["half_gap"] == motor
 
@@ -209,7 +209,7 @@ def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, same):
 def test_values_are_the_same_whatever_pieces_rows_come_in(logs):
     task = read_watch_task("udp://127.0.0.1:1", logs / "axis.toml", **WINDOW)
     rows = pd.read_csv(logs / "same.csv")
-    found = []
+    result = []
     with jax.enable_x64(True):
         for size in (10_000, 333):
             watcher = Watcher(task, lambda values: None)
@@ -217,8 +217,8 @@ def test_values_are_the_same_whatever_pieces_rows_come_in(logs):
                 part = rows[i : i + size]
                 positions = {"motor": part["theta_e"].to_numpy(), "load": part["theta_s"].to_numpy()}
                 watcher.take(jaxbl.records.live.Rows(float(part["t"].iloc[0]), part["u"].to_numpy(), positions, i == 0))
-            found.append(pd.DataFrame(watcher.values))
-    pd.testing.assert_frame_equal(*found, rtol=1e-6, atol=1e-9)
+            result.append(pd.DataFrame(watcher.values))
+    pd.testing.assert_frame_equal(*result, rtol=1e-6, atol=1e-9)
 
 
 def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
@@ -229,9 +229,9 @@ def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
     log = tmp_path / "log.csv"
     still.to_csv(log, index=False)
     task = read_watch_task(log, logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
-    found = run_watch(task, ended=looks(8))
-    assert (found.summary["values"], found.summary["determined"], found.summary["alarm"]) == (12, 0, None)
-    assert jaxbl.write_report(found, tmp_path)[0].startswith("Nothing was determined (12 values)")
+    result = run_watch(task, ended=looks(8))
+    assert (result.summary["values"], result.summary["determined"], result.summary["alarm"]) == (12, 0, None)
+    assert jaxbl.write_report(result, tmp_path)[0].startswith("Nothing was determined (12 values)")
 
 
 def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path, capsys):
@@ -243,7 +243,12 @@ def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path,
     assert all(len(line) <= 100 for line in lines)
     assert sum(line.endswith("ALARM") for line in lines) > 5
     assert any(line.startswith("ALARM from ") for line in shown)
-    assert sorted(one.name for one in (tmp_path / "out").iterdir()) == ["figures", "report.html", "watch.csv", "watch.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "figures",
+        "report.html",
+        "watch.csv",
+        "watch.json",
+    ]
     values = pd.read_csv(tmp_path / "out" / "watch.csv")
     summary = read_json(tmp_path / "out" / "watch.json")
     assert values["t"][values["alarm"]].iloc[0] == summary["alarm"]["t"]
@@ -282,12 +287,12 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
             lines.append(process.stdout.readline())
         values = (tmp_path / "out" / "watch.csv").read_text().splitlines()
         process.send_signal(number)
-        rest, errors = process.communicate(timeout=120)
+        remainder, errors = process.communicate(timeout=120)
     assert process.returncode == (3 if alarm else 0), errors
     assert [line.split(" s ")[0].strip() for line in lines] == [f"{4.0 + 0.5 * i:.1f}" for i in range(12)]
     assert len(values) == 13
-    assert ("ALARM from 4.0 s on" in rest) == alarm
-    assert "Half gap: 0.0" in rest
+    assert ("ALARM from 4.0 s on" in remainder) == alarm
+    assert "Half gap: 0.0" in remainder
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
     assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten
@@ -343,10 +348,10 @@ def test_gaps_in_a_log_part_it(logs, tmp_path):
     """Observers begin anew after a gap; the window goes on."""
     rows = pd.read_csv(logs / "same.csv").drop(index=range(5000, 5300))
     rows.to_csv(tmp_path / "log.csv", index=False)
-    found = jaxbl.watch(tmp_path / "log.csv", logs / "axis.toml", **WINDOW)
-    assert found.summary["samples"] == 9700
-    assert np.abs(found.values["half_gap"] / HALF_GAP - 1.0).max() < 0.01
-    assert found.values["t"].tolist() == pytest.approx([4.0, 4.5, 5.3, *np.arange(5.5, 9.9, 0.5)])
+    watch = jaxbl.watch(tmp_path / "log.csv", logs / "axis.toml", **WINDOW)
+    assert watch.summary["samples"] == 9700
+    assert np.abs(watch.values["half_gap"] / HALF_GAP - 1.0).max() < 0.01
+    assert watch.values["t"].tolist() == pytest.approx([4.0, 4.5, 5.3, *np.arange(5.5, 9.9, 0.5)])
 
 
 def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
@@ -354,14 +359,14 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.bind(("127.0.0.1", 0))
         port = out.getsockname()[1]
-    heard, seen = [], []
+    heard, calls = [], []
 
     def ended():
-        if not seen:
+        if not calls:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
                 out.sendto(b"1,2,3", ("127.0.0.1", port))
-        seen.append(0)
-        return len(seen) > 8
+        calls.append(0)
+        return len(calls) > 8
 
     task = read_watch_task(f"udp://127.0.0.1:{port}", logs / "axis.toml", **WINDOW)
     run_watch(task, on_remark=heard.append, ended=ended)
@@ -375,9 +380,9 @@ def test_a_drive_by_another_simulator(tmp_path):
     log.write(tmp_path / "log.csv")
     data = axis(4.0, transmission=GAP | {"half_gap": 0.06, "stiffness": 50.0})
     data["run"]["sample_period"] = 2e-3
-    found = jaxbl.watch(tmp_path / "log.csv", data, window=3.0, interval=0.5)
-    assert found.summary["determined"] == found.summary["values"] == 2
-    last = found.summary["last"]
+    watch = jaxbl.watch(tmp_path / "log.csv", data, window=3.0, interval=0.5)
+    assert watch.summary["determined"] == watch.summary["values"] == 2
+    last = watch.summary["last"]
     assert last["half_gap"] == pytest.approx(GAP["half_gap"], rel=0.01)
     assert last["stiffness"] == pytest.approx(GAP["stiffness"], rel=0.01)
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
@@ -389,7 +394,7 @@ def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(grown, logs, tmp_
     write_mcap(tmp_path / "grown.mcap", {"axis": zip(log.pop("t"), log.to_dict("records"), strict=True)})
     columns = {name: f"/axis.{name}" for name in ("u", "theta_e", "theta_s")}
     data = axis(log=columns)
-    found = jaxbl.watch(tmp_path / "grown.mcap", data, alarm_gap=LIMIT, **WINDOW)
-    pd.testing.assert_frame_equal(found.values, grown[0].values, rtol=1e-6)
+    watch = jaxbl.watch(tmp_path / "grown.mcap", data, alarm_gap=LIMIT, **WINDOW)
+    pd.testing.assert_frame_equal(watch.values, grown[0].values, rtol=1e-6)
     with pytest.raises(InputError, match=r"grown\.mcap: .*follow"):
         jaxbl.watch(tmp_path / "grown.mcap", data, follow=True, **WINDOW)

@@ -64,14 +64,14 @@ def window_of(rows, data=None, seconds=10.0):
 @pytest.mark.parametrize("half_gap", [0.5 * HALF_GAP, HALF_GAP, 1.5 * HALF_GAP])
 def test_the_numbers_that_rows_were_made_of(half_gap):
     """Also where the model's half gap is another one, with an offset of the twist, friction and a constant torque."""
-    found = window_of(rows_of(half_gap=half_gap)).estimate()
+    estimate = window_of(rows_of(half_gap=half_gap)).estimate()
     for side, own in (("motor", MOTOR), ("load", LOAD)):
-        numbers = found[side].numbers
+        numbers = estimate[side].numbers
         assert numbers["half_gap"].value == pytest.approx(half_gap, rel=1e-4)
         assert numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-4)
         assert numbers["coulomb"].value == pytest.approx(own["coulomb"], rel=5e-3)
         assert numbers["viscous"].value == pytest.approx(own["viscous"], rel=5e-3)
-        assert found[side].zero == pytest.approx(ZERO, abs=1e-5)
+        assert estimate[side].zero == pytest.approx(ZERO, abs=1e-5)
         assert set(numbers) == {"half_gap", "stiffness", "coulomb", "viscous"}
 
 
@@ -80,31 +80,31 @@ def test_the_same_as_a_fit_by_scipy():
     rows = rows_of(noise=0.5)
     time, twist, motor, _ = motion(10_000)
     window = window_of(rows)
-    own = window.estimate()["motor"].numbers
+    numbers = window.estimate()["motor"].numbers
     speed = np.gradient(motor, time, edge_order=2)
     # rows that count: the filter has settled, the motor does not turn, and the velocity has its readings
-    kept = np.abs(late(np.sign(speed))) > 0.9
-    kept[:100] = kept[-20:] = False
+    selected = np.abs(late(np.sign(speed))) > 0.9
+    selected[:100] = selected[-20:] = False
 
     def residual(x):
         stiffness, half_gap, zero, coulomb, viscous, push = x
         torque = hinge(twist, stiffness, half_gap, zero) + coulomb * np.sign(speed) + (viscous - 0.15) * speed + push
-        return (late(torque) - rows["motor.torque"])[kept]
+        return (late(torque) - rows["motor.torque"])[selected]
 
     fit = least_squares(residual, [55.0, 0.07, 0.0, 0.1, 0.1, 0.0], x_scale=[60, 0.1, 0.01, 0.1, 0.1, 0.1], xtol=1e-14)
     for name, value in zip(("stiffness", "half_gap", "_", "coulomb", "viscous"), fit.x, strict=False):
         if name != "_":
             # the constant torque is held at zero a little, velocities are of other readings
-            assert own[name].value == pytest.approx(value, abs=0.1 * own[name].error), name
+            assert numbers[name].value == pytest.approx(value, abs=0.1 * numbers[name].error), name
 
 
 def test_standard_errors_are_the_scatter():
     values = [window_of(rows_of(noise=0.5, seed=seed)).estimate()["motor"].numbers for seed in range(60)]
     for name in ("half_gap", "stiffness", "coulomb", "viscous"):
         scatter = np.std([one[name].value for one in values], ddof=1)
-        said = np.sqrt(np.mean([one[name].error ** 2 for one in values]))
+        stated_error = np.sqrt(np.mean([one[name].error ** 2 for one in values]))
         # both have errors of a tenth with 60 windows of ten blocks
-        assert said == pytest.approx(scatter, rel=0.35), name
+        assert stated_error == pytest.approx(scatter, rel=0.35), name
 
 
 def test_what_determines_nothing_gives_nothing():
@@ -115,8 +115,8 @@ def test_what_determines_nothing_gives_nothing():
     # one flank alone: the gap and the zero of the twist can't be told apart
     flank = rows | {"twist": 0.15 + 0.2 * np.abs(rows["twist"])}
     flank["motor.torque"] = late(hinge(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
-    found = window_of(flank).estimate().get("motor")
-    assert found is None or found.numbers["half_gap"].error > HALF_GAP
+    estimate = window_of(flank).estimate().get("motor")
+    assert estimate is None or estimate.numbers["half_gap"].error > HALF_GAP
     infinite = rows | {"motor.torque": np.full(10_000, np.inf)}
     assert "motor" not in window_of(infinite).estimate()
 
@@ -140,20 +140,22 @@ def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
     count = 5000
     time, _, motor, load = motion(count)
     noise = np.random.default_rng(1).standard_normal((2, count))
-    given = {"motor": motor + 1e-4 * noise[0], "load": load + 2e-5 * noise[1]}
+    inputs = {"motor": motor + 1e-4 * noise[0], "load": load + 2e-5 * noise[1]}
     torque = np.sin(5.0 * time)
 
     def keep(state, signals):
         return {f"{side}.torque": signals.side(side).torque_estimate for side in experiment.sides} | {"twist": signals.twist}
 
-    whole = replay(experiment, jnp.asarray(torque), {side: jnp.asarray(x) for side, x in given.items()}, record=keep)[1]
+    full_replay = replay(experiment, jnp.asarray(torque), {side: jnp.asarray(x) for side, x in inputs.items()}, record=keep)[
+        1
+    ]
     ends = np.cumsum([1, BLOCKS[0], BLOCKS[0] + 1, BLOCKS[1], 300, 1])
-    chain, found = LiveChain(experiment), []
+    chain, result = LiveChain(experiment), []
     for first, end in zip([0, *ends], [*ends, count], strict=True):
         part = slice(first, end)
-        found.append(chain.take(torque[part], {side: x[part] for side, x in given.items()}, restarts=first == 0))
-    for name, values in whole.items():
-        pieces = np.concatenate([one[name] for one in found])
+        result.append(chain.take(torque[part], {side: x[part] for side, x in inputs.items()}, restarts=first == 0))
+    for name, values in full_replay.items():
+        pieces = np.concatenate([one[name] for one in result])
         rms = float(np.sqrt(np.mean(np.asarray(values) ** 2)))
         np.testing.assert_allclose(pieces, values, rtol=0.0, atol=1e-9 * rms, err_msg=name)
-    np.testing.assert_array_equal(np.concatenate([one["load.position"] for one in found]), given["load"])
+    np.testing.assert_array_equal(np.concatenate([one["load.position"] for one in result]), inputs["load"])

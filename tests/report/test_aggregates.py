@@ -33,14 +33,14 @@ def test_spread_is_that_of_pandas(monkeypatch, kind, most):
     of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
     values[(rng.random(3000) < 0.1) | (of == 7)] = np.nan
     monkeypatch.setattr(aggregates, "MOST_VALUES", most)
-    found = spread(lambda: ((of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21, (0.05, 0.5, 0.95))
+    actual = spread(lambda: ((of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21, (0.05, 0.5, 0.95))
     groups = pd.Series(values).groupby(of)
     for name, expected in (("count", groups.count()), ("least", groups.min()), ("largest", groups.max())):
         np.testing.assert_array_equal(
-            getattr(found, name), expected.reindex(range(21), fill_value=[np.nan, 0][name == "count"])
+            getattr(actual, name), expected.reindex(range(21), fill_value=[np.nan, 0][name == "count"])
         )
-    np.testing.assert_array_equal(found.quantiles[1], groups.median().reindex(range(21)))
-    for share, row in zip((0.05, 0.95), found.quantiles[[0, 2]], strict=True):
+    np.testing.assert_array_equal(actual.quantiles[1], groups.median().reindex(range(21)))
+    for share, row in zip((0.05, 0.95), actual.quantiles[[0, 2]], strict=True):
         np.testing.assert_allclose(row, groups.quantile(share).reindex(range(21)), rtol=1e-14)
 
 
@@ -118,16 +118,16 @@ def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
         finite=lambda frame: rng.random(len(frame)) < 0.99,
     )
     assert result.source.manifest["parts"] > 4
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    full, parts = tmp_path / "whole", tmp_path / "parts"
     lines = []
-    for folder in (whole, parts):
+    for folder in (full, parts):
         folder.mkdir()
         lines.append(write_sweep_report(result, folder))
         monkeypatch.setattr(aggregates, "MOST_VALUES", 64)
         monkeypatch.setattr(aggregates, "_MOST_KEPT", 0)
     assert lines[0] == lines[1]
     # values of figures are in the page
-    assert (whole / "report.html").read_bytes() == (parts / "report.html").read_bytes()
+    assert (full / "report.html").read_bytes() == (parts / "report.html").read_bytes()
     assert len(list((parts / "figures").iterdir())) == len(figures)
 
 

@@ -19,11 +19,11 @@ def study():
 
 
 def test_a_notebook_shows_figures_with_captions_and_texts(study):
-    both, one = jaxbl.draw(study), jaxbl.draw(study, "heatmap_motor_chatter")
-    assert len(both) == 2 and [drawn.name for drawn in one] == ["heatmap_motor_chatter"]
-    shown = one._repr_html_()
-    assert shown.count("<figure>") == 1 and f"<figcaption>{one[0].caption}</figcaption>" in shown
-    assert f"x {ALPHA} (rad/s²) from " in shown.partition('alt="')[2].partition('"')[0]
+    figure, one = jaxbl.draw(study), jaxbl.draw(study, "heatmap_motor_chatter")
+    assert len(figure) == 2 and [drawn.name for drawn in one] == ["heatmap_motor_chatter"]
+    html = one._repr_html_()
+    assert html.count("<figure>") == 1 and f"<figcaption>{one[0].caption}</figcaption>" in html
+    assert f"x {ALPHA} (rad/s²) from " in html.partition('alt="')[2].partition('"')[0]
 
 
 def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
@@ -34,7 +34,7 @@ def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
 
 def test_each_kind_of_result_goes_to_its_own_functions():
     for kind, functions in results._KINDS.items():
-        first = [next(iter(inspect.signature(one).parameters.values())).annotation for one in functions]
+        first = [next(iter(inspect.signature(function).parameters.values())).annotation for function in functions]
         assert first == [kind, kind]
 
 

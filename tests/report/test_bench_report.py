@@ -28,8 +28,8 @@ def result():
 
 def test_files_and_figures(result, tmp_path):
     write_bench_report(result, tmp_path)
-    found = json.loads((tmp_path / "bench.json").read_text())
-    row = next(r for r in found["rows"] if (r["name"], r["precision"]) == (FUSED_NAME, "float64"))
+    content = json.loads((tmp_path / "bench.json").read_text())
+    row = next(r for r in content["rows"] if (r["name"], r["precision"]) == (FUSED_NAME, "float64"))
     assert row["lane_steps_per_second"] == pytest.approx(4e8)
     assert row["median_lane_steps_per_second"] == pytest.approx(4e8 / 1.5)
     assert {"name", "precision", "lanes", "steps", "lane_steps_per_second"} <= set(row)

@@ -57,10 +57,10 @@ def test_report_holds_lines_numbers_and_figures(folder):
 
 
 def test_sentences_have_the_numbers_of_the_summary(point):
-    found = point.summary["points"][0]["sides"]["motor"]
+    motor = point.summary["points"][0]["sides"]["motor"]
     line, chosen_line = choice_headline(point.summary)
-    assert line.startswith(f"motor: {found['best']} ")
-    for kind, one in list(found["kinds"].items())[1:]:
+    assert line.startswith(f"motor: {motor['best']} ")
+    for kind, one in list(motor["kinds"].items())[1:]:
         assert f"{kind} {one['ratio']:.3g} ({one['low']:.3g} to {one['high']:.3g})" in line
     assert point.summary["for_both_sides"] in chosen_line
 
@@ -82,7 +82,7 @@ def test_the_point_figure_has_a_dot_at_each_ratio(point):
     kinds = point.summary["points"][0]["sides"]["motor"]["kinds"]
     assert [label.get_text() for label in ax.get_yticklabels()] == list(kinds)
     dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(dots, [one["ratio"] for one in kinds.values()])
+    np.testing.assert_allclose(dots, [kind["ratio"] for kind in kinds.values()])
     assert drawn.name == "observers" and "rad/s" in drawn.caption
 
 
@@ -128,7 +128,7 @@ def test_points_won_are_counted(mapped):
 
 def test_short_names_are_different():
     names = ["super_twisting", "differentiator_3", "differentiator_1", "dirty_derivative", "slow_tracker", "steady_twin"]
-    found = short_names(names)
-    assert found["super_twisting"] == "ST"
-    assert found["differentiator_3"] == "D3"
-    assert len(set(found.values())) == len(names)
+    result = short_names(names)
+    assert result["super_twisting"] == "ST"
+    assert result["differentiator_3"] == "D3"
+    assert len(set(result.values())) == len(names)

@@ -54,7 +54,7 @@ def test_command_writes_text_json_and_figure(folders, called):
     data = json.loads((folders / "both" / "comparison.json").read_text())
     assert data["config"]["excitation.amplitude"] == [0.1, 0.4]
     assert data["points"] == {"both": 6, "first_only": 0, "second_only": 4}
-    sizes = next(one for one in data["metrics"] if one["metric"] == "motor.f_plus_acceleration")
+    sizes = next(metric for metric in data["metrics"] if metric["metric"] == "motor.f_plus_acceleration")
     # the acceleration of a linear drive is in proportion to its input
     assert (sizes["points"], sizes["differs"], sizes["up"]) == (6, 6, 6)
     assert sizes["moved"]["value"] == pytest.approx(4.0, rel=1e-6)

@@ -112,7 +112,7 @@ def test_the_headline_has_verdict_numbers_and_gap():
 
 def test_the_observers_residual_is_given_where_they_converge():
     assert not any("observers" in line for line in diagnosis_lines(SUMMARY))
-    seen = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
+    calls = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
     nothing = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
     silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
 
@@ -120,18 +120,18 @@ def test_the_observers_residual_is_given_where_they_converge():
         where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in observed.items()}
         return [line for line in diagnosis_lines(changed(where=where)) if "observers" in line]
 
-    assert lines_of(motor=nothing, load=seen) == [
+    assert lines_of(motor=nothing, load=calls) == [
         "By the observers' equivalent control: motor side, no more than its noise (0.02 N m rms); load side, 2.1 N m rms "
         "(its noise 0.2), correlation 0.99 with the smoother's."
     ]
-    assert lines_of(motor=silent, load=seen)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
+    assert lines_of(motor=silent, load=calls)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
     assert lines_of(motor=silent) == []
 
 
 def test_other_verdicts_say_what_is_left():
     assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
-    rest = {"load.drift": {"evidence": 30.0, "share": 0.01}}
-    lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=rest))
+    remainder = {"load.drift": {"evidence": 30.0, "share": 0.01}}
+    lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=remainder))
     assert lines[0].startswith("Unknown: no known effect explains what is missing: motor side")
     assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
@@ -147,15 +147,15 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     partly = (
         "Partly explained: the model lacks load.coulomb_friction; with it, {} of the missing torque is explained on data "
     )
-    rest = "not used for the fit. The rest is none of the known effects: load side, there."
+    remainder = "not used for the fit. The rest is none of the known effects: load side, there."
     first, _, _, second, *_ = lines(failed=["theta_e"])
-    assert first == partly.format("83 %") + rest
+    assert first == partly.format("83 %") + remainder
     assert second == (
         "More is left than noise, the uncertainty of the numbers and torques too small to be named account for (1 % test): "
         "theta_e 0.0011 rad (at most 0.0012)."
     )
-    assert lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + rest
-    assert lines(share=-0.2, remainder=True)[0] == partly.format("none") + rest
+    assert lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + remainder
+    assert lines(share=-0.2, remainder=True)[0] == partly.format("none") + remainder
     first, _, _, second, *_ = lines(far={"drive.motor_inertia": -25.0})
     assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
@@ -180,8 +180,8 @@ def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
     }
     gap = SUMMARY["gap"] | {"slow_torques": slow}
     gap["test"] = gap["test"] | {"failed": ["torque_motor below 18 Hz", "torque_motor below 9 Hz"]}
-    said = diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
-    assert said.endswith("(1 % test): torque_motor below 9 Hz 0.03 N m (at most 0.01).")
+    diagnosis_line = diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
+    assert diagnosis_line.endswith("(1 % test): torque_motor below 9 Hz 0.03 N m (at most 0.01).")
     # of a model that diverges nothing is finite
     slow["torque_motor below 18 Hz"]["after"] = None
     assert "torque_motor below 18 Hz" in diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
@@ -232,8 +232,8 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     pairs = {"motor": [(residual(before, rows), residual(noise, rows), held) for rows, held in parts]}
     record = _Named(unit_of=lambda path, unit: unit, path=tmp_path / "axis.csv")
     gap = {"holdout": {"separate": False}}
-    found = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
-    drawn = _over_time(found)  # type: ignore[arg-type]
+    part = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
+    drawn = _over_time(part)  # type: ignore[arg-type]
     (ax,) = drawn.figure.axes
     assert ax.get_ylabel() == "motor:\nmissing torque (N m)"
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["before", "after", "± 2 noise", "held out"]

@@ -11,16 +11,16 @@ from jaxbl.sweeps.trial import run
 def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5}
     trial = run(small({"observer.motor": gains, "encoders.noise": 0.0, "run.duration": 1.0}))
-    found = trial.summary["conditions"]["motor"]
-    left, right = error_plane(trial.trace, "motor", found).figure.axes
+    motor = trial.summary["conditions"]["motor"]
+    left, right = error_plane(trial.trace, "motor", motor).figure.axes
     error, majorant = left.get_lines()
     assert majorant.get_ydata()[0] == pytest.approx(0.5, rel=0.05)
     assert np.abs(error.get_xdata()).max() <= np.abs(majorant.get_xdata()).max()
     labels = [line.get_label() for line in right.get_lines()]
-    ratio = found["least_lambda"]["davila_fridman"] / found["lambda"]
-    assert labels[1:] == [f"majorant (37): ratio {ratio:.3g}", f"exact worst case: ratio {found['peak_ratio']:.3g}"]
+    ratio = motor["least_lambda"]["davila_fridman"] / motor["lambda"]
+    assert labels[1:] == [f"majorant (37): ratio {ratio:.3g}", f"exact worst case: ratio {motor['peak_ratio']:.3g}"]
     # what the run shows is no worse than the worst case
-    assert labels[0].startswith("run: ratio ") and float(labels[0].split()[2]) <= found["peak_ratio"]
+    assert labels[0].startswith("run: ratio ") and float(labels[0].split()[2]) <= motor["peak_ratio"]
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,11 @@ def test_outline_keeps_the_extremes_and_the_order():
     values[7] = 50.0
     values[99_999] = -60.0
     values[2000:9000] = np.nan
-    at = outline(values, 2400)
-    assert len(at) < 2500
-    assert np.all(np.diff(at) >= 0)
-    assert np.nanmax(values[at]) == 50.0 and np.nanmin(values[at]) == -60.0
-    assert np.isnan(values[at]).any()
+    index = outline(values, 2400)
+    assert len(index) < 2500
+    assert np.all(np.diff(index) >= 0)
+    assert np.nanmax(values[index]) == 50.0 and np.nanmin(values[index]) == -60.0
+    assert np.isnan(values[index]).any()
 
 
 def test_a_few_outliers_do_not_set_the_ends_of_an_axis():
@@ -46,6 +46,6 @@ def test_a_user_s_name_is_drawn_as_it_is(tmp_path):
         ax.plot([0.0, 1.0], label=literal(name))
     ax.legend()
     save(figure, tmp_path / "figure.png")
-    shown = [text.get_text().replace(r"\$", "$") for text in ax.get_legend().get_texts()]
-    assert shown[:4] == [r"$\frac{$", r"a\$b$", r"\x1b[31m\n", "漢"]
-    assert len(shown[4]) == 40
+    labels = [text.get_text().replace(r"\$", "$") for text in ax.get_legend().get_texts()]
+    assert labels[:4] == [r"$\frac{$", r"a\$b$", r"\x1b[31m\n", "漢"]
+    assert len(labels[4]) == 40

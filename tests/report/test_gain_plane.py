@@ -21,11 +21,11 @@ GAINS = {
 @pytest.mark.parametrize("case", GAINS)
 def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
     lambda_, alpha, bound, text = GAINS[case]
-    found = judge_gains(lambda_, alpha, bound)
-    line = conditions_line("motor", found, "of a test")
+    result = judge_gains(lambda_, alpha, bound)
+    line = conditions_line("motor", result, "of a test")
     assert line.startswith(f"motor: at f⁺ = {bound:g} rad/s², of a test, ")
     assert text in line
-    drawn = draw_gain_plane("motor", found)
+    drawn = draw_gain_plane("motor", result)
     ax = drawn.figure.axes[0]
     star = next(one for one in ax.lines if one.get_marker() == "*")
     (x,), (y,) = star.get_data()
@@ -45,22 +45,22 @@ def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
 
 
 def test_undisturbed_the_exact_condition_alone_asks_for_no_more_than_a_lambda():
-    found = judge_gains(0.1, 1.0, 0.0)
-    line = conditions_line("motor", found, "of a test")
+    result = judge_gains(0.1, 1.0, 0.0)
+    line = conditions_line("motor", result, "of a test")
     assert line.endswith("nothing disturbs the observer: the exact gain condition asks for λ > 0 alone.")
-    assert found["holds"]["exact"] and not found["holds"]["seeber_horn"]
+    assert result["holds"]["exact"] and not result["holds"]["seeber_horn"]
 
 
 def test_factors_lead_to_where_the_exact_condition_fails():
-    found = judge_gains(1.24, 2.84, 1.97)
-    line = conditions_line("motor", found, "of a test")
+    result = judge_gains(1.24, 2.84, 1.97)
+    line = conditions_line("motor", result, "of a test")
     factor = float(line.partition("fall by a factor of ")[2].partition(" ")[0])
     grown = float(line.partition("grow by one of ")[2].partition(" ")[0])
     for share, held in ((0.999, True), (1.001, False)):
         assert judge_gains(1.24 / (factor * share), 2.84, 1.97)["holds"]["exact"] == held
         assert judge_gains(1.24, 2.84, 1.97 * grown * share)["holds"]["exact"] == held
     # the dashed curve for that f⁺ goes through the gains
-    ax = draw_gain_plane("motor", found).figure.axes[0]
+    ax = draw_gain_plane("motor", result).figure.axes[0]
     edge = next(one for one in ax.lines if one.get_color() == "black" and one.get_linestyle() == "--")
     x, y = edge.get_data()
     # the first point is that of the vertical part

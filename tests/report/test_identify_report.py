@@ -76,7 +76,7 @@ def made(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
     if gap:
         # as of the observers, which run on the longest part alone
         chain = ["twist", *(f"{s}.{n}" for s in sides for n in ("velocity_estimate", "torque_estimate", *names))]
-        longest = max(record.segments, key=lambda one: one.stop - one.start)
+        longest = max(record.segments, key=lambda segment: segment.stop - segment.start)
         outside = np.ones(len(trace), bool)
         outside[longest] = False
         trace.loc[outside, chain] = np.nan
@@ -125,8 +125,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_all_figures_are_drawn_with_units(case, tmp_path):
     data, how, names = CASES[case]
-    found = made(data, tmp_path, **how)
-    drawn = draw_identification(found)
+    result = made(data, tmp_path, **how)
+    drawn = draw_identification(result)
     assert [one.name for one in drawn] == names
     for one in drawn:
         assert one.caption.endswith(".")
@@ -156,10 +156,10 @@ def labels(figure: Figure) -> list[str]:
 
 
 def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
-    found = made(CASES["rigid"][0], tmp_path)
-    one = found.summary["parameters"]["drive.motor_inertia"]
-    one["interval"] = [one["value"] - 5e-3, 10.0 * one["value"]]
-    ax = draw_identification(found)[0].figure.axes[0]
+    result = made(CASES["rigid"][0], tmp_path)
+    motor_inertia = result.summary["parameters"]["drive.motor_inertia"]
+    motor_inertia["interval"] = [motor_inertia["value"] - 5e-3, 10.0 * motor_inertia["value"]]
+    ax = draw_identification(result)[0].figure.axes[0]
     arrows = [(line.get_marker(), *line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("<", ">")]
     assert arrows == [(">", ax.get_xlim()[1], 0.0)]
 
@@ -172,12 +172,12 @@ def test_the_page_in_a_browser(tmp_path):
 
 
 def test_a_linear_axis_has_newtons_and_metres(tmp_path):
-    found = made(CASES["linear"][0], tmp_path, unit="m")
-    words = "\n".join(write_identification_report(found, tmp_path))
+    result = made(CASES["linear"][0], tmp_path, unit="m")
+    words = "\n".join(write_identification_report(result, tmp_path))
     assert "drive.motor_inertia = 0.05 ± 0.001 kg," in words
     assert "drive.motor_viscous = 0.15 ± 0.001 N s/m," in words
     assert "position residual 0.0001 m rms" in words
-    figures = {one.name: one.figure for one in draw_identification(found)}
+    figures = {one.name: one.figure for one in draw_identification(result)}
     assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
     assert figures["resistance"].axes[0].get_ylabel() == "resisting force (N)"
     assert "kg m²" not in (tmp_path / "report.html").read_text()
@@ -186,11 +186,11 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
 def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
     friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
-    found = made(geared({"run.duration": 2.0}, effects=friction), tmp_path)
-    axes = drawn_of(found)["torque"].figure.axes
+    result = made(geared({"run.duration": 2.0}, effects=friction), tmp_path)
+    axes = drawn_of(result)["torque"].figure.axes
     rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert len(rms) == 2
-    without = dataclasses.replace(found, trace=found.trace.drop(columns=["motor.effects", "load.effects"]))
+    without = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
     axes = drawn_of(without)["torque"].figure.axes
     more = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert min(rms) < 0.6 * min(more)
@@ -198,11 +198,11 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
 
 def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     """Small motion, then large motion in the third quarter."""
-    found = made(geared({"run.duration": 10.0}), tmp_path)
-    trace = found.trace.copy()
+    result = made(geared({"run.duration": 10.0}), tmp_path)
+    trace = result.trace.copy()
     size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
     trace["motor.velocity"] *= size
-    above, below = drawn_of(dataclasses.replace(found, trace=trace))["velocities"].figure.axes[::2]
+    above, below = drawn_of(dataclasses.replace(result, trace=trace))["velocities"].figure.axes[::2]
     low, high = above.get_xlim()
     assert 5.9 < low < high < 8.1
     assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
@@ -210,11 +210,11 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
 
 @pytest.mark.usefixtures("every_figure_drawn")
 def test_observers_that_diverged_leave_figures(tmp_path):
-    found = made(geared(), tmp_path)
-    trace = found.trace.copy()
+    result = made(geared(), tmp_path)
+    trace = result.trace.copy()
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
-    drawn = draw_identification(dataclasses.replace(found, trace=trace))
+    drawn = draw_identification(dataclasses.replace(result, trace=trace))
     assert [one.name for one in drawn] == GEARED
     for one in drawn:
         save(one.figure, tmp_path / f"{one.name}.png")
@@ -222,11 +222,11 @@ def test_observers_that_diverged_leave_figures(tmp_path):
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
 def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
-    found = made(geared(), tmp_path)
-    trace = found.trace.copy()
+    result = made(geared(), tmp_path)
+    trace = result.trace.copy()
     for side in ("motor", "load"):
         trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))
-    figure = drawn_of(dataclasses.replace(found, trace=trace))["recursive"].figure
+    figure = drawn_of(dataclasses.replace(result, trace=trace))["recursive"].figure
     low, high = figure.axes[1].get_ylim()
     margin = 0.1 * (high - low)
     assert low + margin < 0.08 < high - margin

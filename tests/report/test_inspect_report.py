@@ -60,8 +60,8 @@ def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
     frame = frame.assign(sensor=frame["u"])
     frame.loc[200:202, "t"] = frame.loc[200, "t"]
     frame.to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", {"theta_s": {"skew": 1.0}, "transmitted": "sensor", "stop": 2.9e3})
-    lines = summary(found)
+    inspection = inspect(tmp_path / "log.parquet", {"theta_s": {"skew": 1.0}, "transmitted": "sensor", "stop": 2.9e3})
+    lines = summary(inspection)
     # three sentences, both tables, and three lines of remarks
     ends = [i for i, line in enumerate(lines) if not line]
     assert ends[0] == 3 and len(lines) - ends[2] == 4
@@ -73,9 +73,9 @@ def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
 def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
     (tmp_path / "out").mkdir()
     simulate_log(gap=0.1).rename(columns={"theta_e": "a<b"}).to_parquet(tmp_path / "log.parquet")
-    found = inspect(tmp_path / "log.parquet", {"theta_e": "a<b"}, gear_ratio=GEAR_RATIO)
-    lines = write_inspection_report(found, tmp_path / "out")
-    assert lines == summary(found)
+    inspection = inspect(tmp_path / "log.parquet", {"theta_e": "a<b"}, gear_ratio=GEAR_RATIO)
+    lines = write_inspection_report(inspection, tmp_path / "out")
+    assert lines == summary(inspection)
     page = (tmp_path / "out" / "report.html").read_text()
     Page(page)
     assert page.count("<img") == 4
@@ -94,9 +94,9 @@ def test_the_page_in_a_browser(tmp_path):
 
 
 def test_a_real_log_with_two_encoders(tmp_path):
-    found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    twist = draw_inspection(found)[-1]
+    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    twist = draw_inspection(inspection)[-1]
     assert twist.name == "twist" and len(twist.figure.axes) == 1
     labels = [text.get_text() for text in twist.figure.axes[0].get_legend().get_texts()]
     assert labels == ["load on its first side", "on the other"]
-    assert summary(found)[0] == "outputEncoderData.txt: 42000 samples, 126 s every 3 ms, even stamps, one segment"
+    assert summary(inspection)[0] == "outputEncoderData.txt: 42000 samples, 126 s every 3 ms, even stamps, one segment"

@@ -115,12 +115,12 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
 def test_what_did_not_converge_is_hatched(tmp_path):
     data = small(axes=GAINS, figures=[heatmap()])
     none = drawn(tmp_path, data, motor__velocity_rmse=product)
-    some = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0)
+    selection = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0)
     all_ = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] < 0.0)
     assert legend(none) == []
-    assert legend(some) == legend(all_) == ["motor not converged"]
+    assert legend(selection) == legend(all_) == ["motor not converged"]
     # the best is sought among those that converged
-    assert "best ★ 7.1" in panels(some)[0].get_title()
+    assert "best ★ 7.1" in panels(selection)[0].get_title()
 
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
@@ -279,9 +279,9 @@ def test_more_parts_than_a_figure_can_have(figure, key, part):
     axes = [*GAINS, spaced(NOISE, 1e-6, 1e-3, 61)]
     with pytest.raises(InputError) as error:
         draw(made(rigid(axes=axes, figures=[figure(**{key: NOISE})])))
-    said = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
-    said += "can be drawn; name another axis, or give it fewer values"
-    assert str(error.value) == said
+    output = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
+    output += "can be drawn; name another axis, or give it fewer values"
+    assert str(error.value) == output
     # a study that asks for no figures gets one all the same
     (drawing,) = draw(made(rigid(axes=axes[::-1])))
     assert drawing.caption.endswith(f"median over {NOISE}.")

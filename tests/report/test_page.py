@@ -49,10 +49,10 @@ HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 
 
 def test_everything_is_escaped_and_in_its_place():
-    shown = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
+    picture = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
     table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
     text = html(
-        HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"', [NextStep(HOSTILE, HOSTILE)]
+        HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, picture)], [table], f'title = "{HOSTILE}"', [NextStep(HOSTILE, HOSTILE)]
     )
     page = Page(text)
     # values of the figure, and the page's own
@@ -133,15 +133,15 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
         left, top, width, height = panel["place"]
         # of the map's first column, the middle row
         view.hover(position=place(view, left + 0.05 * width, top + 0.5 * height))
-        shown = dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n"))
+        texts = dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n"))
         alpha = 50.0**0.5
-        assert [float(text) for text in shown.values()] == pytest.approx([alpha, 1.0, alpha], rel=1e-3)
-        assert list(shown) == ["motor: velocity error, rms (rad/s)", f"{LAMBDA} (√rad/s)", f"{ALPHA} (rad/s²)"]
+        assert [float(text) for text in texts.values()] == pytest.approx([alpha, 1.0, alpha], rel=1e-3)
+        assert list(texts) == ["motor: velocity error, rms (rad/s)", f"{LAMBDA} (√rad/s)", f"{ALPHA} (rad/s²)"]
         # the same place, zoomed: the pointer stays on its cell
         view.dblclick(position=place(view, left + 0.05 * width, top + 0.5 * height))
         assert "scale(3)" in page.locator("figure img").get_attribute("style")
         view.hover(position=place(view, left + 0.05 * width, top + 0.5 * height))
-        assert dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n")) == shown
+        assert dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n")) == texts
         page.get_by_label("whole figure").click()
         assert not page.locator("figure img").get_attribute("style")
         # by keyboard, and said to a screen reader
@@ -177,9 +177,9 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
         "a\x1b]0;b\x07\x00\u202e",
         "x" * 5000,
     ]
-    shown = Picture(b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>', (9, 9), names[1], names[2] * 2, [])
+    picture = Picture(b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>', (9, 9), names[1], names[2] * 2, [])
     table = PageTable(names[1], names, [names, names])
-    text = html(names[2], names, names, [(names[0], shown)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
+    text = html(names[2], names, names, [(names[0], picture)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
     with opened(tmp_path / "page.html") as (page,):
         check(page, 2)

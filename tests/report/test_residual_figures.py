@@ -30,9 +30,9 @@ def test_observers_that_converge_are_drawn_thin(tmp_path):
     torque = {name: -0.1 * np.sign(np.cos(time)) for name in ("motor", "load")}
     pairs = {name: made(name, one, time) for name, one in torque.items()}
     residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
-    found = {name: locate(residuals[name], coordinates[name]) for name in pairs}
+    result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
-    drawn = draw_residuals(residuals, coordinates, found, observed=observed)[0]
+    drawn = draw_residuals(residuals, coordinates, result, observed=observed)[0]
     above, below = (ax.get_legend_handles_labels()[1] for ax in drawn.figure.axes)
     assert above[:2] == below == ["missing", "± 2 noise"] and len(above) == 3
     assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawn.caption
@@ -47,11 +47,11 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     pairs = {name: made(name, one, time) for name, one in torque.items()}
     residuals = {name: [residual] for name, (residual, _) in pairs.items()}
     coordinates = {name: [values] for name, (_, values) in pairs.items()}
-    found = {name: locate(residuals[name], coordinates[name]) for name in pairs}
-    drawn = {one.name: one for one in draw_residuals(residuals, coordinates, found, unit)}
+    result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
+    drawn = {one.name: one for one in draw_residuals(residuals, coordinates, result, unit)}
     assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
     above, below = drawn["residual_torque"].figure.axes
-    assert sentence_of(found["motor"], unit) == " ".join(above.get_title("left").split())
+    assert sentence_of(result["motor"], unit) == " ".join(above.get_title("left").split())
     assert "nothing beyond noise" in below.get_title("left")
     assert above.get_ylabel().endswith(f"({unit})")
     assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"

@@ -101,11 +101,11 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned, tmp_path):
 def bound_to(summary, binding):
     """The summary, as if some constraints of the motor had bound."""
     summary = copy.deepcopy(summary)
-    found = summary["limits"]["motor"]
-    found["binding"] = binding
+    motor = summary["limits"]["motor"]
+    motor["binding"] = binding
     for name in binding:
-        found["constraints"][name]["binds"] = True
-        found["towards"]["lambda"]["smaller"] = {
+        motor["constraints"][name]["binds"] = True
+        motor["towards"]["lambda"]["smaller"] = {
             "limit": "constraint",
             "missed": [name],
             "at": 1.0,
@@ -117,8 +117,8 @@ def bound_to(summary, binding):
 
 def test_map_and_sentence_name_the_constraint_that_binds(tuned):
     for binding in ([], ["margin_exact"]):
-        found = dataclasses.replace(tuned, summary=bound_to(tuned.summary, binding))
-        drawn = {d.name: d for d in draw_tuning(found)}
+        result = dataclasses.replace(tuned, summary=bound_to(tuned.summary, binding))
+        drawn = {d.name: d for d in draw_tuning(result)}
         legends = {
             name: [text.get_text() for legend in drawn[name].figure.legends for text in legend.get_texts()]
             for name in ("tuning_motor", "limits_motor")
@@ -126,7 +126,7 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuned):
         named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
         assert named == [bool(binding)] * 2
         assert ("Bold line: margin_exact, which binds." in drawn["tuning_motor"].caption) == bool(binding)
-        lead = next(line for line in tune_headline(found.summary) if line.startswith("motor, what limits the gains: "))
+        lead = next(line for line in tune_headline(result.summary) if line.startswith("motor, what limits the gains: "))
         assert lead.partition(": ")[2].partition(" (Chatter")[0] in drawn["limits_motor"].caption
         assert ("margin_exact = 1.1 (here" in lead) == bool(binding)
         assert ("no constraint binds" in lead) != bool(binding)
@@ -136,18 +136,18 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuned):
 
 def test_limits_are_drawn_as_the_numbers_have_them(tuned):
     drawing = next(d for d in draw_tuning(tuned) if d.name == "limits_load")
-    found = tuned.summary["limits"]["load"]
+    load = tuned.summary["limits"]["load"]
     for ax, gain in zip(drawing.figure.axes, ("lambda", "alpha"), strict=True):
-        line, profile = ax.lines[0], found["profiles"][gain]
+        line, profile = ax.lines[0], load["profiles"][gain]
         np.testing.assert_allclose(line.get_xydata(), np.column_stack([profile[gain], profile["error"]]))
-        larger = found["towards"][gain]["larger"]
+        larger = load["towards"][gain]["larger"]
         assert larger["limit"] == "error"
         size = f"× {1 + larger['change']:.2g}" if larger["change"] >= 1.0 else f"{100 * larger['change']:+.2g} %"
         assert size in ax.get_title("right")
         # each stretch of missed constraints is shaded
         missed = sum("margin_exact" in names for names in profile["missed"])
         spans = [patch for patch in ax.patches if patch.get_facecolor()[:3] == to_rgb("#E8000B")]
-        inside = sum(one.get_x() < x < one.get_x() + one.get_width() for one in spans for x in profile[gain])
+        inside = sum(span.get_x() < x < span.get_x() + span.get_width() for span in spans for x in profile[gain])
         assert inside == missed > 0
 
 
@@ -176,9 +176,12 @@ def test_bars_have_the_names_beside_them(folder, tuned):
         panel = json.loads(figure.locator("script").text_content())[0]
         left, bottom, width, height = panel["bars"][0]
         low, high = panel["x"]["ends"], panel["y"]["ends"]
-        at = (left + 0.5 * width - low[0]) / (low[1] - low[0]), 1.0 - (bottom + 0.5 * height - high[0]) / (high[1] - high[0])
+        index = (
+            (left + 0.5 * width - low[0]) / (low[1] - low[0]),
+            1.0 - (bottom + 0.5 * height - high[0]) / (high[1] - high[0]),
+        )
         x, y, wide, tall = panel["place"]
-        figure.locator(".view").hover(position=place(figure.locator(".view"), x + at[0] * wide, y + at[1] * tall))
+        figure.locator(".view").hover(position=place(figure.locator(".view"), x + index[0] * wide, y + index[1] * tall))
         name, value = figure.locator(".values").inner_text().split("\n")
         assert name in [one for _, one in panel["y"]["names"]]
         assert float(value.rpartition(": ")[2]) == pytest.approx(left + width, rel=1e-3)

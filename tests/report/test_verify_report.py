@@ -68,15 +68,15 @@ def test_tuning_rules_in_figure_page_and_lines(checked):
     (drawn,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
     good, wrong = drawn.figure.axes
     legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (good, wrong)]
-    for one in rules:
-        assert (one["title"] in legends[0]) == one["sufficient"]
-        assert (one["title"] in legends[1]) != one["sufficient"]
+    for rule in rules:
+        assert (rule["title"] in legends[0]) == rule["sufficient"]
+        assert (rule["title"] in legends[1]) != rule["sufficient"]
     crosses = [line.get_xydata()[0] for line in wrong.lines if line.get_marker() == "x"]
-    failed = [one["counterexample"] for one in rules if not one["sufficient"]]
-    expected = [(found["alpha"] / found["f_plus"], found["lambda"] / found["f_plus"] ** 0.5) for found in failed]
+    failed = [rule["counterexample"] for rule in rules if not rule["sufficient"]]
+    expected = [(actual["alpha"] / actual["f_plus"], actual["lambda"] / actual["f_plus"] ** 0.5) for actual in failed]
     np.testing.assert_allclose(crosses, expected)
     page = (folder / "report.html").read_text()
-    assert all(one["source"].split(",")[0] in page for one in rules)
+    assert all(rule["source"].split(",")[0] in page for rule in rules)
     (counted,) = [line for line in lines if "public tuning rules are sufficient" in line]
     assert counted.startswith(f"{len(rules) - len(failed)} of {len(rules)} ")
     assert sum(line.startswith("Tuning rule ") for line in lines) == len(failed) > 0

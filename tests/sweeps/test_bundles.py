@@ -29,13 +29,13 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
     alone = sweep(thirty(), tmp_path / "alone")
     count = len(computed)
     computed.clear()
-    seen = []
-    result = sweep(thirty(), tmp_path / "cluster", scheduler=client, progress=lambda *done: seen.append(done))
+    calls = []
+    result = sweep(thirty(), tmp_path / "cluster", scheduler=client, progress=lambda *done: calls.append(done))
     assert sorted(computed) == list(range(count)) and count == 8
     assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
     pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
     assert result.cost["lanes"] == 30 and result.cost["run_seconds"] > 0.0
-    assert seen[-1] == (30, 30) and seen == sorted(seen)
+    assert calls[-1] == (30, 30) and calls == sorted(calls)
     # what is there is left out
     lost = tmp_path / "cluster" / "points" / "part-00003.parquet"
     lost.unlink()
@@ -54,12 +54,12 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
 def test_processes_of_this_machine_give_the_same_table(tmp_path):
     sweep(thirty(), tmp_path / "alone")
     other = thirty(sweep={"seeds": 2, "chunk": 256})
-    whole = sweep(other, tmp_path / "whole", devices=jax.devices()[:1]).frame
-    found = sweep(thirty(), tmp_path / "study", scheduler="local:2")
+    full_frame = sweep(other, tmp_path / "whole", devices=jax.devices()[:1]).frame
+    study = sweep(thirty(), tmp_path / "study", scheduler="local:2")
     assert parts(tmp_path / "study") == parts(tmp_path / "alone")
     # in other chunks, on one device
     points = [ALPHA, LAMBDA, "seed"]
-    frames = [frame.sort_values(points, ignore_index=True) for frame in (found.frame, whole)]
+    frames = [frame.sort_values(points, ignore_index=True) for frame in (study.frame, full_frame)]
     pd.testing.assert_frame_equal(*frames, check_exact=True)
 
 
@@ -84,7 +84,7 @@ def test_a_refined_study_on_a_cluster(tmp_path, client):
 
 def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monkeypatch):
     submitted = []
-    monkeypatch.setattr(Cluster, "_submit", lambda self, *given: submitted.append(given) or _submit(self, *given))
+    monkeypatch.setattr(Cluster, "_submit", lambda self, *inputs: submitted.append(inputs) or _submit(self, *inputs))
     with open_stages(read_config(thirty()), "verify", tmp_path, client) as stages:
         stages.write_manifest()
         assert len(stages.run(thirty(), "drive").frame) == 30

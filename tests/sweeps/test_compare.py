@@ -67,9 +67,9 @@ def test_the_tests_are_those_of_scipy(paired):
     a, b = (one.frame.sort_values([ALPHA, LAMBDA, "seed"])[RMSE].to_numpy().reshape(100, 6) for one in (first, second))
     p = (stats.ttest_rel(a, b, axis=1) if paired else stats.ttest_ind(a, b, axis=1, equal_var=False)).pvalue
     expected = stats.false_discovery_control(p, method="by") <= 0.05
-    found = compare(first, second).frame(RMSE).sort_values([ALPHA, LAMBDA])["differs"].to_numpy()
+    differs = compare(first, second).frame(RMSE).sort_values([ALPHA, LAMBDA])["differs"].to_numpy()
     assert 0 < expected.sum() < 100
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(differs, expected)
 
 
 def test_noise_alone_is_no_difference():
@@ -93,56 +93,58 @@ def test_roundings_are_no_difference(seeds):
 
 def test_one_seed_tells_no_noise():
     first, second = study(function=noisy(), seeds=1), study(function=noisy(far, seed=2), seeds=1)
-    found = compare(first, second)
-    assert not found.knows_noise
-    one = next(m for m in found.metrics if m.metric == RMSE)
+    comparison = compare(first, second)
+    assert not comparison.knows_noise
+    one = next(m for m in comparison.metrics if m.metric == RMSE)
     assert (one.differs, one.changed, one.count) == (None, 100, 100)
     assert np.isnan(one.moved.low)
-    assert any("Noise: not known (one common seed)" in line for line in comparison_lines(found))
+    assert any("Noise: not known (one common seed)" in line for line in comparison_lines(comparison))
 
 
 def test_different_grids_are_compared_where_both_have_points():
     other = [spaced(ALPHA, 1.0, 4096.0, 13), listed(LAMBDA, *(np.geomspace(1.0, 8.0, 20)[::2] * (1.0 + 1e-12)).tolist())]
-    found = compare(study(function=noisy()), study(*other, function=noisy(far, seed=2), seeds=9))
-    assert found.points == (50, 50, 80)
-    assert (found.seeds, found.paired) == (6, True)
-    assert next(m for m in found.metrics if m.metric == RMSE).points == 50
-    assert "Points: 50 in both; 50 in the first alone, 80 in the second alone." in comparison_lines(found)
+    comparison = compare(study(function=noisy()), study(*other, function=noisy(far, seed=2), seeds=9))
+    assert comparison.points == (50, 50, 80)
+    assert (comparison.seeds, comparison.paired) == (6, True)
+    assert next(m for m in comparison.metrics if m.metric == RMSE).points == 50
+    assert "Points: 50 in both; 50 in the first alone, 80 in the second alone." in comparison_lines(comparison)
 
 
 def test_an_axis_of_one_study_is_compared_at_the_others_value():
     several = study(*GAINS, listed(NOISE, 1e-3, 1e-4, 0.0), function=lambda frame: frame[ALPHA] * (1.0 + frame[NOISE]))
-    found = compare(study(function=lambda frame: frame[ALPHA] * (1.0 + 1e-4)), several)
-    assert found.points == (100, 0, 200)
-    assert next(m for m in found.metrics if m.metric == RMSE).changed == 0
+    comparison = compare(study(function=lambda frame: frame[ALPHA] * (1.0 + 1e-4)), several)
+    assert comparison.points == (100, 0, 200)
+    assert next(m for m in comparison.metrics if m.metric == RMSE).changed == 0
     # and where the other does not have the number at all
     word = listed("effects.motor.coulomb_friction.torque", 0.0, 0.1)
     with_effect = rigid(axes=[*GAINS, word], effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}])
-    found = compare(study(), made(with_effect))
-    assert found.points == (0, 100, 200)
-    assert found.metrics == ()
-    assert "No point is in both: no metric is compared." in comparison_lines(found)
+    comparison = compare(study(), made(with_effect))
+    assert comparison.points == (0, 100, 200)
+    assert comparison.metrics == ()
+    assert "No point is in both: no metric is compared." in comparison_lines(comparison)
 
 
 def test_config_by_keys_with_what_decides_nothing_left_out():
     effects = [{"kind": "motor.coulomb_friction", "torque": 0.1}, {"kind": "encoder.delay", "time": 1e-3}]
     first = study(changes={"title": "one"})
     second = made(rigid({"title": "two", "drive.motor_inertia": 0.06}, axes=GAINS, effects=effects[:1], sweep={"seeds": 2}))
-    found = compare(first, second)
-    assert found.config["drive.motor_inertia"] == (0.05, 0.06)
-    assert found.config["sweep.seeds"] == (6, 2)
-    assert found.config["effects.motor.coulomb_friction.torque"] == (None, 0.1)
-    assert not any(key.startswith(("title", "axes")) for key in found.config)
+    comparison = compare(first, second)
+    assert comparison.config["drive.motor_inertia"] == (0.05, 0.06)
+    assert comparison.config["sweep.seeds"] == (6, 2)
+    assert comparison.config["effects.motor.coulomb_friction.torque"] == (None, 0.1)
+    assert not any(key.startswith(("title", "axes")) for key in comparison.config)
 
 
 def test_what_is_true_or_false_and_what_is_not_defined():
     columns = {"motor__converged": lambda frame: frame[ALPHA] > 3.0}
     times = {"motor__convergence_time": lambda frame: np.where(frame[ALPHA] > 3.0, 1.0, np.nan)}
-    found = compare(study(**columns, **times), study(motor__convergence_time=lambda frame: 0.0 * frame[ALPHA] + 1.0))
-    converged, time = (next(m for m in found.metrics if m.metric == f"motor.{n}") for n in ("converged", "convergence_time"))
+    comparison = compare(study(**columns, **times), study(motor__convergence_time=lambda frame: 0.0 * frame[ALPHA] + 1.0))
+    converged, time = (
+        next(m for m in comparison.metrics if m.metric == f"motor.{n}") for n in ("converged", "convergence_time")
+    )
     assert (converged.changed, converged.up, converged.moved.value) == (40, 40, pytest.approx(0.4))
     assert (time.points, time.only, time.changed) == (60, (0, 240), 0)
-    text = " ".join(" ".join(comparison_lines(found)).split())
+    text = " ".join(" ".join(comparison_lines(comparison)).split())
     assert "motor.converged: +40.00 % of the runs (+40.00 % to +40.00 %); 40 points gained, 0 lost (of 100)." in text
     assert "motor.convergence_time (240 runs)" in text
 
@@ -153,10 +155,10 @@ def test_text_and_figure(axes):
         return lambda frame: noisy(shift, seed=seed)(frame.assign(**{} if ALPHA in frame else {ALPHA: 9.0}))
 
     first, second = study(*axes, function=size(lambda frame: 0.0, 0)), study(*axes, function=size(far, 2))
-    found = compare(first, second)
-    lines = comparison_lines(found)
-    assert max(len(one) for line in lines for one in line.split("\n")) <= 80
-    drawn = draw_comparison(found, first.config)
+    comparison = compare(first, second)
+    lines = comparison_lines(comparison)
+    assert max(len(part) for line in lines for part in line.split("\n")) <= 80
+    drawn = draw_comparison(comparison, first.config)
     assert len(drawn) == (len(axes[0].get("values", [0, 0])) > 1)
-    names = {field.name for field in dataclasses.fields(found) if not field.name.startswith("_")}
-    assert set(found.to_dict()) == names
+    names = {field.name for field in dataclasses.fields(comparison) if not field.name.startswith("_")}
+    assert set(comparison.to_dict()) == names

@@ -19,17 +19,17 @@ KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 def test_counted_work():
     one, ten = (read_config(small({"run.substeps": n})) for n in (1, 10))
     gains, plants = [LAMBDA, ALPHA], ["transmission.dead_zone"]
-    shared, own = count_operations(ten, gains), count_operations(ten, plants)
+    shared, operations = count_operations(ten, gains), count_operations(ten, plants)
     # one and the same step, by all lanes or by each
-    assert shared.shared + shared.lane == pytest.approx(own.shared + own.lane, rel=0.1)
+    assert shared.shared + shared.lane == pytest.approx(operations.shared + operations.lane, rel=0.1)
     assert shared.shared > 3.0 * shared.lane
-    assert own.lane > own.shared
+    assert operations.lane > operations.shared
     # nine plant steps more, each of them a tanh at least
     for paths, of in ((gains, "shared"), (plants, "lane")):
         more = getattr(count_operations(ten, paths), of) - getattr(count_operations(one, paths), of)
         assert 9 * 30 < more < 9 * 100
     # position and velocity of both sides are among what a lane of its own carries
-    assert own.carried - shared.carried >= 4 * 8
+    assert operations.carried - shared.carried >= 4 * 8
     single = read_config(small({"run.precision": "float32"}))
     assert count_operations(single, gains).carried == pytest.approx(count_operations(one, gains).carried / 2, rel=0.01)
     # a run that is twice as long does not more a sample
@@ -52,10 +52,10 @@ def test_measured_costs_are_those_of_the_machine(monkeypatch):
         return took, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
 
     monkeypatch.setattr(under_test, "_time_programs", times)
-    found = measure_costs(jax.devices()[:1])
+    costs = measure_costs(jax.devices()[:1])
     for backend in ("fused", "scan"):
-        np.testing.assert_allclose(found.of(backend), KNOWN.of(backend), rtol=1e-6)
-    assert found.cache == 4096 * count_operations(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
+        np.testing.assert_allclose(costs.of(backend), KNOWN.of(backend), rtol=1e-6)
+    assert costs.cache == 4096 * count_operations(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
 
 
 def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):

@@ -113,8 +113,8 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     assert Engine(config).backend == "fused"
     result, scanned = sweep(config), sweep(config, backend="scan").frame
     assert result.fallback_reasons == why
-    found = result.frame
-    np.testing.assert_allclose(found["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
+    frame = result.frame
+    np.testing.assert_allclose(frame["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
 
 
 def test_the_faster_backend_is_chosen():
@@ -245,8 +245,8 @@ def test_an_estimate_runs_every_seed(monkeypatch):
     used = []
     compiled = engine.compile_program
 
-    def counted(*arguments, **rest):
-        program = compiled(*arguments, **rest)
+    def counted(*arguments, **remainder):
+        program = compiled(*arguments, **remainder)
 
         def run(values, seeds):
             used.append((len(np.unique(seeds)), *(len(np.unique(column)) for column in values.values())))
@@ -336,10 +336,10 @@ def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
         return engine, engine.run(engine.chunk(0))
 
     _, full = run()
-    _, found = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
+    _, result = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
     columns = [f"motor.{name}" for name in ("converged", "velocity_rmse", "margin_alpha")]
-    assert list(found) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
-    assert_equal(found, full[list(found)])
+    assert list(result) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
+    assert_equal(result, full[list(result)])
     # none of these follows from gains
     engine, alone = run(metrics=["converged"])
     assert list(alone)[4:] == ["finite", "motor.converged"]

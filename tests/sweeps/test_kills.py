@@ -54,24 +54,24 @@ def alone(tmp_path_factory):
         run.join()
         assert run.exitcode == 0
         times.append(time.monotonic() - start)
-        found = parts(folder)
+        result = parts(folder)
         for path in (folder / "points").iterdir():
             path.unlink()
-    return found, times[1]
+    return result, times[1]
 
 
-def begun(function, *given):
-    process = CONTEXT.Process(target=function, args=given)
+def begun(function, *inputs):
+    process = CONTEXT.Process(target=function, args=inputs)
     process.start()
     return process
 
 
 def whole(folder, expected):
     """Parts that are whole, with what changes when one is written again."""
-    found = {path.name: path for path in (folder / "points").glob("part-*")} if (folder / "points").is_dir() else {}
+    actual = {path.name: path for path in (folder / "points").glob("part-*")} if (folder / "points").is_dir() else {}
     return {
         name: (path.stat().st_ino, path.stat().st_mtime_ns)
-        for name, path in found.items()
+        for name, path in actual.items()
         if path.read_bytes() == expected[name]
     }
 

@@ -29,8 +29,8 @@ H = 1e-3
 
 @eqx.filter_jit
 def run(experiment):
-    figures, kept = scan(experiment, jnp.asarray(2), (ALL_METRICS,), lambda state, signals: (signals, state.identifier))
-    return figures, kept
+    figures, selected = scan(experiment, jnp.asarray(2), (ALL_METRICS,), lambda state, signals: (signals, state.identifier))
+    return figures, selected
 
 
 def by_numpy(experiment, signals, identifier):
@@ -170,8 +170,8 @@ def test_some_metrics_alone():
     # one state for both, besides those that show whether the lane stays finite
     assert {side: len(carry) for side, carry in asked.init(experiment).items()} == {"motor": 6, "load": 6}
     assert [needs_gain_metrics(names) for names in (None, ("converged",), ("margin_alpha",))] == [True, False, True]
-    given = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics_reducer(("margin_alpha",)),))[0])
-    assert set(given) == {"finite", "motor.f_plus", "load.f_plus"}
+    inputs = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics_reducer(("margin_alpha",)),))[0])
+    assert set(inputs) == {"finite", "motor.f_plus", "load.f_plus"}
 
 
 @pytest.mark.parametrize(
@@ -209,11 +209,11 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
         "motor": ObserverGains(np.array([4.0, 5.0, 6.0]), np.array([9.0, 9.0, 8.0]), np.array(0.0), np.array(0.5)),
         "load": ObserverGains(*map(np.array, (0.5, 0.4, 0.0, 0.1))),
     }
-    found = add_gain_metrics(f_plus, gains)
+    result = add_gain_metrics(f_plus, gains)
     # both sides by the program of six lanes
     assert counts == [(5, {"largest": 6}), (2, {"largest": 6})]
     for seed, lane in np.ndindex(2, 3):
         alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
         of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}
         for name, value in add_gain_metrics(alone, of_lane).items():
-            np.testing.assert_array_equal(found[name][seed, lane], value, err_msg=name)
+            np.testing.assert_array_equal(result[name][seed, lane], value, err_msg=name)

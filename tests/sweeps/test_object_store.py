@@ -54,9 +54,9 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed):
     address = f"{bucket}/a/study"
     first = share(thirty(), address, (1, 2))
     assert (first.parts, first.finished) == (4, False)
-    found = sweep(thirty(), address)
+    study = sweep(thirty(), address)
     assert sorted(computed) == list(range(8))
-    pd.testing.assert_frame_equal(found.frame, result.frame, check_exact=True)
+    pd.testing.assert_frame_equal(study.frame, result.frame, check_exact=True)
     stored = keys(address)
     assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
     assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == parts(folder)

@@ -55,8 +55,8 @@ def test_a_sweep_over_the_kind_by_both_loops():
 def test_an_axis_over_gains_needs_kinds_that_have_them():
     kinds = {"path": "observer.kind", "values": ["luenberger", "extended_state"]}
     shared = {"path": "observer.motor.bandwidth", "values": [100.0, 200.0]}
-    found = jaxbl.sweep(study(axes=[kinds, shared], sweep={"metrics": ["velocity_rmse"]})).frame
-    assert found["motor.velocity_rmse"].nunique() == 4
+    frame = jaxbl.sweep(study(axes=[kinds, shared], sweep={"metrics": ["velocity_rmse"]})).frame
+    assert frame["motor.velocity_rmse"].nunique() == 4
     kinds["values"].append("kalman")
     with pytest.raises(InputError, match=r"axes\[1\]: 'observer.motor.bandwidth' is no gain of kind 'kalman'"):
         jaxbl.sweep(study(axes=[kinds, shared]))
@@ -87,13 +87,13 @@ def test_wrong_observers_get_one_line(observer, message):
 def test_every_kind_says_what_a_search_should_try(kind):
     """Gains of the class, positive, and a study with them runs."""
     cls = OBSERVERS[kind].select_discretisation("implicit")
-    found = cls.gain_ranges(OperatingConditions(f_plus=3.0, period=1e-3, noise=1e-5))
-    assert found
-    assert all(0.0 < least <= largest < np.inf for least, largest in found.values())
-    middle = {key: (least * largest) ** 0.5 for key, (least, largest) in found.items()}
+    gain_ranges = cls.gain_ranges(OperatingConditions(f_plus=3.0, period=1e-3, noise=1e-5))
+    assert gain_ranges
+    assert all(0.0 < least <= largest < np.inf for least, largest in gain_ranges.values())
+    middle = {key: (least * largest) ** 0.5 for key, (least, largest) in gain_ranges.items()}
     config = read_config(study(observer={"kind": kind, "motor": middle, "load": middle}))
     paths = [path for path in numeric_paths(config) if path.startswith("observer.motor.")]
-    assert {f"observer.motor.{key}" for key in found} <= set(paths)
+    assert {f"observer.motor.{key}" for key in gain_ranges} <= set(paths)
     assert config.build().observer.motor.name == kind
     # gains of other kinds are no numbers of this study
     assert len(paths) == len(list(parameters(cls)))

@@ -27,33 +27,33 @@ def test_grid_has_the_last_axis_fastest():
 
 def test_zipped_axes_advance_together_and_may_repeat_a_value():
     study = points(listed(ALPHA, 1.0, 1.0, 3.0, zip="g"), listed(NOISE, 0.0, 1e-3), listed(LAMBDA, 4.0, 5.0, 5.0, zip="g"))
-    found = columns(study)
-    np.testing.assert_array_equal(found[ALPHA], [1.0, 1.0, 1.0, 1.0, 3.0, 3.0])
-    np.testing.assert_array_equal(found[LAMBDA], [4.0, 4.0, 5.0, 5.0, 5.0, 5.0])
-    np.testing.assert_array_equal(found[NOISE], [0.0, 1e-3] * 3)
+    result = columns(study)
+    np.testing.assert_array_equal(result[ALPHA], [1.0, 1.0, 1.0, 1.0, 3.0, 3.0])
+    np.testing.assert_array_equal(result[LAMBDA], [4.0, 4.0, 5.0, 5.0, 5.0, 5.0])
+    np.testing.assert_array_equal(result[NOISE], [0.0, 1e-3] * 3)
 
 
 def test_slices_are_parts_of_the_whole():
     study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 2.0, 5))
-    whole = columns(study)
+    full_columns = columns(study)
     for first in range(0, study.group_size, 11):
         part = study.columns(np.arange(first, min(first + 11, study.group_size)))
         for path, values in part.items():
-            np.testing.assert_array_equal(values, whole[path][first : first + 11])
+            np.testing.assert_array_equal(values, full_columns[path][first : first + 11])
 
 
 @pytest.mark.parametrize("design", ["sobol", "latin_hypercube"])
 def test_quasi_random_points_fill_the_ranges_evenly_and_repeat(design):
     axes = [spaced(ALPHA, 1.0, 100.0), spaced(LAMBDA, 2.0, 4.0, scale="linear")]
     study = points(*axes, design=design, points=64)
-    found = columns(study)
-    unit = [np.log(found[ALPHA]) / np.log(100.0), (found[LAMBDA] - 2.0) / 2.0]
+    result = columns(study)
+    unit = [np.log(result[ALPHA]) / np.log(100.0), (result[LAMBDA] - 2.0) / 2.0]
     for u in unit:
         # one point in each of 64 slices of either axis, in its own scale
         assert sorted(np.floor(64 * u).astype(int)) == list(range(64))
     again = columns(points(*axes, design=design, points=64))
     other = columns(points(*axes, design=design, points=64, design_seed=1))
-    for path, values in found.items():
+    for path, values in result.items():
         np.testing.assert_array_equal(values, again[path])
         assert (values != other[path]).all()
 
@@ -66,12 +66,12 @@ def test_fewer_sobol_points_are_the_first_of_more():
 
 def test_a_design_is_crossed_with_the_axes_that_are_listed():
     study = points(spaced(ALPHA, 1.0, 9.0), listed(NOISE, 0.0, 1e-3), spaced(LAMBDA, 2.0, 4.0), design="sobol", points=5)
-    found = columns(study)
+    result = columns(study)
     assert len(study) == 10
-    np.testing.assert_array_equal(found[NOISE], [0.0, 1e-3] * 5)
+    np.testing.assert_array_equal(result[NOISE], [0.0, 1e-3] * 5)
     for path in (ALPHA, LAMBDA):
-        np.testing.assert_array_equal(found[path][::2], found[path][1::2])
-        assert len(set(found[path])) == 5
+        np.testing.assert_array_equal(result[path][::2], result[path][1::2])
+        assert len(set(result[path])) == 5
 
 
 def test_axes_over_structure_are_groups_outside_of_the_lanes():

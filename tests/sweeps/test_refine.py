@@ -38,9 +38,9 @@ def traced(function, grid):
         return full.ravel()[vertices]
 
     vertices, values = refine_boundary(grid, evaluate, lambda a, b: a != b)
-    every = np.concatenate(asked)
-    assert len(np.unique(every)) == len(every)
-    np.testing.assert_array_equal(vertices, np.sort(every))
+    stride = np.concatenate(asked)
+    assert len(np.unique(stride)) == len(stride)
+    np.testing.assert_array_equal(vertices, np.sort(stride))
     np.testing.assert_array_equal(values, full.ravel()[vertices])
     mask = np.zeros(full.size, bool)
     mask[vertices] = True
@@ -59,8 +59,8 @@ def corners(values):
 
 def at_boundary(full):
     """Cells whose corners disagree."""
-    found = corners(full)
-    return (found != found[0]).any(axis=0)
+    result = corners(full)
+    return (result != result[0]).any(axis=0)
 
 
 def simulated_cells(mask):
@@ -84,8 +84,8 @@ def pieces(full):
             inside = ((place >= 0) & (place < shape)).all(axis=1)
             around.append(np.where(inside, cells[tuple(np.clip(place, 0, np.array(shape) - 1).T)], -1))
         for a, b in itertools.combinations(around, 2):
-            both = (a >= 0) & (b >= 0)
-            links.append(np.stack([a[both], b[both]]))
+            both_inside = (a >= 0) & (b >= 0)
+            links.append(np.stack([a[both_inside], b[both_inside]]))
     pairs = np.concatenate([np.zeros((2, 0), int), *links], axis=1)
     graph = coo_matrix((np.ones(pairs.shape[1]), tuple(pairs)), (cells.size, cells.size))
     labels = connected_components(graph, directed=False)[1].reshape(shape)
@@ -95,9 +95,9 @@ def pieces(full):
 def assert_traced(mask, full, depth):
     """Every piece of the boundary that a coarse edge crosses an odd number of times is simulated whole; so is every piece
     of which any cell is."""
-    labels, whole = pieces(full), simulated_cells(mask)
-    touched = np.unique(labels[whole & (labels >= 0)])
-    missed = np.isin(labels, touched) & (labels >= 0) & ~whole
+    labels, cells = pieces(full), simulated_cells(mask)
+    touched = np.unique(labels[cells & (labels >= 0)])
+    missed = np.isin(labels, touched) & (labels >= 0) & ~cells
     assert not missed.any()
     stride = 1 << depth
     coarse = full[(slice(None, None, stride),) * full.ndim]
@@ -264,15 +264,15 @@ def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
         axes = [spaced(LAMBDA, 0.1, 37.0, num), spaced(ALPHA, 0.3, 91.7, num, "linear")]
         plain, fine = (Points(read_config(small(axes=axes, sweep=s))) for s in ({}, {"refine": depth}))
         assert fine.coarse_size == plain.group_size
-        every = np.arange(plain.group_size)
-        expected = plain.columns(every)
-        for path, values in fine.columns(fine.coarse_points(every)).items():
+        group_size = np.arange(plain.group_size)
+        expected = plain.columns(group_size)
+        for path, values in fine.columns(fine.coarse_points(group_size)).items():
             np.testing.assert_array_equal(values, expected[path])
         # and all values are those of a grid that is as fine
         axes = [axis | {"num": (num - 1 << depth) + 1} for axis in axes]
-        whole = Points(read_config(small(axes=axes)))
+        full_points = Points(read_config(small(axes=axes)))
         for path in (LAMBDA, ALPHA):
-            np.testing.assert_array_equal(fine.axis_values(path), whole.axis_values(path))
+            np.testing.assert_array_equal(fine.axis_values(path), full_points.axis_values(path))
 
 
 def test_what_is_refined():
@@ -391,9 +391,9 @@ def study(changes=None, refine=3, num=5, seeds=1, axes=None, **sweep_keys):
 def whole_grid(data):
     """All points of the fine grid, by the engine that a refined study has."""
     engine = Engine(read_config(data), Layout(read_config(data).sweep.seeds, 2048))
-    every = np.arange(engine.points.group_size)
+    group_size = np.arange(engine.points.group_size)
     return pd.concat(
-        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split_points(g, every)],
+        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split_points(g, group_size)],
         ignore_index=True,
     )
 
@@ -403,9 +403,9 @@ def assert_on_the_whole_grid(result, whole):
     keys = [*(axis.path for axis in result.config.axes), "seed"]
     frame = result.frame.sort_values(keys, ignore_index=True)
     assert not frame.duplicated(keys).any()
-    found = whole.merge(frame[keys], on=keys).sort_values(keys, ignore_index=True)
+    actual = whole.merge(frame[keys], on=keys).sort_values(keys, ignore_index=True)
     exact = [name for name in frame if not name.endswith("convergence_time_bound")]  # rounds differently in other chunks
-    pd.testing.assert_frame_equal(found[exact], frame[exact], check_exact=True)
+    pd.testing.assert_frame_equal(actual[exact], frame[exact], check_exact=True)
 
 
 def masks(data, frame, whole):
@@ -424,10 +424,10 @@ def test_the_boundary_of_the_full_grid_at_257(precision):
     axes = [spaced(LAMBDA, 3.0, 40.0, 17), spaced(ALPHA, 2.0, 200.0, 17)]  # where the boundary is one line
     # all metrics are compared on a smaller grid, below
     data = study(changes, refine=4, axes=axes, chunk=256, metrics=["converged", "velocity_rmse"])
-    result, whole = sweep(data), whole_grid(data)
-    assert len(whole) == 257**2
-    assert_on_the_whole_grid(result, whole)
-    mask, full = masks(data, result.frame, whole)
+    result, full_grid = sweep(data), whole_grid(data)
+    assert len(full_grid) == 257**2
+    assert_on_the_whole_grid(result, full_grid)
+    mask, full = masks(data, result.frame, full_grid)
     assert_traced(mask, full, 4)
     boundary = at_boundary(full)
     assert boundary.sum() > 250
@@ -551,11 +551,11 @@ def test_a_refined_study_in_a_folder(finished, computed):
 
 @pytest.mark.parametrize("stop", [0, 1, 3, 5])
 def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(tmp_path, finished, computed, stop):
-    seen = []
+    calls = []
 
     def interrupt(done, total):
-        seen.append((done, total))
-        if len(seen) == stop + 1:
+        calls.append((done, total))
+        if len(calls) == stop + 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -564,14 +564,14 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(t
     assert computed in (list(range(stop + 1)), list(range(stop + 2)))
     assert not manifest(tmp_path / "study")["finished"]
     assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
-    seen.clear()
+    calls.clear()
     # with other chunks asked for: those of the folder stay
-    result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: seen.append(done))
+    result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: calls.append(done))
     pd.testing.assert_frame_equal(result.frame, finished[1].frame)
     assert computed == list(range(parts(finished[0])))
-    dones, totals = zip(*seen, strict=True)
+    dones, totals = zip(*calls, strict=True)
     assert dones[-1] == totals[-1] == len(result.frame)
-    assert list(totals) == sorted(totals) and all(d <= t for d, t in seen)
+    assert list(totals) == sorted(totals) and all(d <= t for d, t in calls)
     expected = {key: manifest(finished[0])[key] for key in ("parts", "rows", "finished")}
     assert {key: manifest(tmp_path / "study")[key] for key in expected} == expected
 

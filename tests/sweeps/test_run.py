@@ -18,11 +18,11 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 def test_shares_are_the_whole_study(tmp_path, computed):
     alone = sweep(thirty(), tmp_path / "alone")
     computed.clear()
-    folder, seen = tmp_path / "shares", []
-    last = share(thirty(), folder, (3, 3), progress=lambda *done: seen.append(done))
+    folder, calls = tmp_path / "shares", []
+    last = share(thirty(), folder, (3, 3), progress=lambda *done: calls.append(done))
     assert len(computed) == 2 and not last.complete
     # progress of a share is of its own lanes
-    assert seen[-1][0] == seen[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed)
+    assert calls[-1][0] == calls[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed)
     assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
     with lock_folder(folder, shared=True):
         # another one is at work

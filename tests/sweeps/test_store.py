@@ -86,11 +86,11 @@ def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished, computed
         sweep(study(), tmp_path / "study", progress=interrupt)
     # the second one was computed while the first was written, and is kept
     assert computed == [0, 1]
-    seen = []
+    calls = []
     # with other chunks asked for: those of the folder stay
-    result = sweep(study(sweep={"seeds": 3, "chunk": 100}), tmp_path / "study", progress=lambda *done: seen.append(done))
+    result = sweep(study(sweep={"seeds": 3, "chunk": 100}), tmp_path / "study", progress=lambda *done: calls.append(done))
     assert computed == [0, 1, 2]
-    assert seen == [(3, 9), (6, 9), (9, 9)]
+    assert calls == [(3, 9), (6, 9), (9, 9)]
     assert result.cost["lanes"] == 3
     pd.testing.assert_frame_equal(result.frame, finished[1].frame)
 
@@ -114,8 +114,8 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, d
     result = sweep(study(), copy)
     assert computed == [1]
     if damage in ("truncated", "empty"):
-        (why,) = result.damaged
-        assert why.startswith("points/part-00001.parquet") and why.endswith("it is kept as damaged/part-00001.parquet")
+        (reason,) = result.damaged
+        assert reason.startswith("points/part-00001.parquet") and reason.endswith("it is kept as damaged/part-00001.parquet")
         assert len(list((copy / "damaged").iterdir())) == 1
     # drafts of processes that were killed are gone
     assert not list(copy.rglob(".*"))
@@ -203,12 +203,12 @@ def test_manifest_of_another_version(copy):
 
 def flipped(folder, random):
     """Flip a bit of one of a folder's files, which is returned."""
-    every = sorted(path for path in folder.rglob("*") if path.is_file())
-    sizes = [path.stat().st_size for path in every]
-    path = random.choices(every, sizes)[0]
+    stride = sorted(path for path in folder.rglob("*") if path.is_file())
+    sizes = [path.stat().st_size for path in stride]
+    path = random.choices(stride, sizes)[0]
     content = path.read_bytes()
-    at = random.randrange(len(content) * 8)
-    path.write_bytes(bytes(byte ^ (1 << at % 8 if i == at // 8 else 0) for i, byte in enumerate(content)))
+    index = random.randrange(len(content) * 8)
+    path.write_bytes(bytes(byte ^ (1 << index % 8 if i == index // 8 else 0) for i, byte in enumerate(content)))
     return path
 
 
@@ -251,8 +251,8 @@ def test_an_edited_part_is_kept_aside(copy, finished, computed):
         _ = open_study(copy).frame
     sweep(study(), copy)
     assert computed == [1]
-    kept = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
-    pd.testing.assert_frame_equal(kept, frame)
+    stored_frame = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
+    pd.testing.assert_frame_equal(stored_frame, frame)
 
 
 def test_a_part_of_another_study_is_refused(copy, tmp_path):
@@ -282,8 +282,8 @@ def test_a_part_too_many_is_refused(copy, computed, name):
 def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed):
     (copy / "manifest.json").unlink()
     (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
-    whole, store = repair(copy)
-    assert whole == 2 and len(store.damaged) == 1 and computed == []
+    whole_parts, store = repair(copy)
+    assert whole_parts == 2 and len(store.damaged) == 1 and computed == []
     assert not open_study(copy).source.manifest["finished"]
     assert len(open_study(copy).frame) == 6
     sweep(copy / "study.toml", copy)
@@ -301,8 +301,8 @@ def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, comput
     coarse = len(Engine(read_config(refined)))
     assert len(parts) > coarse
     (tmp_path / "study" / "manifest.json").unlink()
-    whole, store = repair(tmp_path / "study")
-    assert (whole, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
+    whole_parts, store = repair(tmp_path / "study")
+    assert (whole_parts, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
     again = sweep(refined, tmp_path / "study")
     assert computed == parts and files(tmp_path / "study" / "points") == points
     pd.testing.assert_frame_equal(again.frame, result.frame)
@@ -341,12 +341,12 @@ def test_two_processes_do_not_write_into_one_folder(copy):
 
 
 def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished):
-    def full(table, draft, **_):
+    def whole_parts(table, draft, **_):
         Path(draft).write_bytes(b"x")
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("jaxbl.sweeps.parts.pq.write_table", full)
+        patched.setattr("jaxbl.sweeps.parts.pq.write_table", whole_parts)
         with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
             sweep(study(), tmp_path / "study")
     assert {*files(tmp_path / "study")} == {"study.toml", "manifest.json"}
@@ -408,18 +408,18 @@ def test_files_of_others_are_never_removed(tmp_path):
 
 def test_rows_are_read_as_they_are_asked_for(finished):
     folder, result = finished
-    opened, whole = open_study(folder), result.frame
+    opened, full_frame = open_study(folder), result.frame
     assert len(list(opened.batches(["seed"]))) == 3
     columns = ["motor.f_plus", ALPHA]
-    pd.testing.assert_frame_equal(opened.read(columns), whole[columns])
-    kept = whole[(whole["seed"] > 0) & (whole[ALPHA] < 20.0)]
-    some = opened.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)])
-    pd.testing.assert_frame_equal(some, kept[columns].reset_index(drop=True))
+    pd.testing.assert_frame_equal(opened.read(columns), full_frame[columns])
+    selected = full_frame[(full_frame["seed"] > 0) & (full_frame[ALPHA] < 20.0)]
+    content = opened.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)])
+    pd.testing.assert_frame_equal(content, selected[columns].reset_index(drop=True))
     either = opened.read(["seed"], [[("seed", "==", 0)], [(ALPHA, "in", [5.0, 9.0])]])
-    assert len(either) == ((whole["seed"] == 0) | whole[ALPHA].isin([5.0, 9.0])).sum()
+    assert len(either) == ((full_frame["seed"] == 0) | full_frame[ALPHA].isin([5.0, 9.0])).sum()
     # the same of a result in memory
-    memory = StudyResult(opened.config, whole)
-    pd.testing.assert_frame_equal(memory.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)]), some)
+    memory = StudyResult(opened.config, full_frame)
+    pd.testing.assert_frame_equal(memory.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)]), content)
 
 
 @pytest.mark.parametrize("check", [True, False])
@@ -429,10 +429,10 @@ def test_a_dataset_of_the_rows(finished, check):
     folder, result = finished
     dataset = open_study(folder).dataset(check=check)
     assert dataset.count_rows() == 9
-    found = dataset.to_table(columns=["seed", "motor.f_plus"], filter=pc.field(ALPHA) == 9.0).to_pandas()
+    table = dataset.to_table(columns=["seed", "motor.f_plus"], filter=pc.field(ALPHA) == 9.0).to_pandas()
     expected = result.frame.loc[result.frame[ALPHA] == 9.0, ["seed", "motor.f_plus"]]
     pd.testing.assert_frame_equal(
-        found.sort_values("seed", ignore_index=True), expected.sort_values("seed", ignore_index=True)
+        table.sort_values("seed", ignore_index=True), expected.sort_values("seed", ignore_index=True)
     )
     memory = StudyResult(result.config, result.frame).dataset()
     assert memory.to_table().to_pandas().equals(result.frame)
@@ -478,8 +478,8 @@ def test_a_study_in_an_object_store_is_read_alike(finished):
     opened = open_study("memory://reading/study")
     pd.testing.assert_frame_equal(opened.frame, finished[1].frame)
     for check in (True, False):
-        found = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
-        pd.testing.assert_frame_equal(found, finished[1].frame[[ALPHA, "seed"]])
+        table = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
+        pd.testing.assert_frame_equal(table, finished[1].frame[[ALPHA, "seed"]])
 
 
 def test_the_metrics_asked_for_are_a_sweeps_own():

@@ -61,10 +61,13 @@ def test_summary_of_table_1_names_what_it_misses(table1):
     assert float(unmet[0].split("factor of ")[1].split(";")[0].rstrip(".")) > 379
     assert any("torques |C| up to 0.09 N m" in line and line.startswith("motor: alpha = 1.8") for line in remarks)
     for side, gains in (("motor", (0.005, 1.8)), ("load", (0.004, 0.08))):
-        found = summary["conditions"][side]
-        assert (found["lambda"], found["alpha"]) == gains
-        assert not found["holds"]["davila_fridman"]
-        assert found["least_lambda"]["davila_fridman"] is None or found["least_lambda"]["davila_fridman"] > 50 * gains[0]
+        conditions = summary["conditions"][side]
+        assert (conditions["lambda"], conditions["alpha"]) == gains
+        assert not conditions["holds"]["davila_fridman"]
+        assert (
+            conditions["least_lambda"]["davila_fridman"] is None
+            or conditions["least_lambda"]["davila_fridman"] > 50 * gains[0]
+        )
 
 
 @pytest.mark.parametrize("law", ["sigmoid_backlash", "dead_zone", "linear_shaft"])
@@ -77,11 +80,11 @@ def test_every_dead_zone_comes_with_its_half_gap(law):
     numbers, names = laws[law]
     trial = run(small(transmission={"law": law, **numbers}))
     assert set(trial.summary["identified"]) == names
-    for name, found in trial.summary["identified"].items():
-        assert found["true"] == numbers.get(name, 0.08)
+    for name, result in trial.summary["identified"].items():
+        assert result["true"] == numbers.get(name, 0.08)
         for side in ("motor", "load"):
             last = trial.trace[f"{side}.{name}"].iloc[-1]
-            assert found[side] == (None if np.isnan(last) else last)
+            assert result[side] == (None if np.isnan(last) else last)
 
 
 def test_rigid_run():
@@ -93,10 +96,10 @@ def test_rigid_run():
 
 
 def test_decimated_trace_is_a_part_of_the_whole_with_the_same_metrics():
-    whole, part = run(rigid({"run.duration": 0.203})), run(rigid({"run.duration": 0.203}), every=7)
+    full_trial, part = run(rigid({"run.duration": 0.203})), run(rigid({"run.duration": 0.203}), every=7)
     assert len(part.trace) == 29
-    pd.testing.assert_frame_equal(part.trace, whole.trace[::7].reset_index(drop=True), rtol=1e-9)
-    assert part.summary["metrics"].keys() == whole.summary["metrics"].keys()
+    pd.testing.assert_frame_equal(part.trace, full_trial.trace[::7].reset_index(drop=True), rtol=1e-9)
+    assert part.summary["metrics"].keys() == full_trial.summary["metrics"].keys()
     with pytest.raises(InputError, match="every: should be between 1 and the number of samples 203, not 204"):
         run(rigid({"run.duration": 0.203}), every=204)
 
@@ -123,18 +126,18 @@ def test_axes_are_not_used():
 
 def test_decimation_thins_the_trace_and_nothing_else():
     study = small({"run.duration": 2.0})
-    whole, thin = (run(study, every=every) for every in (1, 1999))
+    full, thin = (run(study, every=number) for number in (1, 1999))
     assert len(thin.trace) < 5
-    assert thin.summary["remarks"] == whole.summary["remarks"]
-    for name, found in whole.summary["identified"].items():
-        assert thin.summary["identified"][name] == pytest.approx(found, rel=1e-9)
+    assert thin.summary["remarks"] == full.summary["remarks"]
+    for name, result in full.summary["identified"].items():
+        assert thin.summary["identified"][name] == pytest.approx(result, rel=1e-9)
 
 
 def test_backends(monkeypatch):
     """Both give the same; one that is asked for is not replaced."""
     study = rigid({"run.duration": 0.1})
-    both = [run(study, backend=backend) for backend in ("fused", "scan")]
-    pd.testing.assert_frame_equal(both[0].trace, both[1].trace, rtol=1e-9)
+    trials = [run(study, backend=backend) for backend in ("fused", "scan")]
+    pd.testing.assert_frame_equal(trials[0].trace, trials[1].trace, rtol=1e-9)
 
     def unsupported(*_):
         raise Unsupported("a step of its own")
@@ -144,4 +147,4 @@ def test_backends(monkeypatch):
         InputError, match=r"backend: the fused loop does not support a step of its own; use 'scan', or leave it out"
     ):
         run(study, backend="fused")
-    pd.testing.assert_frame_equal(run(study).trace, both[1].trace)
+    pd.testing.assert_frame_equal(run(study).trace, trials[1].trace)

@@ -31,8 +31,8 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("kernel")
 
 
-def _short_curve(curve, able, lanes, *rest):
-    return curve(able, min(lanes, 64), *rest)
+def _short_curve(curve, able, lanes, *remainder):
+    return curve(able, min(lanes, 64), *remainder)
 
 
 @functools.cache
@@ -77,9 +77,9 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
             entry._replace(lanes=2**13) for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME
         ]
 
-    def few(able, lanes, *rest):
+    def few(able, lanes, *remainder):
         asked.append(lanes)
-        return curve(able, min(lanes, 512), *rest)
+        return curve(able, min(lanes, 512), *remainder)
 
     monkeypatch.setattr(run, "make_entries", only_ours)
     monkeypatch.setattr(run, "_measure_curve", few)

@@ -45,19 +45,23 @@ def summary(unit="rad"):
 
 
 def test_columns_and_what_is_said_of_them(tmp_path):
-    told = write_log(summary(), trace(), tmp_path)
-    kept = pq.read_table(tmp_path / "points.parquet").to_pandas()
-    assert kept["t"].dtype == np.float64 and kept["u"].dtype == np.float32
-    np.testing.assert_array_equal(kept["t"], TIME)
-    np.testing.assert_allclose(kept["twist"], 0.2 * ANGLE, atol=1e-6)
-    assert kept["motor.turn"].between(0.0, 2.0 * np.pi).all() and "load.turn" not in kept and "motor.noise" not in kept
-    units = {one["column"]: one["unit"] for one in told["coordinates"]}
-    assert units["motor.velocity"] == "rad/s" and units["u"] == "N m" and told["held"]
+    log = write_log(summary(), trace(), tmp_path)
+    stored_table = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert stored_table["t"].dtype == np.float64 and stored_table["u"].dtype == np.float32
+    np.testing.assert_array_equal(stored_table["t"], TIME)
+    np.testing.assert_allclose(stored_table["twist"], 0.2 * ANGLE, atol=1e-6)
+    assert (
+        stored_table["motor.turn"].between(0.0, 2.0 * np.pi).all()
+        and "load.turn" not in stored_table
+        and "motor.noise" not in stored_table
+    )
+    units = {coordinate["column"]: coordinate["unit"] for coordinate in log["coordinates"]}
+    assert units["motor.velocity"] == "rad/s" and units["u"] == "N m" and log["held"]
     # over what explains most
-    assert told["over"] == ["theta_e", "motor.turn"]
-    (group,) = told["groups"]
+    assert log["over"] == ["theta_e", "motor.turn"]
+    (group,) = log["groups"]
     assert (group["name"], group["unit"], group["bandwidth"]) == ("motor: missing torque", "N m", 40.0)
-    assert {one["column"]: one["label"] for one in group["lines"]} == {
+    assert {coordinate["column"]: coordinate["label"] for coordinate in group["lines"]} == {
         "motor.missing_before": "model as given",
         "motor.missing_after": "with the missing effects",
         f"motor.missing_without.{HOSTILE}": f"with the missing effects, without {HOSTILE}",
@@ -66,37 +70,37 @@ def test_columns_and_what_is_said_of_them(tmp_path):
 
 
 def test_a_linear_axis_has_forces_and_no_turns(tmp_path):
-    told = write_log(summary("m"), trace(), tmp_path)
-    units = {one["column"]: one["unit"] for one in told["coordinates"]}
+    log = write_log(summary("m"), trace(), tmp_path)
+    units = {coordinate["column"]: coordinate["unit"] for coordinate in log["coordinates"]}
     assert units["theta_e"] == "m" and units["motor.velocity"] == "m/s" and units["u"] == "N"
-    assert "motor.turn" not in units and told["groups"][0]["name"] == "motor: missing force"
+    assert "motor.turn" not in units and log["groups"][0]["name"] == "motor: missing force"
 
 
 def test_an_identification_and_an_element(tmp_path):
     motor = (f"motor.{name}" for name in ("velocity", "velocity_estimate", "residual", "torque_estimate"))
     frame = pd.DataFrame(dict.fromkeys(("t", "u", "theta_e", "torque", *motor), TIME))
-    found = {"residual": {"motor": {"unit": "rad"}}, "sample_period": 1e-3}
-    groups = write_log(found, frame, tmp_path)["groups"]
-    assert [one["name"] for one in groups] == ["motor: position residual", "torque in the transmission", "motor: speed"]
+    result = {"residual": {"motor": {"unit": "rad"}}, "sample_period": 1e-3}
+    groups = write_log(result, frame, tmp_path)["groups"]
+    assert [group["name"] for group in groups] == ["motor: position residual", "torque in the transmission", "motor: speed"]
     element = {"kind": "element", "sample_period": 1e-3}
-    told = write_log(element, pd.DataFrame(dict.fromkeys(("t", "u", "displacement", "torque"), TIME)), tmp_path)
-    assert told["over"] == ["u", "displacement"]
-    assert [one["label"] for one in told["groups"][0]["lines"]] == ["measured", "by the fitted law"]
+    log = write_log(element, pd.DataFrame(dict.fromkeys(("t", "u", "displacement", "torque"), TIME)), tmp_path)
+    assert log["over"] == ["u", "displacement"]
+    assert [group["label"] for group in log["groups"][0]["lines"]] == ["measured", "by the fitted law"]
     with pytest.raises(InputError, match=r"explore: trace\.parquet has no column that the page could draw"):
-        write_log(found, frame.loc[:, ["t", "u"]], tmp_path)
+        write_log(result, frame.loc[:, ["t", "u"]], tmp_path)
 
 
 def stored(folder):
     """A folder as `jaxbl identify` leaves it."""
     trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
     (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
-    found = {
+    result = {
         "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
         "kind": "element", "warnings": [], "refused": [],
         "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
         "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
-    (folder / "identification.json").write_text(json_with_checksum(found))
+    (folder / "identification.json").write_text(json_with_checksum(result))
 
 
 def test_folders_without_results_and_damaged_ones(tmp_path):
@@ -113,8 +117,8 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
 
 @needs_chromium
 def test_lines_coordinates_and_moments(tmp_path):
-    said = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
-    write_page(tmp_path, ("log",), write_log(summary(), trace(), tmp_path) | said)
+    output = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
+    write_page(tmp_path, ("log",), write_log(summary(), trace(), tmp_path) | output)
     with opened(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
@@ -151,10 +155,10 @@ def test_lines_coordinates_and_moments(tmp_path):
         # a moment, and a part
         page.locator("#moment").fill("500")
         assert page.locator("#now").inner_text().startswith("t 100002 s, input u ")
-        whole = page.locator("#time .plane").bounding_box()
-        page.mouse.move(whole["x"] + 200, whole["y"] + 100)
+        plot_area = page.locator("#time .plane").bounding_box()
+        page.mouse.move(plot_area["x"] + 200, plot_area["y"] + 100)
         page.mouse.down()
-        page.mouse.move(whole["x"] + 400, whole["y"] + 102, steps=3)
+        page.mouse.move(plot_area["x"] + 400, plot_area["y"] + 102, steps=3)
         page.mouse.up()
         assert page.locator("#state").inner_text().startswith("From 10000")
         page.click("#play")

@@ -42,9 +42,9 @@ def call(server, path, method="GET", body=None, **headers):
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, path if path.startswith("/") else f"/{token}/{path}", body, named)
     answer = connection.getresponse()
-    found = answer.status, answer.headers, answer.read()
+    result = answer.status, answer.headers, answer.read()
     connection.close()
-    return found
+    return result
 
 
 def test_the_page_and_parts_of_its_files(server):
@@ -85,9 +85,13 @@ def test_only_this_machine_with_the_token(server):
 def test_questions(server):
     kind = {"Content_Type": "application/json"}
     assert call(server, "1/run", "POST", '{"at": 1}', **kind)[::2] == (200, b'{"value": 2.0}')
-    for body, why in (('{"at": 3}', "at: should be 1"), ("{", "Expecting property name"), (b"\xff", "codec can't decode")):
+    for body, reason in (
+        ('{"at": 3}', "at: should be 1"),
+        ("{", "Expecting property name"),
+        (b"\xff", "codec can't decode"),
+    ):
         status, _, content = call(server, "1/run", "POST", body, **kind)
-        assert status == 400 and why in json.loads(content)["error"]
+        assert status == 400 and reason in json.loads(content)["error"]
     status, _, content = call(server, "1/run", "POST", '{"at": 2}', **kind)
     assert status == 500 and json.loads(content) == {"error": "RuntimeError: out of memory"}
     assert call(server, "1/run", "POST", '{"at": 1}')[0] == 404
@@ -120,9 +124,9 @@ def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
         request = f"GET {server.url.partition(own)[2]}1/index.html HTTP/1.1\r\nHost: {own}\r\n\r\n"
         ended, close = threading.Event(), server.shutdown_request
         monkeypatch.setattr(server, "shutdown_request", lambda request: (close(request), ended.set()))
-        with socket.create_connection(("127.0.0.1", server.server_port)) as one:
-            one.sendall(request.encode())
-            assert one.recv(100).startswith(b"HTTP/1.1 200")
+        with socket.create_connection(("127.0.0.1", server.server_port)) as connection:
+            connection.sendall(request.encode())
+            assert connection.recv(100).startswith(b"HTTP/1.1 200")
         assert ended.wait(10.0)
         server.shutdown()
     assert capfd.readouterr().err == ""
@@ -151,19 +155,19 @@ def test_a_page_loaded_again_is_the_newest():
 
 
 def test_results_that_cannot_be_read_are_told_and_read_later():
-    why = [InputError("study.toml: is missing"), OSError("no space left")]
+    errors = [InputError("study.toml: is missing"), OSError("no space left")]
 
     def write(out, served):
         (out / "index.html").write_text("page")
-        if why:
-            raise why.pop(0)
+        if errors:
+            raise errors.pop(0)
         return False
 
     with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        for said in ("study.toml: is missing", "no space left"):
+        for name in ("study.toml: is missing", "no space left"):
             status, _, content = call(server, "")
-            assert (status, json.loads(content)) == (503, {"error": said})
+            assert (status, json.loads(content)) == (503, {"error": name})
         assert call(server, "")[0] == 302
         server.shutdown()
 

@@ -53,17 +53,17 @@ def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
     result = study(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
     shuffled = result.frame.sample(frac=1.0, random_state=0).iloc[5:]
     write_static(source(result.__class__(result.config, shuffled), ["found"]), tmp_path / "out")
-    told, table = about(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
-    assert (told["rows"], told["found"], told["title"]) == (180, 175, HOSTILE)
-    paths = [one["path"] for axis in told["axes"] for one in axis["paths"]]
-    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in told["axes"]], names=paths)
+    messages, table = about(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
+    assert (messages["rows"], messages["found"], messages["title"]) == (180, 175, HOSTILE)
+    paths = [path["path"] for axis in messages["axes"] for path in axis["paths"]]
+    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in messages["axes"]], names=paths)
     expected = shuffled.set_index(paths)["motor.velocity_rmse"].reindex(grid).to_numpy()
     np.testing.assert_allclose(table["motor.velocity_rmse"], expected, rtol=1e-6)
     # what is infinite is not there
     assert table["motor.convergence_time"].isna().sum() > 100
     # the same bytes in scripts, for pages from disk
     scripts = "".join(file.read_text() for file in sorted((tmp_path / "out").glob("points.*.js")))
-    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * told["bytes"] / 3
+    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * messages["bytes"] / 3
 
 
 def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
@@ -71,11 +71,11 @@ def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
     result = made(small(axes=AXES, sweep={"seeds": 3}), **columns)
     write_static(source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
-    found = table["motor.stiffness_error"]
-    assert found.isna().mean() == pytest.approx(1.0 / 3.0) and set(found.dropna()) == {2.0}
+    stiffness_error = table["motor.stiffness_error"]
+    assert stiffness_error.isna().mean() == pytest.approx(1.0 / 3.0) and set(stiffness_error.dropna()) == {2.0}
     assert set(table["finite"]) == {0.0, 1.0}
-    (told,) = [one for one in about(tmp_path)["metrics"] if one["name"] == "motor.stiffness_error"]
-    assert told["label"].startswith("motor: |")
+    (messages,) = [metric for metric in about(tmp_path)["metrics"] if metric["name"] == "motor.stiffness_error"]
+    assert messages["label"].startswith("motor: |")
 
 
 def test_zipped_axes_are_one(tmp_path):
@@ -147,11 +147,11 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         page.select_option("#condition", "exact")
         page.wait_for_selector("#state:has-text('f⁺ = 1 rad/s²')")
         # a region by mouse, a cell by keyboard
-        at = plot.bounding_box()
+        bounding_box = plot.bounding_box()
         start, end = place(0.05, 0.9), place(0.6, 0.3)
-        page.mouse.move(at["x"] + start["x"], at["y"] + start["y"])
+        page.mouse.move(bounding_box["x"] + start["x"], bounding_box["y"] + start["y"])
         page.mouse.down()
-        page.mouse.move(at["x"] + end["x"], at["y"] + end["y"], steps=3)
+        page.mouse.move(bounding_box["x"] + end["x"], bounding_box["y"] + end["y"], steps=3)
         page.mouse.up()
         plot.hover(position=place(0.01, 0.01))
         assert read(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
@@ -181,11 +181,11 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
     config = read_config(tmp_path / "out" / "point.toml")
     assert config.encoders.noise == 1e-4 and config.axes == []
     motor = config.observer.motor
-    assert any(motor.alpha == pytest.approx(one) for one in alphas)
+    assert any(motor.alpha == pytest.approx(alpha) for alpha in alphas)
     assert f" at {NOISE}: 1e-4 rad, {ALPHA}: {motor.alpha:.4g} " in where
     assert f", {LAMBDA}: {motor.lambda_:.4g} " in where
-    found = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
-    assert found == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
+    observer = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
+    assert observer == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
 
 
 @needs_chromium
@@ -230,22 +230,22 @@ def swept(tmp_path_factory):
 
 
 def test_a_run_simulated_anew_is_that_of_its_config(swept):
-    found = study_source(swept).answers["simulated"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
-    trial = run(tomllib.loads(found["config"]))
+    result = study_source(swept).answers["simulated"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
+    trial = run(tomllib.loads(result["config"]))
     assert trial.config.encoders.noise == 1e-4 and trial.config.observer.motor.alpha == pytest.approx(50.0)
-    assert set(found["metrics"]) == set(trial.summary["metrics"])
+    assert set(result["metrics"]) == set(trial.summary["metrics"])
     for name, value in trial.summary["metrics"].items():
-        assert found["metrics"][name] == (value if value is None else pytest.approx(value, rel=1e-9)), name
-    velocity = np.frombuffer(base64.b64decode(found["columns"]["motor.velocity"]), "<f4")
+        assert result["metrics"][name] == (value if value is None else pytest.approx(value, rel=1e-9)), name
+    velocity = np.frombuffer(base64.b64decode(result["columns"]["motor.velocity"]), "<f4")
     np.testing.assert_allclose(velocity, trial.trace["motor.velocity"], rtol=1e-5, atol=1e-7)
     # its phase plane shows the error, though the majorant goes far beyond it
-    plane = found["planes"]["motor"]
+    plane = result["planes"]["motor"]
     error, slope = (np.frombuffer(base64.b64decode(plane[name]), "<f4") for name in ("error", "slope"))
     assert plane["reach"] == pytest.approx([1.32 * np.abs(one).max() for one in (error, slope)], rel=1e-5)
     # the sweep stored the same
     frame = open_study(swept).frame
     row = frame[(frame[NOISE] == 1e-4) & (frame[ALPHA] > 49.0) & (frame[LAMBDA] < 2.0)]
-    assert row["motor.velocity_rmse"].item() == pytest.approx(found["metrics"]["motor.velocity_rmse"], rel=1e-6)
+    assert row["motor.velocity_rmse"].item() == pytest.approx(result["metrics"]["motor.velocity_rmse"], rel=1e-6)
 
 
 VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
@@ -271,8 +271,8 @@ def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
 def test_numbers_that_differ_in_the_last_digit_of_their_precision_give_nearly_the_same():
     config, asked = read_config(SWEPT | {"run": SWEPT["run"] | {"precision": "float32"}}), {"values": VALUES, "seed": 0}
     name = "motor.velocity_rmse"
-    found, near = simulated(config, asked)["metrics"][name], [one[name] for one in nearby(config, asked)["metrics"]]
-    assert near == pytest.approx([found] * 6, rel=1e-3) and len({found, *near}) > 3
+    metrics, near = simulated(config, asked)["metrics"][name], [metric[name] for metric in nearby(config, asked)["metrics"]]
+    assert near == pytest.approx([metrics] * 6, rel=1e-3) and len({metrics, *near}) > 3
 
 
 CLICKS = """async () => {
@@ -301,13 +301,13 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             plot.click(position={"x": 200, "y": 100})
             page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
             page.locator("#told:has-text('stored')").wait_for()
-            told = page.locator("#told").inner_text()
-            assert told.endswith("as stored in the sweep.")
+            text = page.locator("#told").inner_text()
+            assert text.endswith("as stored in the sweep.")
             with page.expect_download() as download:
                 page.click("#point")
             (tmp_path / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
             error = run(tmp_path / "point.toml").summary["metrics"]["motor.velocity_rmse"]
-            assert float(told.split(": ")[-1].split(",")[0]) == pytest.approx(error, rel=1e-3)
+            assert float(text.split(": ")[-1].split(",")[0]) == pytest.approx(error, rel=1e-3)
             page.click("#pinned button")
             plot.click(position={"x": 700, "y": 500})
             page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")
@@ -326,8 +326,8 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             check(page, 0)
             # a run that the sweep has no figures of
             one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
-            said = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
-            assert said == "error: 2. The sweep has none: its run diverged, or is not there yet."
+            reply = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
+            assert reply == "error: 2. The sweep has none: its run diverged, or is not there yet."
             # of clicks while one is simulated the last one counts
             assert page.evaluate(CLICKS) == [1, 3]
             assert page.locator("#told").inner_text() == "Not simulated: no"
@@ -371,13 +371,13 @@ def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     columns = {"finite": lambda frame: frame["seed"] == 0, "motor__position_rmse": lambda frame: 1e300}
     result = made(data, motor__velocity_rmse=product_of_gains, **columns)
     write_study(result, tmp_path, ["found"])
-    told, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
-    assert (told["rows"], told["found"], told["total"], told["sampled"]) == (32, 32, 32, True)
-    assert [(one["path"], one["words"], one["log"]) for one in told["axes"]] == [
+    messages, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert (messages["rows"], messages["found"], messages["total"], messages["sampled"]) == (32, 32, 32, True)
+    assert [(axis["path"], axis["words"], axis["log"]) for axis in messages["axes"]] == [
         (ALPHA, None, True), (LAMBDA, None, False), (WORDS["path"], WORDS["values"], False)
     ]  # fmt: skip
     np.testing.assert_array_equal(table[ALPHA], result.frame[ALPHA])
-    words = [WORDS["values"][int(one)] for one in table[WORDS["path"]]]
+    words = [WORDS["values"][int(axis)] for axis in table[WORDS["path"]]]
     assert words == [*result.frame[WORDS["path"]]] and set(words) == set(WORDS["values"])
     assert table["motor.velocity_rmse"].isna().equals(table["seed"] == 1.0)
     assert table["motor.position_rmse"].isna().all()
