@@ -282,8 +282,8 @@ def test_a_part_too_many_is_refused(copy, computed, name):
 def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed):
     (copy / "manifest.json").unlink()
     (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
-    whole_parts, store = repair(copy)
-    assert whole_parts == 2 and len(store.damaged) == 1 and computed == []
+    whole_part_count, store = repair(copy)
+    assert whole_part_count == 2 and len(store.damaged) == 1 and computed == []
     assert not open_study(copy).source.manifest["finished"]
     assert len(open_study(copy).frame) == 6
     sweep(copy / "study.toml", copy)
@@ -301,8 +301,8 @@ def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, comput
     coarse = len(Engine(read_config(refined)))
     assert len(parts) > coarse
     (tmp_path / "study" / "manifest.json").unlink()
-    whole_parts, store = repair(tmp_path / "study")
-    assert (whole_parts, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
+    whole_part_count, store = repair(tmp_path / "study")
+    assert (whole_part_count, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
     again = sweep(refined, tmp_path / "study")
     assert computed == parts and files(tmp_path / "study" / "points") == points
     pd.testing.assert_frame_equal(again.frame, result.frame)
@@ -341,12 +341,12 @@ def test_two_processes_do_not_write_into_one_folder(copy):
 
 
 def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished):
-    def whole_parts(table, draft, **_):
+    def fill_disk(table, draft, **_):
         Path(draft).write_bytes(b"x")
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("jaxbl.sweeps.parts.pq.write_table", whole_parts)
+        patched.setattr("jaxbl.sweeps.parts.pq.write_table", fill_disk)
         with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
             sweep(study(), tmp_path / "study")
     assert {*files(tmp_path / "study")} == {"study.toml", "manifest.json"}
