@@ -44,10 +44,11 @@ def write_simulated(folder: Path) -> None:
     simulated_log(f"{SWEEPS}/geared_axis.toml", folder / "geared.parquet", ["t", "u", "theta_e", "theta_s"])
     for seed, name in enumerate(("direct", "direct_1", "direct_2")):
         simulated_log(f"{SWEEPS}/direct_drive.toml", folder / f"{name}.parquet", ["t", "u", "theta_e"], seed)
-    from records.test_element import PERIOD, simulate_rig
+    from records import test_element
 
-    positions, torques = simulate_rig()
-    times = PERIOD * np.arange(len(positions))
+    # its name at the base
+    positions, torques = getattr(test_element, "loaded")()  # noqa: B009
+    times = test_element.PERIOD * np.arange(len(positions))
     table = {"t": times, "u": torques, "theta_e": positions}
     pd.DataFrame(table).to_csv(folder / "element.csv", index=False)
 
