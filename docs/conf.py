@@ -73,7 +73,7 @@ def list_outdated_tutorials(app, env, added, changed, removed):
     package = hashlib.sha256(read_package()).hexdigest()
     outdated = getattr(env, "tutorials_package", None) != package
     env.tutorials_package = package
-    return list(TUTORIALS) if outdated else []
+    return [f"{HERE.name}/{name}" for name in TUTORIALS] if outdated else []
 
 
 def warn_of_foreign_files(app, error):

@@ -53,4 +53,5 @@ if __name__ == "__main__":
     printed = [""]
     for language, text in blocks:
         printed.append(printed[-1] if language == "output" else run_block(language, text))
-    json.dump(printed[1:], answer)
+    with answer:
+        json.dump(printed[1:], answer)
