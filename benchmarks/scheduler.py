@@ -2,9 +2,9 @@
 
 The scheduler is a process of its own, as on a cluster. Workers are Dask's, of one thread each, many of them in each of a few
 processes; their jobs sleep, or return at once, and give back what a bundle of ten parts gives. The client is
-`jaxbl.cluster.Cluster.run_jobs`, or `submit_jobs` with --leave. Rows are of one pass, at so many bundles done. Processor time is read
-from the system for each process: on a machine of few cores, which workers share, that is the steadier figure, and its
-inverse what scheduler or client could do at best.
+`jaxbl.cluster.Cluster.run_jobs`, or `submit_jobs` with --leave. Rows are of one pass, at so many bundles done. Processor
+time is read from the system for each process: on a machine of few cores, which workers share, that is the steadier figure,
+and its inverse what scheduler or client could do at best.
 
     python benchmarks/scheduler.py --workers 10 100 1000 --bundles 1000 10000 100000
     python benchmarks/scheduler.py --workers 10 --bundles 100000 --leave          # all known at once, none done
