@@ -70,7 +70,7 @@ def test_every_kind_of_log_is_found_and_what_is_none_is_told(tmp_path):
     assert skipped == ["f.pdf", "g"]
 
 
-def _found(job):
+def _make_row(job):
     assert all(path.is_absolute() for path in (job.log, job.model, job.folder))
     return make_batch_row(job.log, DIAGNOSIS)
 
@@ -81,7 +81,7 @@ def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):
         (tmp_path / name).write_text("")
     work, _ = read_batch(Path(), Path("a.toml"), Path("out"), overwrite=False)
     calls = []
-    monkeypatch.setattr(batch, "_diagnose_log", _found)
+    monkeypatch.setattr(batch, "_diagnose_log", _make_row)
     rows = run_batch(work, Path("out"), None, lambda *done: calls.append(done), client)
     assert [row["log"] for row in rows] == ["a.csv", "b.csv", "c.csv"]
     assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]

@@ -29,14 +29,14 @@ GAP = {
 
 
 @pytest.fixture(scope="module")
-def found():
+def hidden_cases():
     return cases(4, 32, "all", DURATION) + cases(4, len(NEW), "new", DURATION) + cases(4, 2, "clutter", DURATION)
 
 
 @pytest.fixture(scope="module")
-def oracle(found):
+def oracle(hidden_cases):
     """A diagnosis that knows the truth."""
-    truths = {case.name: case for case in found}
+    truths = {case.name: case for case in hidden_cases}
 
     def diagnose(logs, model, holdout):
         case = truths[model["title"]]
@@ -57,11 +57,11 @@ def test_all_effects_of_the_package_are_hidden_at_all_sizes():
     assert {effect for _, ((effect, _),) in _targets(0, 8, "unknown")} == set(UNKNOWN)
 
 
-def test_clutter_is_there_and_small_and_its_name_is_not_spurious(found):
-    for case in found:
+def test_clutter_is_there_and_small_and_its_name_is_not_spurious(hidden_cases):
+    for case in hidden_cases:
         assert bool(case.truth["clutter"]) == (case.kind == "clutter")
         assert not set(case.truth["clutter"]) & set(case.truth["effects"])
-    case = found[-1]
+    case = hidden_cases[-1]
     output = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
     one = outcome(case, {"verdict": "unknown_effect", "findings": output})
     assert one.is_right and one.spurious_effects == ["motor.inertia"]
@@ -85,9 +85,9 @@ def test_same_seed_same_cases():
     assert case.model == other.model != third.model
 
 
-def test_kinds_come_in_their_shares_and_logs_are_whole(found):
-    assert [sum(case.kind == kind for case in found) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW), 2]
-    for case in found:
+def test_kinds_come_in_their_shares_and_logs_are_whole(hidden_cases):
+    assert [sum(case.kind == kind for case in hidden_cases) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW), 2]
+    for case in hidden_cases:
         for log in (case.log, case.holdout):
             columns = log.columns()
             assert ("theta_s" in columns) == (case.conditions["plant"] != "direct")
@@ -95,8 +95,8 @@ def test_kinds_come_in_their_shares_and_logs_are_whole(found):
         assert case.conditions["excitation"] != case.conditions["holdout"]
 
 
-def test_sizes_are_as_asked_or_say_so(found):
-    for case in found:
+def test_sizes_are_as_asked_or_say_so(hidden_cases):
+    for case in hidden_cases:
         for (name, size), level in zip(case.truth["sizes"].items(), [case.truth["level"]], strict=False):
             if case.kind in ("single", "new", "hard") and name.split(".")[1] not in (
                 "inertia",
@@ -110,8 +110,8 @@ def test_sizes_are_as_asked_or_say_so(found):
                 assert size == pytest.approx(level, rel=0.01)
 
 
-def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apart(found):
-    for case in found:
+def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apart(hidden_cases):
+    for case in hidden_cases:
         relative = case.model["uncertainty"]["relative"]
         assert 0.01 <= relative <= 0.06
         for table in ("drive", "transmission"):
@@ -124,9 +124,9 @@ def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apa
                 assert abs(parameters["inertia"]) >= 0.99 * APART * relative * case.oracle["drive"][f"{side}_inertia"]
 
 
-def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(found):
+def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(hidden_cases):
     checked = {"single": 0, "new": 0}
-    for case in found:
+    for case in hidden_cases:
         read_model(case.model)
         config, _ = read_model(case.oracle)
         if checked.get(case.kind, 4) == 4 or case.truth["growth"] > 1.0:
@@ -156,8 +156,8 @@ def _package(plant, initial, torques, period, substeps=20):
     return np.asarray(positions(plant, state, jnp.asarray(torques)))
 
 
-def test_an_oracle_gets_full_marks(found, oracle):
-    outcomes = run(found, oracle, oracle=lambda case: {"theta_e": 0.1})
+def test_an_oracle_gets_full_marks(hidden_cases, oracle):
+    outcomes = run(hidden_cases, oracle, oracle=lambda case: {"theta_e": 0.1})
     figures = scores(outcomes)
     for key in ("single", "new", "clutter", "hard", "pairs", "abstentions"):
         assert figures[key]["value"] == 1.0
@@ -180,8 +180,8 @@ def test_an_oracle_gets_full_marks(found, oracle):
     assert all(counts[i, columns.index(row)] for i, row in enumerate(rows) if not row.startswith("unknown."))
 
 
-def test_who_never_sees_anything_raises_no_alarm_and_finds_nothing(found):
-    outcomes = run(found, lambda logs, model, holdout: {"verdict": "no_discrepancy", "findings": [], "model": model})
+def test_who_never_sees_anything_raises_no_alarm_and_finds_nothing(hidden_cases):
+    outcomes = run(hidden_cases, lambda logs, model, holdout: {"verdict": "no_discrepancy", "findings": [], "model": model})
     figures = scores(outcomes)
     assert figures["false_alarms"]["value"] == figures["confidently_wrong"]["value"] == 0.0
     assert figures["single"]["value"] == figures["pairs"]["value"] == figures["abstentions"]["value"] == 0.0
@@ -191,8 +191,8 @@ def test_who_never_sees_anything_raises_no_alarm_and_finds_nothing(found):
     assert "**not met**" in markdown(outcomes)
 
 
-def test_a_wrong_answer_is_counted_where_it_belongs(found):
-    pair = next(case for case in found if case.kind == "pairs")
+def test_a_wrong_answer_is_counted_where_it_belongs(hidden_cases):
+    pair = next(case for case in hidden_cases if case.kind == "pairs")
     wrong = next(name for name in EFFECTS if name not in pair.hidden)
     findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong)]
     gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
@@ -204,18 +204,18 @@ def test_a_wrong_answer_is_counted_where_it_belongs(found):
     curve = calibration([messages])
     assert curve == [{"confidence": pytest.approx(0.8), "right": pytest.approx(2 / 3), "count": 3}]
     assert calibration_error(curve) == pytest.approx(0.8 - 2 / 3)
-    unknown = next(case for case in found if case.kind == "unknown")
+    unknown = next(case for case in hidden_cases if case.kind == "unknown")
     messages = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong, "confidence": 0.95}]})
     assert scores([messages])["confidently_wrong"]["value"] == 1.0
     with pytest.raises(ValueError, match="verdict 'maybe'"):
         outcome(unknown, {"verdict": "maybe"})
 
 
-def test_a_diagnosis_that_fails_is_an_outcome(found, capsys):
+def test_a_diagnosis_that_fails_is_an_outcome(hidden_cases, capsys):
     def fails(logs, model, holdout):
         raise RuntimeError("no")
 
-    outcomes = run(found[:2], fails)
+    outcomes = run(hidden_cases[:2], fails)
     assert scores(outcomes)["failed"]["value"] == 1.0
     assert "RuntimeError: no" in markdown(outcomes)
 
@@ -240,8 +240,8 @@ def _no_oracle(case):
     raise RuntimeError("not this one")
 
 
-def test_processes_share_the_cases_and_an_oracle_may_fail(found, capsys):
-    selection = [case for case in found if case.hidden][:3]
+def test_processes_share_the_cases_and_an_oracle_may_fail(hidden_cases, capsys):
+    selection = [case for case in hidden_cases if case.hidden][:3]
     outcomes = run(selection, _sees_nothing, _no_oracle, jobs=2)
     assert [one.name for one in outcomes] == [case.name for case in selection]
     assert all(one.ratio is None and one.reduction == 0.0 for one in outcomes)
@@ -249,8 +249,8 @@ def test_processes_share_the_cases_and_an_oracle_may_fail(found, capsys):
     assert len(messages) == 3 and all("WRONG" in line for line in messages)
 
 
-def test_the_proof_parts_true_from_nominal_model(found):
-    case = next(case for case in found if case.kind == "single")
+def test_the_proof_parts_true_from_nominal_model(hidden_cases):
+    case = next(case for case in hidden_cases if case.kind == "single")
     nominal, true = foretold([(case, case.model), (case, case.oracle)])
     assert true["theta_e"] < 1e-6 * nominal["theta_e"]
     worse = {**case.model, "effects": [{"kind": "motor.constant_torque", "torque": 100.0}]}
@@ -262,15 +262,15 @@ def test_the_proof_parts_true_from_nominal_model(found):
 
 
 @pytest.mark.parametrize("name", ["load.flexibility", "load.presliding_friction"])
-def test_windows_begin_with_what_the_motion_before_has_left(found, name, monkeypatch):
+def test_windows_begin_with_what_the_motion_before_has_left(hidden_cases, name, monkeypatch):
     monkeypatch.setattr("hidden.proof.WINDOW", 0.1)
-    case = next(case for case in found if list(case.hidden) == [name])
+    case = next(case for case in hidden_cases if list(case.hidden) == [name])
     nominal, true = foretold([(case, case.model), (case, case.oracle)])
     assert true["theta_s"] < 0.01 * nominal["theta_s"]
 
 
-def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tmp_path):
-    selection = found[:3]
+def test_files_are_read_by_the_package_and_scored_from_a_batch(hidden_cases, oracle, tmp_path):
+    selection = hidden_cases[:3]
     save(selection, tmp_path / "logs")
     for case in selection:
         model = tomllib.loads((tmp_path / "logs" / f"{case.name}.toml").read_text())
@@ -282,7 +282,7 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tm
         (folder / "diagnosis.json").write_text(json.dumps(oracle(None, case.model, None)))
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
     assert set(truth) == {case.name for case in selection}
-    outcomes = read_outcomes(found[:4], tmp_path / "found")
+    outcomes = read_outcomes(hidden_cases[:4], tmp_path / "found")
     assert [one.is_right for one in outcomes] == [True, True, True, False]
     result = write(outcomes, tmp_path / "out", "A seed")
     assert {path.name for path in result} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}

@@ -19,7 +19,7 @@ GEARED = {
 RIGID = {"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}
 
 
-def geared(t, y, u, flank):
+def gear_torques(t, y, u, flank):
     """Torques on both sides, and dry friction levels: play, hardening, damping, eccentricity, gravity, Stribeck, a sine."""
     x, v, q, w, *_ = y
     z = x - 5.0 * q + 0.01 * np.sin(2.0 * q + 0.3)
@@ -111,7 +111,7 @@ def reference(torques, inertias, half, start, commands, lag):
     states = np.zeros((4, len(commands)))
     # direction of each side, and the flank of the gap
     modes = [np.sign(start[1]), np.sign(start[3]), 1.0]
-    z = geared(0.0, state, 0.0, 0.0)[4]
+    z = gear_torques(0.0, state, 0.0, 0.0)[4]
     if half:
         modes[2] = np.sign(z) if abs(z) > half else 0.0
     for k, command in enumerate(commands):
@@ -179,7 +179,7 @@ GEARED_START, RIGID_START = (0.05, 2.0, 0.01, 0.3), (0.3, 0.5, 0.0, 0.0)
 def truths():
     limited = np.clip(1.1 * np.append(np.zeros(3), RIGID_INPUT[:-3]), -0.25, 0.25)
     return {
-        "geared": reference(geared, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
+        "geared": reference(gear_torques, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
         "rigid": reference(rigid, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
         "bristles": reference(bristles, (0.05, 7.0), 0.0, GEARED_START, GEARED_INPUT, 0.0),
     }

@@ -288,7 +288,7 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     assert one["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
 
 
-def refused(logs, *arguments, **keywords):
+def expect_refusal(logs, *arguments, **keywords):
     with pytest.raises(InputError) as error:
         read_diagnosis_task(*arguments, **keywords)
     message = str(error.value)
@@ -314,17 +314,17 @@ def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
 
 def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
     axis = logs / "axis.csv"
-    assert "is the log itself" in refused(logs, axis, model(), holdout=axis)
+    assert "is the log itself" in expect_refusal(logs, axis, model(), holdout=axis)
     log = logged(seed=2)
     logged(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
-    assert "shows an inertia of 0.1" in refused(logs, axis, model(), holdout=tmp_path / "heavy.csv")
+    assert "shows an inertia of 0.1" in expect_refusal(logs, axis, model(), holdout=tmp_path / "heavy.csv")
     dataclasses.replace(log, theta_e=-log.theta_e).write(tmp_path / "sign.csv")
-    assert "sign" in refused(logs, axis, model(), holdout=tmp_path / "sign.csv")
+    assert "sign" in expect_refusal(logs, axis, model(), holdout=tmp_path / "sign.csv")
 
 
 def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
     part(logged(), slice(150)).write(tmp_path / "short.csv")
-    assert "too few to hold a quarter of them out" in refused(logs, tmp_path / "short.csv", model())
+    assert "too few to hold a quarter of them out" in expect_refusal(logs, tmp_path / "short.csv", model())
 
 
 def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):

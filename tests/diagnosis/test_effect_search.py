@@ -15,7 +15,7 @@ SEED = 21
 _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}
 
 
-def explained(case, tmp_path):
+def run_search(case, tmp_path):
     case.log.write(tmp_path / "log.csv")
     return search(tmp_path / "log.csv", case.model).run()
 
@@ -32,7 +32,7 @@ def search(log, study):
 def test_a_hidden_effect_is_named_with_its_numbers(i, duration, tmp_path):
     """Of 2000 samples each, by the same programs."""
     case = cases(SEED, 4, "single", duration)[i]
-    result = explained(case, tmp_path)
+    result = run_search(case, tmp_path)
     (name,) = case.hidden
     assert result.verdict == "explained"
     assert [finding.effect for finding in result.findings] == [name]
@@ -47,13 +47,13 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, duration, tmp_path):
 
 @pytest.mark.parametrize("i", range(2))
 def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
-    result = explained(cases(SEED, 2, "none", 4.0)[i], tmp_path)
+    result = run_search(cases(SEED, 2, "none", 4.0)[i], tmp_path)
     assert result.verdict == "no_discrepancy"
     assert result.findings == ()
 
 
 def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
-    result = explained(cases(SEED, 1, "unknown", 2.0)[0], tmp_path)
+    result = run_search(cases(SEED, 1, "unknown", 2.0)[0], tmp_path)
     assert result.verdict == "unknown_effect"
     assert max(gain for gain, _ in result.rest.values()) > CLEAR
 

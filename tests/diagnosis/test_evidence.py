@@ -26,7 +26,7 @@ def columns(design, errors, scale, centre, **more):
     return Products(full.T @ full, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
 
 
-def drawn(size=1.0):
+def draw_regression(size=1.0):
     random = np.random.default_rng(5)
     design = size * random.standard_normal((40, 3))
     return design, design @ [0.3, -0.2, 0.5] + random.standard_normal(40)
@@ -34,7 +34,7 @@ def drawn(size=1.0):
 
 @pytest.mark.parametrize("which", [None, 0])
 def test_evidence_is_that_of_a_gaussian(which):
-    design, errors = drawn()
+    design, errors = draw_regression()
     scale, centre = np.array([0.4, 0.2, 0.7]), np.array([0.1, 0.0, -0.1])
     count = 2 if which is None else 3
     used = design[:, :count]
@@ -47,7 +47,7 @@ def test_evidence_is_that_of_a_gaussian(which):
 @pytest.mark.parametrize("size", [1.0, 1e8])
 def test_twins_are_parted_by_their_priors(size):
     """However precise the data are: at 1e8 the product matrix tells nothing of priors any more."""
-    design, errors = drawn(size)
+    design, errors = draw_regression(size)
     factor, scale, centre = -2.5, np.array([0.02, 0.2, 0.7]), np.array([0.1, 0.0, 0.05])
     design[:, 2] = factor * design[:, 0]
     result = evidence_of(columns(design, errors, scale, centre, twins={3: (1, factor)}), [Candidate()], 0)
@@ -69,7 +69,7 @@ def test_twins_are_parted_by_their_priors(size):
 
 def test_a_number_is_held_at_its_bound():
     """Against SciPy's bounded least squares; the other numbers, and the misfit, make the best of it."""
-    design, errors = drawn()
+    design, errors = draw_regression()
     scale, centre = np.array([0.05, 0.5, 0.7]), np.array([0.01, 0.0, 0.0])
     inputs = columns(design, errors, scale, centre)
     free, held = (

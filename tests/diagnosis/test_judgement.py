@@ -25,7 +25,7 @@ def fit(log_likelihood, log_evidence, name=NAME):
     return SimpleNamespace(names=(name,), numbers=numbers, log_likelihood=log_likelihood, log_evidence=log_evidence)
 
 
-def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
+def make_search_result(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
     finding = Finding(NAME, 0.98, {"torque": 0.1}, (("motor.inertia", 0.02),))
     model, wrong = fit(0.0, 0.0), fit(-fit_gain, -fit_gain - prior_gain, rival)
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
@@ -51,7 +51,16 @@ def judge(
         errors=lambda: {f"effects.{NAME}.torque": error},
     )
     return judged(
-        found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, {NAME: z}, contradicting
+        make_search_result(verdict, **gains),
+        fitted,
+        before,
+        errors,
+        LIMITS,
+        controls,
+        np.array([0.02]),
+        share,
+        {NAME: z},
+        contradicting,
     )  # type: ignore[arg-type]
 
 
@@ -77,7 +86,7 @@ def test_a_verdict_that_held_out_data_support_stays():
 )
 def test_one_reason_is_enough_against_it(given, reason):
     judgement = judge(**given)
-    assert judgement.found.verdict == "unknown_effect" and judgement.found.findings == found().findings
+    assert judgement.found.verdict == "unknown_effect" and judgement.found.findings == make_search_result().findings
     none = {key: value for key, value in PASSED.items() if key != "level"}
     assert {key: getattr(judgement, key) for key in none} == none | reason
 
@@ -98,12 +107,12 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, 
         errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
-    inputs = dataclasses.replace(found(), findings=(finding,), wrong=None)
+    inputs = dataclasses.replace(make_search_result(), findings=(finding,), wrong=None)
     (output,) = judged(inputs, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
     assert output == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
-def shared(z, **gains):
+def judge_shared(z, **gains):
     (one,) = judge(
         controls=[Control("wrong", NOISE, z, gains.get("rival", "motor.viscous_friction"))], **gains
     ).found.findings
@@ -111,16 +120,16 @@ def shared(z, **gains):
 
 
 def test_what_the_fit_says_counts_only_if_held_out_data_agree():
-    assert shared(2.0)[0] == pytest.approx(0.98)
-    confidence, others = shared(0.0)
+    assert judge_shared(2.0)[0] == pytest.approx(0.98)
+    confidence, others = judge_shared(0.0)
     assert confidence == pytest.approx(others["motor.viscous_friction"]) == pytest.approx(0.5, abs=0.01)
     assert confidence + sum(others.values()) == pytest.approx(1.0)
-    assert shared(-3.0)[0] == pytest.approx(1.0 / (1.0 + np.exp(4.5)), abs=2e-3)
+    assert judge_shared(-3.0)[0] == pytest.approx(1.0 / (1.0 + np.exp(4.5)), abs=2e-3)
 
 
 def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     control = [Control("wrong", NOISE, -3.0, "motor.viscous_friction")]
-    output = found()
+    output = make_search_result()
     assert exchanged(output, []) is None and exchanged(output, [control[0]._replace(z=3.0)]) is None
     other = exchanged(output, control)
     assert other is not None and (other.model, other.wrong) == (output.wrong, output.model)
@@ -133,13 +142,18 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     back = [Control("wrong", NOISE, 1.8, NAME)]
     after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
     assert after.found.findings == (one,)
-    assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
+    assert (
+        exchanged(
+            make_search_result(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]
+        )
+        is None
+    )
 
 
 def test_held_out_data_outweigh_a_better_fit_of_another_effect():
     # a delay and a lag over a start that neither knows
     def other(z):
-        return exchanged(found(fit_gain=-380.0), [Control("wrong", NOISE, z, "motor.viscous_friction")])
+        return exchanged(make_search_result(fit_gain=-380.0), [Control("wrong", NOISE, z, "motor.viscous_friction")])
 
     assert other(5.0) is None and other(0.5) is None and other(-0.5) is not None
     finding = judge(controls=[Control("wrong", NOISE, 5.0, "motor.viscous_friction")], fit_gain=-380.0).found.findings[0]
@@ -151,7 +165,7 @@ def test_what_a_log_leaves_open_held_out_data_decide():
     fitted = SimpleNamespace(names=(NAME,), theta=np.zeros(1), free=[], errors=dict, experiment=None)
 
     def said(z):
-        inputs = dataclasses.replace(found(fit_gain=0.0), findings=(tie,))
+        inputs = dataclasses.replace(make_search_result(fit_gain=0.0), findings=(tie,))
         controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
         return judged(inputs, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
 
@@ -160,12 +174,12 @@ def test_what_a_log_leaves_open_held_out_data_decide():
 
 
 def test_what_the_prior_says_stands():
-    assert shared(0.0, prior_gain=20.0)[0] == pytest.approx(0.98)
+    assert judge_shared(0.0, prior_gain=20.0)[0] == pytest.approx(0.98)
 
 
 def test_a_more_general_effect_takes_nothing_away():
     # dry friction is a Stribeck friction with equal levels
-    assert shared(0.0, rival="motor.stribeck_friction") == (0.98, {"motor.inertia": 0.02})
+    assert judge_shared(0.0, rival="motor.stribeck_friction") == (0.98, {"motor.inertia": 0.02})
 
 
 def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete_model_leaves():

@@ -56,7 +56,7 @@ def residual(torque, pole=0.0, level=0.1):
     return Residual("motor", TIME, torque, np.full(COUNT, level), correlation, 0.5 / PERIOD)
 
 
-def found(torque, seed=0, pole=0.0, **more):
+def locate_torque(torque, seed=0, pole=0.0, **more):
     return locate([residual(torque + 0.1 * noise(seed, pole), pole)], [coordinates(**more)])
 
 
@@ -65,7 +65,7 @@ def test_noise_is_found_nowhere(pole):
     """One false region in all of sixty logs would be chance; z-scores have the spread that they claim."""
     false, z, excess, explained = 0, [], [], []
     for seed in range(60):
-        one = found(np.zeros(COUNT), seed, pole)
+        one = locate_torque(np.zeros(COUNT), seed, pole)
         false += one.significant
         for name in ("speed", "position", "time"):
             z += [region.mean_z for region in one.coordinates[name].regions]
@@ -82,7 +82,7 @@ def test_a_slow_disturbance_is_no_function_of_the_motion():
     """Noise that the stated level does not know of, over half a second: power is missing, but at no place of the motion."""
     false = 0
     for seed in range(20):
-        one = found(0.2 * noise(100 + seed, 0.99), seed)
+        one = locate_torque(0.2 * noise(100 + seed, 0.99), seed)
         assert one.significant and one.excess_z > SIGNIFICANT
         for name in ("direction", "reversals", "|speed|", "speed", "turn"):
             assert one.coordinates[name].explained < 0.25
@@ -103,7 +103,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_each_coordinate_is_found_for_what_lives_there(case):
     name, torque, words = CASES[case]
-    one = found(torque)
+    one = locate_torque(torque)
     assert one.significant
     assert one.coordinates[name].explained > 0.9
     assert words in sentence_of(one)
@@ -113,37 +113,37 @@ def test_each_coordinate_is_found_for_what_lives_there(case):
 
 def test_reversals_low_speed_places_and_times_are_told():
     slow = np.where(np.abs(VELOCITY) < 1.0, -0.6 * np.sign(VELOCITY), 0.0)
-    one = found(slow)
+    one = locate_torque(slow)
     near = [region for region in one.coordinates["reversals"].regions if region.label.startswith("reversals")]
     assert sum(region.power_share for region in near) > 0.6 and sum(region.time_share for region in near) < 0.3
     sentence = sentence_of(one)
     assert sentence.startswith("motor side, at ") and "of the residual power lies" in sentence
     dent = np.where(np.abs(POSITION - 2.0) < 0.3, 0.8, 0.0)
-    assert "< θe <" in sentence_of(found(dent))
+    assert "< θe <" in sentence_of(locate_torque(dent))
     knock = np.where(np.abs(TIME - 12.0) < 0.4, 1.0, 0.0) * np.sin(40.0 * TIME)
-    assert "for a while" in sentence_of(found(knock))
+    assert "for a while" in sentence_of(locate_torque(knock))
 
 
 def test_the_gap_is_told():
     inside = (np.abs(np.sin(3.0 * TIME)) < 0.2).astype(int)
     gap = CoordinateValues(inside, classes=("outside", "inside of the gap"))
-    one = found(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
+    one = locate_torque(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
     assert "inside of the gap" in sentence_of(one)
 
 
 def test_a_disturbance_of_its_own_frequency_is_a_narrow_peak():
-    one = found(0.2 * np.sin(2.0 * np.pi * 7.3 * TIME))
+    one = locate_torque(0.2 * np.sin(2.0 * np.pi * 7.3 * TIME))
     peak = one.peaks[0]
     assert peak.frequency == pytest.approx(7.3, abs=0.05)
     assert peak.amplitude == pytest.approx(0.2, rel=0.1)
     assert not peak.in_motion and "7.3 Hz" in sentence_of(one)
     # friction has peaks, too, but where the motion has them
-    friction = found(-0.3 * np.sign(VELOCITY))
+    friction = locate_torque(-0.3 * np.sign(VELOCITY))
     assert friction.peaks[0].in_motion and "Hz" not in sentence_of(friction)
 
 
 def test_weak_torques_are_found_below_the_noise_of_a_sample():
-    one = found(-0.03 * np.sign(VELOCITY))
+    one = locate_torque(-0.03 * np.sign(VELOCITY))
     assert one.significant and one.coordinates["direction"].explained > 0.7
     backward, forward = one.coordinates["direction"].regions
     assert backward.mean == pytest.approx(0.03, abs=4.0 * backward.mean_error)

@@ -44,7 +44,7 @@ class Torques:
         return {"motor": np.concatenate(result)}
 
 
-def found(
+def compare_logs(
     first: float,
     second: float,
     turned: float = 1.0,
@@ -73,7 +73,7 @@ def found(
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_an_inertia_that_two_logs_show_to_differ(separate):
-    (one,) = found(INERTIA, 1.5 * INERTIA, separate=separate)
+    (one,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate)
     assert one.path == "drive.motor_inertia" and (one.least.log, one.most.log) == ("a.csv", "b.csv")
     assert one.least.value == pytest.approx(INERTIA, abs=4.0 * one.least.error)
     assert one.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
@@ -81,25 +81,25 @@ def test_an_inertia_that_two_logs_show_to_differ(separate):
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_logs_of_one_name_are_two(separate):
-    (one,) = found(INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv"))
+    (one,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv"))
     assert (one.least.log, one.most.log) == ("run1/log.csv", "run2/log.csv")
 
 
 def test_logs_of_one_machine_agree():
-    assert found(INERTIA, INERTIA) == []
+    assert compare_logs(INERTIA, INERTIA) == []
 
 
 def test_a_difference_without_torque_is_no_contradiction():
-    assert found(INERTIA, 1.5 * INERTIA, turned=0.05) == []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, turned=0.05) == []
 
 
 def test_a_motion_that_noise_all_but_hides_says_nothing_of_an_inertia():
     # of a load that stands still the acceleration is noise, and so is what a log says of its inertia
-    assert found(INERTIA, 1.5 * INERTIA, noise=1e-3) != []
-    assert found(INERTIA, 1.5 * INERTIA, noise=2e-3) == []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, noise=1e-3) != []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, noise=2e-3) == []
 
 
 def test_blocks_that_agree_beyond_what_noise_allows_have_measured_nothing():
     # of a drive that stands still a model says both sides of the equation
-    assert found(INERTIA, 1.5 * INERTIA, rough=0.1) != []
-    assert found(INERTIA, 1.5 * INERTIA, rough=1e-5) == []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, rough=0.1) != []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, rough=1e-5) == []

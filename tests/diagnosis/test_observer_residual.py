@@ -43,7 +43,7 @@ def logs(tmp_path_factory):
     return folder, speeds
 
 
-def seen(logs, which, study, gains=None):
+def read_residuals(logs, which, study, gains=None):
     """The experiment with gains, the smoother's residuals of its log, and the observers'."""
     task = read_diagnosis_task(logs[0] / f"{which}.csv", study)
     nominal = on_record(task.config, task.record)
@@ -68,7 +68,7 @@ def late(torque, period):
 
 
 def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
-    experiment, residuals, result = seen(logs, "geared", model(drive=GEARED, transmission=GAP))
+    experiment, residuals, result = read_residuals(logs, "geared", model(drive=GEARED, transmission=GAP))
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
         (one,) = result[side]
         assert one.converged and one.stuck < 0.02
@@ -94,7 +94,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretis
     tables = {"drive": DRIVE, "effects": [FRICTION]}
     if which == "geared":
         tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
-    _, _, result = seen(logs, which, model(observer={"discretisation": discretisation}, **tables))
+    _, _, result = read_residuals(logs, which, model(observer={"discretisation": discretisation}, **tables))
     for side, (name,) in result.items():
         scores = [rms(name.residual.torque / name.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
@@ -108,7 +108,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretis
 
 
 def test_a_rigid_drive_has_one_witness(logs):
-    experiment, residuals, result = seen(logs, "direct", model())
+    experiment, residuals, result = read_residuals(logs, "direct", model())
     assert list(result) == ["motor"]
     description = compared(experiment, result["motor"], residuals["motor"], 30.0)
     assert description["correlation"] > 0.98 and description["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
@@ -117,7 +117,7 @@ def test_a_rigid_drive_has_one_witness(logs):
 @pytest.mark.parametrize("alpha", [1.0, 2.5])
 def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
     """What is missing is 3 rad/s^2."""
-    experiment, residuals, result = seen(logs, "direct", model(), {"motor": (2.0, alpha)})
+    experiment, residuals, result = read_residuals(logs, "direct", model(), {"motor": (2.0, alpha)})
     (one,) = result["motor"]
     assert one.stuck > 0.5 and not one.converged
     description = compared(experiment, result["motor"], residuals["motor"], 30.0)
@@ -131,5 +131,5 @@ def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
         return {side: values.at[0, -1].set(np.inf) for side, values in real(*inputs).items()}
 
     monkeypatch.setattr(under_test, "_controls", controls)
-    _, _, result = seen(logs, "direct", model())
+    _, _, result = read_residuals(logs, "direct", model())
     assert not result["motor"][0].converged and np.isnan(result["motor"][0].residual.deviation).all()

@@ -12,7 +12,7 @@ from jaxbl.drive import make_effect
 POSITION, TORQUE = 1e-4, 1e-2
 
 
-def compared(position, torque, *, gain=1.0, floor=TORQUE):
+def compare_errors(position, torque, *, gain=1.0, floor=TORQUE):
     """A model whose errors are so many times the noise; `floor`: noise of the torques by its own inertia, N m."""
     samples = {"theta_e": POSITION * position, "torque_motor": gain * TORQUE * torque}
     return Comparison({name: float(np.std(sample)) for name, sample in samples.items()}, {"motor": floor}, samples, gain)
@@ -29,19 +29,19 @@ def errors():
 
 def test_a_ripple_that_only_the_torque_shows_counts(errors):
     # windows of the position go wrong by something else, which is far larger
-    control, better = compared(errors(500.0), errors(4.0)), compared(errors(500.0), errors(2.0))
+    control, better = compare_errors(errors(500.0), errors(4.0)), compare_errors(errors(500.0), errors(2.0))
     assert beaten(LOG, control, better) > 5.0
     assert beaten(LOG, better, control) < -2.0
     # or one channel against the other: all together
-    assert abs(beaten(LOG, compared(errors(4.0), errors(2.0)), compared(errors(2.0), errors(4.0)))) < 3.0
+    assert abs(beaten(LOG, compare_errors(errors(4.0), errors(2.0)), compare_errors(errors(2.0), errors(4.0)))) < 3.0
 
 
 def test_one_factor_on_all_torques_and_the_input_makes_no_model_better(errors):
     position, torque = errors(3.0), errors(3.0)
-    scaled = compared(position, torque, gain=0.6, floor=0.6 * TORQUE)
-    assert beaten(LOG, compared(position, torque), scaled) == pytest.approx(0.0, abs=1e-9)
+    scaled = compare_errors(position, torque, gain=0.6, floor=0.6 * TORQUE)
+    assert beaten(LOG, compare_errors(position, torque), scaled) == pytest.approx(0.0, abs=1e-9)
     # nor does a smaller inertia, by which readings make less noise of torque
-    assert beaten(LOG, compared(position, torque, floor=0.6 * TORQUE), compared(position, torque)) == 0.0
+    assert beaten(LOG, compare_errors(position, torque, floor=0.6 * TORQUE), compare_errors(position, torque)) == 0.0
 
 
 def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
@@ -56,11 +56,11 @@ def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
     assert _standard_errors(np.full(16, np.inf), moving[:1].repeat(16)) == np.inf
 
 
-def accepted(monkeypatch, errors, shares, gain):
+def accept_effects(monkeypatch, errors, shares, gain):
     """What held-out data leave of effects, given by the torque of each, if `gain(name, names)` is what each one gains."""
     proof = Proof.__new__(Proof)
-    proof.before, proof.noise = compared(errors(9.0), errors(9.0)), LOG.noise_floor({"motor": TORQUE})
-    proof.other = SimpleNamespace(compare=lambda experiment: compared(errors(1.0), errors(1.0)))
+    proof.before, proof.noise = compare_errors(errors(9.0), errors(9.0)), LOG.noise_floor({"motor": TORQUE})
+    proof.other = SimpleNamespace(compare=lambda experiment: compare_errors(errors(1.0), errors(1.0)))
     fitted = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
     monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fitted)
     monkeypatch.setattr(Proof, "_gain", lambda self, search, model, after, name: gain(name, model.names))
@@ -70,7 +70,7 @@ def accepted(monkeypatch, errors, shares, gain):
 
 def test_a_wave_in_time_has_to_go_on_in_other_data(monkeypatch, errors):
     shares = {"load.periodic_disturbance": 0.002, "motor.cogging": 0.01}
-    output = accepted(monkeypatch, errors, shares, lambda name, names: 1.4)
+    output = accept_effects(monkeypatch, errors, shares, lambda name, names: 1.4)
     assert output.withdrawn == ["load.periodic_disturbance"] and output.fitted.names == ("motor.cogging",)
 
 
@@ -82,7 +82,7 @@ def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, err
         alone = "actuator.delay" not in names
         return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
 
-    output = accepted(monkeypatch, errors, shares, gain)
+    output = accept_effects(monkeypatch, errors, shares, gain)
     assert output.withdrawn == ["actuator.delay"]
     assert output.fitted.names == ("motor.cogging", "motor.coulomb_friction")
 
@@ -124,8 +124,8 @@ def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, na
         other=SimpleNamespace(compare=lambda _: "after", noise={"motor": 1e-3}),
         worse=lambda *_: False, _gain=lambda *_: 7.0,
     )  # fmt: skip
-    accepted = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
-    plainer = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]
+    accept_effects = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
+    plainer = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accept_effects, general)  # type: ignore[arg-type]
     assert (plainer is not None) == named
     if plainer is not None:
         assert plainer.fitted.numbers == {plain: {"torque": 0.1}} and plainer.gains == {plain: 7.0}

@@ -28,7 +28,7 @@ def emps(*effects):
     return {key: table for key, table in study.items() if key not in ("observer", "excitation")}
 
 
-def explained(log, study):
+def search_effects(log, study):
     task = read_diagnosis_task(log, study)
     nominal = on_record(task.config, task.record)
     free = make_free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
@@ -62,7 +62,7 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
 
 
 def test_emps_an_effect_that_is_taken_out_is_named_again():
-    result = explained(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET))
+    result = search_effects(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET))
     assert result.findings[0].effect == COULOMB["kind"]
     assert result.findings[0].numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
 
@@ -77,7 +77,7 @@ def test_xl330_gravity_and_then_dry_friction_are_named():
         | {"absent": ["u"], "where": {"torque_enable": False}, "resample": 3.5e-3},
     )
     logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
-    result = explained(logs, study)
+    result = search_effects(logs, study)
     assert result.findings[0].effect == "load.gravity"
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
     assert 0.25 < result.findings[0].numbers["torque"] < 0.49 * 0.1 * 9.81

@@ -10,7 +10,7 @@ from jaxbl.diagnosis.whittle import Spectrum, spectrum_of, weighted_products
 POLE = 0.8
 
 
-def correlated(samples, seed):
+def correlated_noise(samples, seed):
     """First-order noise in its steady state, of one side."""
     noise = np.random.default_rng(seed).standard_normal(samples + 500)
     return lfilter([1.0], [1.0, -POLE], noise)[500:, None]
@@ -23,7 +23,7 @@ def test_white_noise_has_no_colour(samples):
 
 
 def test_the_spectrum_of_first_order_noise():
-    actual = spectrum_of([correlated(20000, 1), correlated(7001, 2)])
+    actual = spectrum_of([correlated_noise(20000, 1), correlated_noise(7001, 2)])
     assert actual.coloured
     index = actual.at(1000)[:, 0]
     frequency = np.fft.rfftfreq(1000)

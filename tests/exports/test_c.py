@@ -30,7 +30,7 @@ def study(kind="super_twisting", **more):
     return small(identifier={"start": 0.1}, observer=observer, **more)
 
 
-def exported(tmp_path, data, precision="double", **flags):
+def export_native(tmp_path, data, precision="double", **flags):
     jaxbl.export(data, tmp_path, precision=precision, name="drive")
     return Native(tmp_path, **flags)
 
@@ -42,7 +42,7 @@ def code(tmp_path_factory):
     @functools.cache
     def made(precision, kind="super_twisting"):
         folder = tmp_path_factory.mktemp("code")
-        return folder, exported(folder, study(kind), precision, flags=("-O0", *UNCONTRACTED))
+        return folder, export_native(folder, study(kind), precision, flags=("-O0", *UNCONTRACTED))
 
     return made
 
@@ -105,7 +105,7 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
         data["transmission"] = {"law": law, "stiffness": 1.0} | numbers.get(law, {})
     sides = ("motor",) if law is None else ("motor", "load")
     inputs = samples(4000, len(sides))
-    native = exported(tmp_path, data)
+    native = export_native(tmp_path, data)
     actual = outputs(native, inputs)
     with jax.enable_x64(True):
         experiment = as_arrays(read_config(data).build(), jnp.float64)

@@ -48,7 +48,7 @@ def study(*effects, **tables):
     return read_config(small(effects=list(effects), **tables))
 
 
-def compiled(config, linear=()):
+def compile_model(config, linear=()):
     """The model at the study's initial state, and what it has of the study."""
     text, _, output = write_mjcf(config, linear=linear)
     model = mujoco.MjModel.from_xml_string(text)
@@ -69,7 +69,7 @@ def test_accelerations_are_those_of_the_plant(case):
     if effect["kind"] == "actuator.delay":
         effect = effect | {"delay": 0.004}
     config = study(effect, transmission=law)
-    model, data, output = compiled(config, linear)
+    model, data, output = compile_model(config, linear)
     (how, text) = output[f"effects.{effect['kind']}"]
     assert text
     plant = as_arrays(config.build().plant, jnp.float64)
@@ -178,7 +178,7 @@ def test_options_of_another_target_are_refused(tmp_path):
 def test_starts_as_the_study_does():
     flexible = {"kind": "load.flexibility", "inertia": 0.5, "frequency": 2.0}
     config = study(flexible, initial={"motor_position": 0.5, "load_position": 0.1, "load_velocity": 0.3})
-    _, data, _ = compiled(config)
+    _, data, _ = compile_model(config)
     np.testing.assert_array_equal(data.qpos, [0.5, 0.1, 0.0])
     np.testing.assert_array_equal(data.qvel, [0.0, 0.3, -0.3])
 

@@ -55,7 +55,7 @@ def spread(experiment, paths, lanes):
     return {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
 
 
-def scanned(experiment, values, reducer, seed):
+def scan_lanes(experiment, values, reducer, seed):
     """Figures of the scan."""
 
     def lane(values):
@@ -102,7 +102,7 @@ def test_figures_are_those_of_the_scan(names, law, options):
     values = spread(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
     fused, expected = (
         HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3),
-        scanned(full_experiment, values, ALL_METRICS, 3),
+        scan_lanes(full_experiment, values, ALL_METRICS, 3),
     )
     device = DeviceSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
@@ -132,7 +132,7 @@ def test_what_no_axis_touches_is_computed_once():
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(simulator._run_shared_part, SharedPartLoop)
     assert simulator._run_shared_part._loop is not None
-    expected = scanned(full_experiment, values, ALL_METRICS, 3)
+    expected = scan_lanes(full_experiment, values, ALL_METRICS, 3)
     for name, figure in simulator(values, 3).items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-9, err_msg=name)
 
@@ -144,7 +144,7 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     with jax.enable_x64(precision == "float64"):
         full_experiment = work.experiment()
         fused = HostSimulator(full_experiment, (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)(values, SEED)
-        expected = scanned(full_experiment, values, CHAIN_METRICS, SEED)
+        expected = scan_lanes(full_experiment, values, CHAIN_METRICS, SEED)
     for name, figure in fused.items():
         assert figure.dtype == precision
         if precision == "float64":

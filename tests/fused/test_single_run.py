@@ -49,7 +49,7 @@ def row(state, signals):
 
 
 @functools.cache
-def scanned(excitation):
+def scan_run(excitation):
     """An experiment, and figures and record of it by the scan."""
     full_experiment = experiment(excitation, 523, "float64")
     return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD), row, 1))(jnp.asarray(3))
@@ -66,7 +66,7 @@ def scanned(excitation):
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
 def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
-    full, figures, record = scanned(excitation)
+    full, figures, record = scan_run(excitation)
     result, selected = record_run(full, 3, reducers, row, every)
     assert list(selected) == ["u", "torque", "moving", "t"]
     assert set(result) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})

@@ -30,7 +30,7 @@ TRUTH = {
 }
 
 
-def geared(changes=None, **tables):
+def geared_study(changes=None, **tables):
     tables = {
         "transmission": LAW,
         "effects": FRICTION,
@@ -41,7 +41,7 @@ def geared(changes=None, **tables):
     return small(SETTINGS | (changes or {}), **tables)
 
 
-NOMINAL = geared(
+NOMINAL = geared_study(
     {
         "drive.motor_inertia": 0.055,
         "drive.load_viscous": 14.0,
@@ -54,7 +54,7 @@ NOMINAL = geared(
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     file = tmp_path_factory.mktemp("log") / "axis.csv"
-    run(geared()).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
+    run(geared_study()).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
     return file
 
 
@@ -90,7 +90,7 @@ def test_recursive_identifier_ends_nearby(found):
 def test_trace_holds_what_the_log_says(found):
     trace = found.trace
     assert len(trace) == 1500
-    truth = run(geared()).trace
+    truth = run(geared_study()).trace
     errors = (trace["motor.velocity"] - truth["motor.velocity"]) / trace["motor.velocity_deviation"]
     assert 0.5 < np.sqrt(np.mean(errors**2)) < 1.5
     assert np.sqrt(np.nanmean(trace["motor.residual"] ** 2)) == pytest.approx(1e-4, rel=0.1)
@@ -123,7 +123,7 @@ def test_report_has_every_number_and_figure(found, tmp_path):
 def test_a_direction_that_the_log_does_not_show_is_refused(log):
     """Torque, inertias, frictions and stiffness scaled alike."""
     effects = [*FRICTION, {"kind": "actuator.gain_error", "relative": 0.0}]
-    summary = identify(log, geared(effects=effects)).summary
+    summary = identify(log, geared_study(effects=effects)).summary
     (refusal,) = summary["refused"]
     assert "effects.actuator.gain_error.relative" in refusal["direction"]
     assert "transmission.stiffness" in refusal["direction"]
@@ -141,11 +141,11 @@ def open_ended(study):
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory):
+def measure_errors(tmp_path_factory):
     """Two logs of the drive with a torque sensor, the second one with another input."""
     folder = tmp_path_factory.mktemp("measured")
     for i, frequency in enumerate((0.5, 0.37)):
-        trace = run(geared(excitation={"kind": "multisine", "amplitude": 5.0, "frequency": frequency})).trace
+        trace = run(geared_study(excitation={"kind": "multisine", "amplitude": 5.0, "frequency": frequency})).trace
         sensor = 0.02 * np.random.default_rng(i).standard_normal(len(trace))
         frame = trace[["t", "u", "theta_e", "theta_s"]].assign(sensor=trace["torque"] + sensor)
         frame.to_csv(folder / f"log{i}.csv", index=False)
@@ -153,15 +153,15 @@ def measured(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def everything(measured):
+def everything(measure_errors):
     """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
     study = open_ended(NOMINAL)
     # the log is sampled twice as often
     study["run"] = {key: 2 * value if key in ("sample_period", "substeps") else value for key, value in study["run"].items()}
     study["log"] = {"transmitted": "sensor", "initial_state": "rest"}
     study["identify"] = {"starts": 2, "window": 0.5, "method": "prediction_error", "parameters": list(TRUTH)[4:]}
-    study["drive"] = geared()["drive"]
-    return identify(measured / "log0.csv", study, holdout=measured / "log1.csv", profile=True)
+    study["drive"] = geared_study()["drive"]
+    return identify(measure_errors / "log0.csv", study, holdout=measure_errors / "log1.csv", profile=True)
 
 
 def test_a_measured_torque_is_regressed_directly(everything):
@@ -217,12 +217,12 @@ def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp
     assert "with the measured transmitted torque" in page
 
 
-def test_several_logs_are_one_record(measured, found, tmp_path):
+def test_several_logs_are_one_record(measure_errors, found, tmp_path):
     """Halves of two logs say as much as one whole log."""
-    study = geared(identify={"starts": 1, "window": 0.5})
+    study = geared_study(identify={"starts": 1, "window": 0.5})
     halves = [tmp_path / "half0.csv", tmp_path / "half1.csv"]
     for i, half in enumerate(halves):
-        pd.read_csv(measured / f"log{i}.csv").iloc[:750].to_csv(half, index=False)
+        pd.read_csv(measure_errors / f"log{i}.csv").iloc[:750].to_csv(half, index=False)
     identification = identify(halves, study)
     assert len(identification.trace) == 1500
     assert identification.summary["method"]["trajectory"]["windows"] == 6
@@ -234,23 +234,26 @@ def test_several_logs_are_one_record(measured, found, tmp_path):
 
 BAD = {
     "no torque, no inertia": (
-        geared(log={"absent": ["u"]}),
+        geared_study(log={"absent": ["u"]}),
         r"without u a motion shows torques only as multiples of an inertia: put a known one into \[uncertainty\] exact",
     ),
     "no motor encoder": (
-        geared(log={"absent": ["theta_e"]}),
+        geared_study(log={"absent": ["theta_e"]}),
         "no motor position .theta_e., which a two_inertia drive needs",
     ),
     "unknown number": (
-        geared(identify={"parameters": ["drive.mass"]}),
+        geared_study(identify={"parameters": ["drive.mass"]}),
         "'drive.mass' is no number of the plant; fitted can be: drive.motor_inertia",
     ),
-    "window": (geared(identify={"window": 60.0}), r"identify.window: 60 s are 30000 samples; it should be between 20 "),
+    "window": (
+        geared_study(identify={"window": 60.0}),
+        r"identify.window: 60 s are 30000 samples; it should be between 20 ",
+    ),
     "far apart": (
-        geared({"run.sample_period": 1e-6, "run.substeps": 1, "run.duration": 1e-3}),
+        geared_study({"run.sample_period": 1e-6, "run.substeps": 1, "run.duration": 1e-3}),
         r"its samples are 0.002 s apart, more than 1000 plant steps of 1e-06 s \(\[run\]\); where the stamps are not in s",
     ),
-    "starts": (geared(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
+    "starts": (geared_study(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
 }
 
 

@@ -45,25 +45,25 @@ def log(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(log):
+def identification(log):
     return identify(log, STUDY)
 
 
-def test_gap_and_friction_behind_the_gear_are_found(found):
-    assert found.summary["backlash"]["shown"]
-    assert found.summary["backlash"]["crossings"] >= 10
+def test_gap_and_friction_behind_the_gear_are_found(identification):
+    assert identification.summary["backlash"]["shown"]
+    assert identification.summary["backlash"]["crossings"] >= 10
     for path, true in TRUTH.items():
-        parameters = found.summary["parameters"][path]
+        parameters = identification.summary["parameters"][path]
         assert parameters["value"] == pytest.approx(true, rel=0.02), path
         assert parameters["interval"][0] <= true <= parameters["interval"][1], path
         assert parameters["interval"][1] / parameters["interval"][0] < 1.1, path
-    assert found.model.transmission.half_gap == pytest.approx(0.08, rel=1e-3)
+    assert identification.model.transmission.half_gap == pytest.approx(0.08, rel=1e-3)
 
 
-def test_the_load_that_the_model_makes_of_it_is_the_true_one(found):
+def test_the_load_that_the_model_makes_of_it_is_the_true_one(identification):
     log, _ = geared()
     # an angle that no channel holds: apart by a constant
-    apart = found.trace["load.modelled_position"].to_numpy() - log.theta_s
+    apart = identification.trace["load.modelled_position"].to_numpy() - log.theta_s
     assert np.std(apart[200:]) < 0.01 * np.std(log.theta_s)
 
 

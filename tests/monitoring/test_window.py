@@ -19,7 +19,7 @@ MOTOR = {"coulomb": 0.3, "viscous": 0.2}
 ZERO, PUSH = 0.013, 0.25
 
 
-def prepared(data):
+def prepare_window(data):
     return prepare(read_config(data))
 
 
@@ -56,7 +56,7 @@ def rows_of(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
 
 
 def window_of(rows, data=None, seconds=10.0):
-    window = Window(prepared(data or axis()), seconds)
+    window = Window(prepare_window(data or axis()), seconds)
     window.add(rows, restarts=True)
     return window
 
@@ -127,7 +127,7 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
     for side in ("motor", "load"):
         spoilt[f"{side}.torque"][12_000:12_090] += 100.0
     assert abs(window_of(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
-    again = Window(prepared(axis()), 10.0)
+    again = Window(prepare_window(axis()), 10.0)
     again.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
     again.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
     assert again.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
@@ -136,7 +136,7 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
 @pytest.mark.parametrize("data", [axis(), small()], ids=["dead_zone", "sigmoid_backlash"])
 def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
     """Of any lengths, also those of a block and one more."""
-    experiment = prepared(data)
+    experiment = prepare_window(data)
     count = 5000
     time, _, motor, load = motion(count)
     noise = np.random.default_rng(1).standard_normal((2, count))

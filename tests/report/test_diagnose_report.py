@@ -22,7 +22,7 @@ ERRORS = {
 UNITS = dict(zip(ERRORS, ["rad", "rad", "rad/s", "rad/s", "N m", "N m"], strict=True))
 
 
-def scaled(factor):
+def scale_errors(factor):
     return {name: factor * value for name, value in ERRORS.items()}
 
 
@@ -50,9 +50,9 @@ SUMMARY = {
         "holdout": {"file": "/logs/other.csv", "separate": True, "from": 0.0, "to": 5.0, "window": 0.5},
         "units": UNITS,
         "holdout_rmse_before": ERRORS,
-        "holdout_rmse_after": scaled(0.011),
-        "noise_floor": scaled(0.01),
-        "free_run": {"before": ERRORS, "after": scaled(0.02)},
+        "holdout_rmse_after": scale_errors(0.011),
+        "noise_floor": scale_errors(0.01),
+        "free_run": {"before": ERRORS, "after": scale_errors(0.02)},
         "expected": {
             name: {"noise": 0.01 * value, "open": 0.0, "least": 0.0, "limit": 0.012 * value}
             for name, value in ERRORS.items()
@@ -60,8 +60,8 @@ SUMMARY = {
         },
         "test": PASSED,
         "controls": {
-            "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3), "z": 12.3},
-            "permuted": {"rmse": scaled(1.4) | {"theta_e": None}, "z": float("inf")},
+            "wrong": {"effect": "load.stribeck_friction", "rmse": scale_errors(0.3), "z": 12.3},
+            "permuted": {"rmse": scale_errors(1.4) | {"theta_e": None}, "z": float("inf")},
         },
     },
 }
@@ -73,7 +73,7 @@ def test_logs_that_contradict_each_other_are_named_first():
         {"log": "fast.csv", "value": 1.68e-4, "standard_error": 5e-6},
     ]
     lines = diagnosis_lines(
-        changed(
+        change_summary(
             contradictions=[{"parameter": "drive.motor_inertia", "unit": "kg m²", "logs": logs}], warnings=["A warning."]
         )
     )
@@ -85,7 +85,7 @@ def test_logs_that_contradict_each_other_are_named_first():
     assert lines[1] == "A warning."
 
 
-def changed(**keys):
+def change_summary(**keys):
     return copy.deepcopy(SUMMARY) | keys
 
 
@@ -118,7 +118,7 @@ def test_the_observers_residual_is_given_where_they_converge():
 
     def lines_of(**observed):
         where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in observed.items()}
-        return [line for line in diagnosis_lines(changed(where=where)) if "observers" in line]
+        return [line for line in diagnosis_lines(change_summary(where=where)) if "observers" in line]
 
     assert lines_of(motor=nothing, load=calls) == [
         "By the observers' equivalent control: motor side, no more than its noise (0.02 N m rms); load side, 2.1 N m rms "
@@ -129,20 +129,20 @@ def test_the_observers_residual_is_given_where_they_converge():
 
 
 def test_other_verdicts_say_what_is_left():
-    assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
+    assert diagnosis_lines(change_summary(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
     remainder = {"load.drift": {"evidence": 30.0, "share": 0.01}}
-    lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=remainder))
+    lines = diagnosis_lines(change_summary(verdict="unknown_effect", findings=[], rest=remainder))
     assert lines[0].startswith("Unknown: no known effect explains what is missing: motor side")
     assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
-    assert "No free run is compared: it is chaotic." in diagnosis_lines(changed(gap=gap))
+    assert "No free run is compared: it is chaotic." in diagnosis_lines(change_summary(gap=gap))
 
 
 def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     def lines(share=0.83, **test):
         gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | test}
         where = {"load": {"sentence": "load side, there"}}
-        return diagnosis_lines(changed(verdict="unknown_effect", where_after=where, gap=gap, explained_share=share))
+        return diagnosis_lines(change_summary(verdict="unknown_effect", where_after=where, gap=gap, explained_share=share))
 
     partly = (
         "Partly explained: the model lacks load.coulomb_friction; with it, {} of the missing torque is explained on data "
@@ -164,11 +164,11 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     assert unsure[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {too_little}"
     assert unsure[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
     assert not any("less than half" in line for line in unsure)
-    gone = changed(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
+    gone = change_summary(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
     lost = "Not confirmed: something is missing by the log, perhaps load.coulomb_friction; "
     assert diagnosis_lines(gone)[0] == lost + too_little
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
-    alone = diagnosis_lines(changed(verdict="unknown_effect", gap=gap, backlash=None))[0]
+    alone = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
     assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in alone
     assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
@@ -180,23 +180,23 @@ def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
     }
     gap = SUMMARY["gap"] | {"slow_torques": slow}
     gap["test"] = gap["test"] | {"failed": ["torque_motor below 18 Hz", "torque_motor below 9 Hz"]}
-    diagnosis_line = diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
+    diagnosis_line = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap))[3]
     assert diagnosis_line.endswith("(1 % test): torque_motor below 9 Hz 0.03 N m (at most 0.01).")
     # of a model that diverges nothing is finite
     slow["torque_motor below 18 Hz"]["after"] = None
-    assert "torque_motor below 18 Hz" in diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
+    assert "torque_motor below 18 Hz" in diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap))[3]
 
 
 @pytest.mark.parametrize(("relative", "told"), [(-0.98, True), (0.14, False)])
 def test_a_torque_that_is_far_off_comes_first(relative, told):
     one = SUMMARY["findings"][0] | {"parameters": {"relative": {"value": relative, "standard_error": 0.01, "unit": ""}}}
-    first = diagnosis_lines(changed(findings=[one]))[0]
+    first = diagnosis_lines(change_summary(findings=[one]))[0]
     assert first.startswith("Doubtful: the torque would be 0.02 times what u says: a unit,") is told
 
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
 def test_the_verdict_is_drawn(findings, tmp_path):
-    drawn = _verdict(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
+    drawn = _verdict(change_summary(findings=findings, verdict="explained" if findings else "no_discrepancy"))
     left, right = drawn.figure.axes
     assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"
     assert left.get_yticklabels()[0].get_text() == "motor position\n0.1 → 0.0011 rad"

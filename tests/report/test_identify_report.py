@@ -52,7 +52,7 @@ def torques_of(config, trace, sides):
     return model_torques(config.build(), kinematics, deviation)
 
 
-def made(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
+def make_identification(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
     """What identify would find with the numbers of the study itself."""
     config = read_config(data)
     truth = _trace(json.dumps(data)).copy()
@@ -125,7 +125,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_all_figures_are_drawn_with_units(case, tmp_path):
     data, how, names = CASES[case]
-    result = made(data, tmp_path, **how)
+    result = make_identification(data, tmp_path, **how)
     drawn = draw_identification(result)
     assert [one.name for one in drawn] == names
     for one in drawn:
@@ -156,7 +156,7 @@ def labels(figure: Figure) -> list[str]:
 
 
 def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
-    result = made(CASES["rigid"][0], tmp_path)
+    result = make_identification(CASES["rigid"][0], tmp_path)
     motor_inertia = result.summary["parameters"]["drive.motor_inertia"]
     motor_inertia["interval"] = [motor_inertia["value"] - 5e-3, 10.0 * motor_inertia["value"]]
     ax = draw_identification(result)[0].figure.axes[0]
@@ -166,13 +166,13 @@ def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
 
 @needs_chromium
 def test_the_page_in_a_browser(tmp_path):
-    write_identification_report(made(CASES["dead zone"][0], tmp_path), tmp_path)
+    write_identification_report(make_identification(CASES["dead zone"][0], tmp_path), tmp_path)
     with opened(tmp_path / "report.html") as (page,):
         check(page, len(GEARED))
 
 
 def test_a_linear_axis_has_newtons_and_metres(tmp_path):
-    result = made(CASES["linear"][0], tmp_path, unit="m")
+    result = make_identification(CASES["linear"][0], tmp_path, unit="m")
     words = "\n".join(write_identification_report(result, tmp_path))
     assert "drive.motor_inertia = 0.05 ± 0.001 kg," in words
     assert "drive.motor_viscous = 0.15 ± 0.001 N s/m," in words
@@ -186,7 +186,7 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
 def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
     friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
-    result = made(geared({"run.duration": 2.0}, effects=friction), tmp_path)
+    result = make_identification(geared({"run.duration": 2.0}, effects=friction), tmp_path)
     axes = drawn_of(result)["torque"].figure.axes
     rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert len(rms) == 2
@@ -198,7 +198,7 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
 
 def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     """Small motion, then large motion in the third quarter."""
-    result = made(geared({"run.duration": 10.0}), tmp_path)
+    result = make_identification(geared({"run.duration": 10.0}), tmp_path)
     trace = result.trace.copy()
     size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
     trace["motor.velocity"] *= size
@@ -210,7 +210,7 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
 
 @pytest.mark.usefixtures("every_figure_drawn")
 def test_observers_that_diverged_leave_figures(tmp_path):
-    result = made(geared(), tmp_path)
+    result = make_identification(geared(), tmp_path)
     trace = result.trace.copy()
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
@@ -222,7 +222,7 @@ def test_observers_that_diverged_leave_figures(tmp_path):
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
 def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
-    result = made(geared(), tmp_path)
+    result = make_identification(geared(), tmp_path)
     trace = result.trace.copy()
     for side in ("motor", "load"):
         trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))

@@ -31,7 +31,7 @@ def product(frame):
     return frame[ALPHA] * frame[LAMBDA]
 
 
-def drawn(tmp_path, data, **columns):
+def draw_only_figure(tmp_path, data, **columns):
     """The one figure of a study, drawn to the end."""
     (drawing,) = draw(made(data, **columns))
     assert save(drawing.figure, tmp_path / "a" / f"{drawing.name}.png").stat().st_size > 5000
@@ -54,7 +54,7 @@ def legend(drawing):
 
 
 def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
-    drawing = drawn(tmp_path, small(axes=GAINS, figures=[heatmap()]), motor__velocity_rmse=product)
+    drawing = draw_only_figure(tmp_path, small(axes=GAINS, figures=[heatmap()]), motor__velocity_rmse=product)
     (ax,) = panels(drawing)
     values, corners = mesh(ax).get_array(), mesh(ax).get_coordinates()
     alphas, lambdas = np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
@@ -73,7 +73,7 @@ def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
 
 def test_panels_share_one_colour_scale(tmp_path):
     data = small(axes=[*GAINS, listed(NOISE, 1e-4, 1e-5)], figures=[heatmap(facet=NOISE)])
-    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: frame[NOISE] * 1e5)
+    drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame[NOISE] * 1e5)
     low, high = panels(drawing)
     assert low.get_title().startswith("encoders.noise = 1e-05 rad")
     assert high.get_title().startswith("encoders.noise = 0.0001 rad")
@@ -83,11 +83,11 @@ def test_panels_share_one_colour_scale(tmp_path):
 
 def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
     data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap()])
-    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: frame["seed"] ** 3.0)
+    drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame["seed"] ** 3.0)
     assert (mesh(panels(drawing)[0]).get_array() == 8.0).all()
     assert drawing.caption.endswith("; median over 5 seeds.")
     data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap(value="motor.converged")])
-    drawing = drawn(tmp_path, data, motor__converged=lambda frame: frame["seed"] < 2)
+    drawing = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame["seed"] < 2)
     np.testing.assert_allclose(mesh(panels(drawing)[0]).get_array(), 0.4)
     assert mesh(panels(drawing)[0]).get_clim() == (0.0, 1.0)
     assert drawing.caption.endswith("; share over 5 seeds.")
@@ -95,7 +95,7 @@ def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
 
 def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
     data = small(axes=GAINS, figures=[heatmap(value="motor.dead_zone_error")])
-    drawing = drawn(tmp_path, data, motor__dead_zone_error=lambda frame: -product(frame))
+    drawing = draw_only_figure(tmp_path, data, motor__dead_zone_error=lambda frame: -product(frame))
     assert mesh(panels(drawing)[0]).get_array().min() > 0.0
     assert drawing.caption.startswith("motor: |error of the dead zone|")
 
@@ -104,7 +104,7 @@ def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
 def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
     data = small(axes=GAINS, figures=[heatmap(value=value)])
     columns = {"motor__velocity_rmse": product, "motor__converged": lambda frame: frame[ALPHA] < 0.0}
-    drawing = drawn(tmp_path, data, finite=lambda frame: frame[ALPHA] < 40.0, **columns)
+    drawing = draw_only_figure(tmp_path, data, finite=lambda frame: frame[ALPHA] < 40.0, **columns)
     (ax,) = panels(drawing)
     gone = np.ma.getmaskarray(mesh(ax).get_array())
     assert gone[:, -1].all()
@@ -114,9 +114,11 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
 
 def test_what_did_not_converge_is_hatched(tmp_path):
     data = small(axes=GAINS, figures=[heatmap()])
-    none = drawn(tmp_path, data, motor__velocity_rmse=product)
-    selection = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0)
-    all_ = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] < 0.0)
+    none = draw_only_figure(tmp_path, data, motor__velocity_rmse=product)
+    selection = draw_only_figure(
+        tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0
+    )
+    all_ = draw_only_figure(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] < 0.0)
     assert legend(none) == []
     assert legend(selection) == legend(all_) == ["motor not converged"]
     # the best is sought among those that converged
@@ -125,7 +127,7 @@ def test_what_did_not_converge_is_hatched(tmp_path):
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
     data = small(axes=GAINS, figures=[heatmap(overlays=["davila_fridman", "seeber_horn", "exact"])])
-    drawing = drawn(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
+    drawing = draw_only_figure(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
     (ax,) = panels(drawing)
     assert "f⁺ = 2 rad/s²" in ax.get_title()
     assert legend(drawing) == ["Davila-Fridman (32), q → 0", "Seeber-Horn 2017", "exact, ρ < 1"]
@@ -161,7 +163,7 @@ ODD = {
 @pytest.mark.parametrize("case", ODD)
 def test_odd_studies_are_drawn(tmp_path, case):
     data, columns = ODD[case]
-    assert panels(drawn(tmp_path, data, **columns))
+    assert panels(draw_only_figure(tmp_path, data, **columns))
 
 
 def test_a_study_of_words_alone_has_no_default_figure():
@@ -170,7 +172,7 @@ def test_a_study_of_words_alone_has_no_default_figure():
 
 def test_words_as_panels(tmp_path):
     axes = [*GAINS, listed("observer.discretisation", "implicit", "explicit")]
-    drawing = drawn(tmp_path, rigid(axes=axes, figures=[heatmap(facet="observer.discretisation")]))
+    drawing = draw_only_figure(tmp_path, rigid(axes=axes, figures=[heatmap(facet="observer.discretisation")]))
     assert [ax.get_title().split("\n")[0] for ax in panels(drawing)] == [
         "observer.discretisation = explicit",
         "observer.discretisation = implicit",
@@ -181,7 +183,9 @@ def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
     axes = [spaced(ALPHA, 1.0, 50.0), spaced(LAMBDA, 1.0, 20.0)]
     sweep = {"design": "sobol", "points": 32}
     wild = {"finite": lambda frame: frame[ALPHA] < 10.0}
-    drawing = drawn(tmp_path, small(axes=axes, sweep=sweep, figures=[heatmap()]), motor__velocity_rmse=product, **wild)
+    drawing = draw_only_figure(
+        tmp_path, small(axes=axes, sweep=sweep, figures=[heatmap()]), motor__velocity_rmse=product, **wild
+    )
     (ax,) = panels(drawing)
     (dots,) = (c for c in ax.collections if isinstance(c, PathCollection))
     x, y = dots.get_offsets().T
@@ -190,14 +194,14 @@ def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
     assert len(dots.get_offsets()) + len(ax.lines[0].get_xdata()) == 32
     assert legend(drawing) == [f"diverged ({len(ax.lines[0].get_xdata())} points)"]
     # over one of its axes a design has no line
-    drawing = drawn(tmp_path, small(axes=axes, sweep=sweep, figures=[line()]), motor__velocity_rmse=product)
+    drawing = draw_only_figure(tmp_path, small(axes=axes, sweep=sweep, figures=[line()]), motor__velocity_rmse=product)
     assert panels(drawing)[0].lines[0].get_linestyle() == "None"
     assert "median" not in drawing.caption
 
 
 def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
     data = small(axes=GAINS, sweep={"seeds": 3}, figures=[line(series=LAMBDA)])
-    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: product(frame) * (1.0 + frame["seed"]))
+    drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: product(frame) * (1.0 + frame["seed"]))
     (ax,) = panels(drawing)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 2.0 * np.geomspace(1.0, 50.0, 5))
     band = ax.collections[0].get_paths()[0].vertices[:, 1]
@@ -210,7 +214,7 @@ def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
 
 def test_where_leaves_the_other_points_out(tmp_path):
     data = rigid(axes=GAINS, figures=[line(where={LAMBDA: "largest"})])
-    drawing = drawn(tmp_path, data, motor__velocity_rmse=product)
+    drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product)
     np.testing.assert_allclose(panels(drawing)[0].lines[0].get_ydata(), 20.0 * np.geomspace(1.0, 50.0, 5))
     assert drawing.caption.endswith(f"over {ALPHA} where {LAMBDA} = 20 √rad/s.")
 
@@ -218,7 +222,7 @@ def test_where_leaves_the_other_points_out(tmp_path):
 def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
     axes = [spaced(ALPHA, 1.0, 1e4, 9), listed(LAMBDA, 1.0, 2.0)]
     data = rigid(axes=axes, figures=[line(series=LAMBDA, theory=1.0)])
-    drawing = drawn(
+    drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * np.maximum(f[ALPHA], 30.0), 0.0)
     )
     (ax,) = panels(drawing)
@@ -235,7 +239,9 @@ def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     # one panel a value, and nothing to draw in one of them
     data = rigid(axes=axes, figures=[line(facet=LAMBDA, theory=1.0)])
-    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0))
+    drawing = draw_only_figure(
+        tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0)
+    )
     assert [ax.get_title() for ax in panels(drawing)] == [f"{LAMBDA} = 1 √rad/s", f"{LAMBDA} = 2 √rad/s"]
     assert panels(drawing)[1].texts[0].get_text() == "nothing above zero to draw"
 

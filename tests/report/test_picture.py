@@ -11,11 +11,11 @@ from jaxbl.report.picture import picture
 pytestmark = pytest.mark.usefixtures("every_figure_drawn")
 
 
-def unpacked(text):
+def unpack(text):
     return np.frombuffer(base64.b64decode(text), "<f4")
 
 
-def made(tmp_path, draw):
+def draw_picture(tmp_path, draw):
     figure, (left, right) = subplots(6.0, 3.0, columns=2)
     draw(left)
     right.barh([0, 1], [3.0, 4.0])
@@ -33,13 +33,13 @@ def test_lines_bars_names_and_a_description(tmp_path):
         ax.axhline(0.5)
         ax.set(xlabel="time (s)", yscale="log")
 
-    shown = made(tmp_path, draw)
+    shown = draw_picture(tmp_path, draw)
     left, right = shown.panels
     # the line that only marks a place is none of values
     (line,) = left["lines"]
     assert line["name"] == "price in $" and line["sorted"]
-    np.testing.assert_array_equal(unpacked(line["x"]), x)
-    y = unpacked(line["y"])
+    np.testing.assert_array_equal(unpack(line["x"]), x)
+    y = unpack(line["y"])
     assert y[0] == 1.0 and np.isnan(y[1]) and y[2] == np.finfo(np.float32).max
     assert left["y"]["log"] and not left["x"]["log"]
     assert right["bars"] == [[0.0, -0.4, 3.0, 0.8], [0.0, 0.6, 4.0, 0.8]]
@@ -60,15 +60,15 @@ def test_cells_have_values_where_a_colour_bar_says_of_what(tmp_path, bar):
     assert ("cells" in panel) == bar
     if bar:
         assert panel["cells"]["name"] == "error (rad)"
-        np.testing.assert_array_equal(unpacked(panel["cells"]["x"]), [0.0, 1.0, 2.0, 3.0])
-        np.testing.assert_array_equal(unpacked(panel["cells"]["values"]), [1.0, 2.0, 3.0, 4.0, 5.0, np.nan])
+        np.testing.assert_array_equal(unpack(panel["cells"]["x"]), [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_array_equal(unpack(panel["cells"]["values"]), [1.0, 2.0, 3.0, 4.0, 5.0, np.nan])
 
 
 @pytest.mark.parametrize("count", [100, 50_000])
 def test_clouds_and_long_lines_stay_small(tmp_path, count):
     values = np.random.default_rng(0).standard_normal((2, count))
-    shown = made(tmp_path, lambda ax: ax.plot(*values, "."))
+    shown = draw_picture(tmp_path, lambda ax: ax.plot(*values, "."))
     assert len(shown.svg) < 200_000
     (line,) = shown.panels[0]["lines"]
-    assert 1 < len(unpacked(line["x"])) <= 30_000
-    assert made(tmp_path, lambda ax: ax.plot(*values, ".")) == shown
+    assert 1 < len(unpack(line["x"])) <= 30_000
+    assert draw_picture(tmp_path, lambda ax: ax.plot(*values, ".")) == shown

@@ -22,7 +22,7 @@ GAINS = [spaced(LAMBDA, 1.0, 16.0, 5), spaced(ALPHA, 1.0, 9.0, 5, "linear")]
 MAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE}
 
 
-def made(function, *axes, figures=(MAP,), depth=3, seeds=1):
+def make_refined_study(function, *axes, figures=(MAP,), depth=3, seeds=1):
     """A refined study without runs: `function` of a frame of points says what converges; the error is lambda."""
     config = read_config(rigid(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
     points = Points(config)
@@ -47,7 +47,7 @@ def panels(drawing):
     return [ax for ax in drawing.figure.axes if ax.get_visible() and ax.get_xlabel()]
 
 
-def shown(ax):
+def map_values(ax):
     # the next one is the grey of what is undefined
     return next(c for c in ax.collections if isinstance(c, QuadMesh)).get_array()
 
@@ -57,10 +57,10 @@ def legend(drawing):
 
 
 def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
-    result = made(disc, figures=[MAP | {"value": "motor.converged"}, MAP])
+    result = make_refined_study(disc, figures=[MAP | {"value": "motor.converged"}, MAP])
     assert len(result.frame) < 0.5 * 33**2
     converged, error = draw(result)
-    values = shown(panels(converged)[0])
+    values = map_values(panels(converged)[0])
     assert values.shape == (33, 33)
     assert not np.ma.is_masked(values) and np.isfinite(values).all()
     alphas, lambdas = np.linspace(1.0, 9.0, 33), np.geomspace(1.0, 16.0, 33)
@@ -68,7 +68,7 @@ def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
     np.testing.assert_array_equal(values, disc(grid).to_numpy(float).reshape(33, 33))
     assert legend(converged) == []
     # far from the boundary a vertex of the coarse grid stands for the block around it
-    blocks = shown(panels(error)[0])
+    blocks = map_values(panels(error)[0])
     np.testing.assert_allclose(blocks[:4, :4], 1.0)
     np.testing.assert_allclose(blocks[4:6, :2], 2.0)
     np.testing.assert_allclose(blocks[-4:, :4], 16.0)
@@ -81,12 +81,12 @@ def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
 
 
 def test_only_what_was_simulated_is_counted_as_missing():
-    result = made(disc)
+    result = make_refined_study(disc)
     frame = result.frame
     frame["finite"] = (frame[LAMBDA] < 16.0) | (frame[ALPHA] < 9.0)
     (drawing,) = draw(result)
     assert legend(drawing)[-1] == "diverged (1 points)"
-    gone = np.ma.getmaskarray(shown(panels(drawing)[0])) | np.isnan(shown(panels(drawing)[0]).filled(0.0))
+    gone = np.ma.getmaskarray(map_values(panels(drawing)[0])) | np.isnan(map_values(panels(drawing)[0]).filled(0.0))
     assert gone.sum() == 5 * 5  # its block, cut by the edges of the map
 
 
@@ -102,20 +102,20 @@ def test_panels_medians_and_lines_over_what_is_not_drawn():
         {"kind": "heatmap", "x": ALPHA, "y": NOISE, "value": "motor.converged"},
         {"kind": "line", "x": ALPHA, "value": RMSE, "series": LAMBDA},
     ]
-    result = made(shrinking, noise, figures=figures, seeds=2)
+    result = make_refined_study(shrinking, noise, figures=figures, seeds=2)
     by_panel, together, of_noise, lines = draw(result)
-    each = np.array([shown(ax) for ax in panels(by_panel)])
+    each = np.array([map_values(ax) for ax in panels(by_panel)])
     assert each.shape == (3, 33, 33)
     # a share over noise levels is one over all of them, also where only one has its boundary
-    np.testing.assert_allclose(shown(panels(together)[0]), each.mean(axis=0))
-    assert shown(panels(of_noise)[0]).shape == (3, 33)
-    np.testing.assert_allclose(shown(panels(of_noise)[0]), each[:, ::8].mean(axis=1), atol=0.2)
+    np.testing.assert_allclose(map_values(panels(together)[0]), each.mean(axis=0))
+    assert map_values(panels(of_noise)[0]).shape == (3, 33)
+    np.testing.assert_allclose(map_values(panels(of_noise)[0]), each[:, ::8].mean(axis=1), atol=0.2)
     # one line for each value of the coarse grid
     assert len(panels(lines)[0].lines) == 5
 
 
 def test_filling_is_exact_where_every_vertex_is_known():
-    result = made(lambda frame: frame[ALPHA] > 0.0)
+    result = make_refined_study(lambda frame: frame[ALPHA] > 0.0)
     points = Points(result.config)
     frame = pd.DataFrame(points.columns(np.arange(points.group_size)))
     table = frame.assign(value=np.arange(len(frame))).set_index([LAMBDA, ALPHA])["value"]
@@ -126,14 +126,14 @@ def test_filling_is_exact_where_every_vertex_is_known():
 
 
 def test_a_map_shows_no_more_places_than_can_be_seen():
-    result = made(lambda frame: frame[ALPHA] > 3.3, depth=10)
+    result = make_refined_study(lambda frame: frame[ALPHA] > 3.3, depth=10)
     drawing = draw(result)[0]
-    assert shown(panels(drawing)[0]).shape == (2049, 2049)
+    assert map_values(panels(drawing)[0]).shape == (2049, 2049)
 
 
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
-    result = made(disc, seeds=seeds)
+    result = make_refined_study(disc, seeds=seeds)
     points = Points(result.config)
     coarse = disc(pd.DataFrame(points.columns(points.coarse_points(np.arange(25))))).mean()
     simulated = len(result.frame) // seeds
@@ -144,7 +144,7 @@ def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
 
 
 def test_an_unfinished_study_is_drawn_as_far_as_it_goes():
-    result = made(disc, figures=[MAP, MAP | {"value": "motor.converged"}])
+    result = make_refined_study(disc, figures=[MAP, MAP | {"value": "motor.converged"}])
     part = result.frame.iloc[:40]
     for drawing in draw(StudyResult(result.config, part)):
         assert panels(drawing)

@@ -12,7 +12,7 @@ from jaxbl.report.figures import save
 from jaxbl.report.residuals import draw_residuals
 
 
-def made(name, torque, time):
+def make_residual(name, torque, time):
     noise = 0.05 * np.random.default_rng(0).standard_normal(len(time))
     count = len(time)
     residual = Residual(name, time, torque + noise, np.full(count, 0.05), np.ones(1), 100.0)
@@ -28,7 +28,7 @@ def made(name, torque, time):
 def test_observers_that_converge_are_drawn_thin(tmp_path):
     time = 5e-3 * np.arange(4000)
     torque = {name: -0.1 * np.sign(np.cos(time)) for name in ("motor", "load")}
-    pairs = {name: made(name, one, time) for name, one in torque.items()}
+    pairs = {name: make_residual(name, one, time) for name, one in torque.items()}
     residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
@@ -44,7 +44,7 @@ def test_observers_that_converge_are_drawn_thin(tmp_path):
 def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     time = 5e-3 * np.arange(8000)
     torque = {"motor": -0.1 * np.sign(np.cos(time)) + 0.1 * np.sin(2.0 * np.pi * 11.0 * time), "load": np.zeros(8000)}
-    pairs = {name: made(name, one, time) for name, one in torque.items()}
+    pairs = {name: make_residual(name, one, time) for name, one in torque.items()}
     residuals = {name: [residual] for name, (residual, _) in pairs.items()}
     coordinates = {name: [values] for name, (_, values) in pairs.items()}
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}

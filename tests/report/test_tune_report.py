@@ -30,36 +30,36 @@ STUDY = small(
 
 
 @pytest.fixture(scope="module")
-def tuned():
+def tuning():
     return tune(STUDY)
 
 
 @pytest.fixture(scope="module")
-def folder(tuned, tmp_path_factory):
+def folder(tuning, tmp_path_factory):
     path = tmp_path_factory.mktemp("tuned")
-    path.joinpath("lines").write_text("\n".join(write_tune_report(tuned, path)))
+    path.joinpath("lines").write_text("\n".join(write_tune_report(tuning, path)))
     return path
 
 
-def test_gains_can_be_included_and_run(folder, tuned):
+def test_gains_can_be_included_and_run(folder, tuning):
     text = (folder / "gains.toml").read_text(encoding="utf-8")
     # exact numbers, and what they are for
     assert {side: tomllib.loads(text)["observer"][side]["alpha"] for side in ("motor", "load")} == {
-        side: gains["alpha"] for side, gains in tuned.summary["gains"].items()
+        side: gains["alpha"] for side, gains in tuning.summary["gains"].items()
     }
     assert "# Objective: worst velocity_rmse (rad/s) over seeds and scenarios; 1 noise seed and 1 drive." in text
     assert "two <b> sides" in text
     study = small({"include": str(folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
     config = read_config(study)
-    for side, gains in tuned.summary["gains"].items():
+    for side, gains in tuning.summary["gains"].items():
         observer = getattr(config.observer, side)
         assert (observer.lambda_, observer.alpha) == (gains["lambda"], gains["alpha"])
     assert config.observer.motor.velocity_error == 0.5
-    assert run(study).summary["conditions"]["motor"]["alpha"] == tuned.summary["gains"]["motor"]["alpha"]
+    assert run(study).summary["conditions"]["motor"]["alpha"] == tuning.summary["gains"]["motor"]["alpha"]
 
 
-def test_numbers_figures_and_page(folder, tuned):
-    assert json.loads((folder / "tuning.json").read_text(encoding="utf-8")) == tuned.summary
+def test_numbers_figures_and_page(folder, tuning):
+    assert json.loads((folder / "tuning.json").read_text(encoding="utf-8")) == tuning.summary
     names = ["limits_load", "limits_motor", "pareto_load", "pareto_motor", "tuning_holdout", "tuning_load", "tuning_motor"]
     assert sorted(path.stem for path in (folder / "figures").iterdir()) == names
     assert plt.get_fignums() == []
@@ -68,23 +68,23 @@ def test_numbers_figures_and_page(folder, tuned):
     lines = (folder / "lines").read_text().splitlines()
     for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
         assert text in page.text
-    assert lines[0].startswith(f"motor: lambda = {tuned.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
+    assert lines[0].startswith(f"motor: lambda = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
     assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
 
 
 @pytest.mark.usefixtures("every_figure_drawn")
-def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned, tmp_path):
-    drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_motor")
+def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning, tmp_path):
+    drawing = next(d for d in draw_tuning(tuning) if d.name == "tuning_motor")
     ax = drawing.figure.axes[0]
     (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
-    coarse = tuned.candidates["motor"].query("stage == 0").sort_values(["lambda", "alpha"])
+    coarse = tuning.candidates["motor"].query("stage == 0").sort_values(["lambda", "alpha"])
     np.testing.assert_allclose(np.ma.getdata(mesh.get_array()).ravel(), coarse["error"])
     assert isinstance(mesh.norm, LogNorm)
-    gains = tuned.summary["gains"]["motor"]
+    gains = tuning.summary["gains"]["motor"]
     star = next(line for line in ax.lines if line.get_marker() == "*")
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha"], gains["lambda"])
     # in units of f⁺ above and on the right
-    bound = tuned.summary["f_plus"]["motor"]
+    bound = tuning.summary["f_plus"]["motor"]
     save(drawing.figure, tmp_path / "map.png")
     top, right = ax.child_axes
     np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
@@ -115,9 +115,9 @@ def bound_to(summary, binding):
     return summary
 
 
-def test_map_and_sentence_name_the_constraint_that_binds(tuned):
+def test_map_and_sentence_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
-        result = dataclasses.replace(tuned, summary=bound_to(tuned.summary, binding))
+        result = dataclasses.replace(tuning, summary=bound_to(tuning.summary, binding))
         drawn = {d.name: d for d in draw_tuning(result)}
         legends = {
             name: [text.get_text() for legend in drawn[name].figure.legends for text in legend.get_texts()]
@@ -134,9 +134,9 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuned):
         assert ("← smaller λ: margin_exact" in titles) == bool(binding)
 
 
-def test_limits_are_drawn_as_the_numbers_have_them(tuned):
-    drawing = next(d for d in draw_tuning(tuned) if d.name == "limits_load")
-    load = tuned.summary["limits"]["load"]
+def test_limits_are_drawn_as_the_numbers_have_them(tuning):
+    drawing = next(d for d in draw_tuning(tuning) if d.name == "limits_load")
+    load = tuning.summary["limits"]["load"]
     for ax, gain in zip(drawing.figure.axes, ("lambda", "alpha"), strict=True):
         line, profile = ax.lines[0], load["profiles"][gain]
         np.testing.assert_allclose(line.get_xydata(), np.column_stack([profile[gain], profile["error"]]))
@@ -151,17 +151,17 @@ def test_limits_are_drawn_as_the_numbers_have_them(tuned):
         assert inside == missed > 0
 
 
-def test_front_says_who_does_not_converge(tuned):
-    drawing = next(d for d in draw_tuning(tuned) if d.name == "pareto_motor")
+def test_front_says_who_does_not_converge(tuning):
+    drawing = next(d for d in draw_tuning(tuning) if d.name == "pareto_motor")
     legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
     assert "slow: 0 % converge" in legend
     (line,) = (line for line in drawing.figure.axes[0].lines if line.get_label() == "none better in both")
-    assert list(line.get_xdata()) == [point["convergence_time"] for point in tuned.summary["pareto"]["motor"]]
+    assert list(line.get_xdata()) == [point["convergence_time"] for point in tuning.summary["pareto"]["motor"]]
 
 
-def test_comparison_draws_what_the_numbers_say(tuned):
-    drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_holdout")
-    rows = [row for row in tuned.summary["holdout"]["rows"] if row["side"] == "motor"]
+def test_comparison_draws_what_the_numbers_say(tuning):
+    drawing = next(d for d in draw_tuning(tuning) if d.name == "tuning_holdout")
+    rows = [row for row in tuning.summary["holdout"]["rows"] if row["side"] == "motor"]
     bars = [patch.get_width() for patch in drawing.figure.axes[0].patches]
     np.testing.assert_allclose(bars, [row["velocity_rmse"]["worst"] for row in rows])
     texts = [text.get_text() for text in drawing.figure.axes[2].texts]
@@ -169,7 +169,7 @@ def test_comparison_draws_what_the_numbers_say(tuned):
 
 
 @needs_chromium
-def test_bars_have_the_names_beside_them(folder, tuned):
+def test_bars_have_the_names_beside_them(folder, tuning):
     with opened(folder / "report.html") as (page,):
         check(page, 7)
         figure = page.locator("figure[data-name=tuning_holdout]")

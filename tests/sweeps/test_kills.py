@@ -50,7 +50,7 @@ def alone(tmp_path_factory):
     for _ in range(2):
         # the second time all is compiled
         start = time.monotonic()
-        run = begun(_sweep, folder)
+        run = start_process(_sweep, folder)
         run.join()
         assert run.exitcode == 0
         times.append(time.monotonic() - start)
@@ -60,13 +60,13 @@ def alone(tmp_path_factory):
     return result, times[1]
 
 
-def begun(function, *inputs):
+def start_process(function, *inputs):
     process = CONTEXT.Process(target=function, args=inputs)
     process.start()
     return process
 
 
-def whole(folder, expected):
+def expected_frame(folder, expected):
     """Parts that are whole, with what changes when one is written again."""
     actual = {path.name: path for path in (folder / "points").glob("part-*")} if (folder / "points").is_dir() else {}
     return {
@@ -90,13 +90,13 @@ def test_killed_at_random_moments(tmp_path, alone, repeats):
     while kills < repeats(6, 200):
         folder, rounds, before = tmp_path / f"{rounds}", rounds + 1, {}
         while True:
-            process = begun(_sweep, folder)
+            process = start_process(_sweep, folder)
             process.join(rng.uniform(0.1, 1.0) * seconds)
             if process.exitcode is None:
                 process.kill()
                 process.join()
                 kills += 1
-            after = whole(folder, expected)
+            after = expected_frame(folder, expected)
             assert before.items() <= after.items(), "a chunk was computed twice"
             before = after
             if process.exitcode == 0:
@@ -107,16 +107,16 @@ def test_killed_at_random_moments(tmp_path, alone, repeats):
 
 def test_shares_of_which_one_is_killed(tmp_path, alone):
     expected, seconds = alone
-    processes = [begun(_share, tmp_path / "study", (number, 3)) for number in (1, 2, 3)]
+    processes = [start_process(_share, tmp_path / "study", (number, 3)) for number in (1, 2, 3)]
     time.sleep(0.7 * seconds)
     processes[1].kill()
     for process in processes:
         process.join()
     assert [process.exitcode for process in processes] == [0, -signal.SIGKILL, 0]
-    before = whole(tmp_path / "study", expected)
+    before = expected_frame(tmp_path / "study", expected)
     assert 2 * len(expected) // 3 <= len(before) < len(expected)
     check(tmp_path / "study", expected)
-    assert before.items() <= whole(tmp_path / "study", expected).items()
+    assert before.items() <= expected_frame(tmp_path / "study", expected).items()
 
 
 @contextmanager
@@ -161,7 +161,7 @@ def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, alone):
     address = f"tcp://127.0.0.1:{port}"
     with worker(address, tmp_path / "a") as first, worker(address, tmp_path / "b"):
         with scheduler(port):
-            client = begun(_sweep, folder, address)
+            client = start_process(_sweep, folder, address)
             until(lambda: count(folder) >= 8)
             # a worker, wherever it is, and a late one is welcome
             first.kill()
@@ -169,17 +169,17 @@ def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, alone):
                 until(lambda: count(folder) >= 30)
                 client.kill()
                 client.join()
-                before = whole(folder, expected)
-                client = begun(_sweep, folder, address)
+                before = expected_frame(folder, expected)
+                client = start_process(_sweep, folder, address)
                 until(lambda: count(folder) >= 60)
         # the scheduler is gone
         client.join(60.0)
         assert client.exitcode == 1
-        after = whole(folder, expected)
+        after = expected_frame(folder, expected)
         assert before.items() <= after.items() and len(after) < len(expected)
     with scheduler(port), worker(address, tmp_path / "d"):
-        client = begun(_sweep, folder, address)
+        client = start_process(_sweep, folder, address)
         client.join(120.0)
         assert client.exitcode == 0
-    assert after.items() <= whole(folder, expected).items()
+    assert after.items() <= expected_frame(folder, expected).items()
     check(folder, expected)

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 # ---------------------------------------------------------------- geometry, on functions instead of runs
 
 
-def traced(function, grid):
+def trace_boundary(function, grid):
     """Simulated vertices as a mask of the fine grid, the function on all of it, and the sizes of the batches."""
     places = [np.linspace(0.0, 1.0, size) for size in grid.sizes]
     full = np.asarray(function(*np.meshgrid(*places, indexing="ij")))
@@ -130,7 +130,7 @@ SHAPES = {
 def test_the_boundary_is_traced_from_end_to_end(name):
     function, n, depth = SHAPES[name]
     grid = square(n, depth, function.__code__.co_argcount)
-    mask, full, _ = traced(function, grid)
+    mask, full, _ = trace_boundary(function, grid)
     assert_traced(mask, full, depth)
 
 
@@ -138,7 +138,7 @@ def test_the_boundary_is_traced_from_end_to_end(name):
 def test_one_piece_is_found_whole(name):
     """Where the coarse grid sees a piece at all, it has every cell of the full grid's boundary."""
     function, n, depth = SHAPES[name]
-    mask, full, _ = traced(function, square(n, depth))
+    mask, full, _ = trace_boundary(function, square(n, depth))
     assert not (at_boundary(full) & ~simulated_cells(mask)).any()
 
 
@@ -146,7 +146,7 @@ def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
     circle = SHAPES["circle"][0]
     shares = []
     for depth in (3, 5, 6):
-        mask, full, batches = traced(circle, square(17, depth))
+        mask, full, batches = trace_boundary(circle, square(17, depth))
         shares.append(mask.sum() / at_boundary(full).sum())
         assert len(batches) <= 2 * depth + 1
     # about two vertices for each cell of the boundary on the finest level, as many again on all others
@@ -157,13 +157,13 @@ def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
 def test_nothing_is_added_where_all_agree():
     for dimensions in (1, 2, 3):
         grid = square(5, 4, dimensions)
-        mask, _, batches = traced(lambda x, *_: x < 2.0, grid)
+        mask, _, batches = trace_boundary(lambda x, *_: x < 2.0, grid)
         assert batches == [5**dimensions]
         np.testing.assert_array_equal(np.flatnonzero(mask), grid.coarse_vertices())
 
 
 def test_what_the_coarse_grid_does_not_see_stays_unseen():
-    mask, _, batches = traced(lambda x, y: np.hypot(x - 0.51, y - 0.52) < 0.005, square(5, 6))
+    mask, _, batches = trace_boundary(lambda x, y: np.hypot(x - 0.51, y - 0.52) < 0.005, square(5, 6))
     assert batches == [25]
     assert mask.sum() == 25
 
@@ -174,11 +174,11 @@ def test_axes_that_are_not_refined_have_a_grid_of_their_own():
 
     grid = CellGrid([3, 5, 9, 2], [False, True, True, False], 3)
     assert grid.sizes == (3, 33, 65, 2)
-    mask, full, batches = traced(shifted, grid)
+    mask, full, batches = trace_boundary(shifted, grid)
     together = len(batches)
     for i, j in itertools.product(range(3), range(2)):
         part = full[i, :, :, j]
-        alone, _, _ = traced(lambda *_, part=part: part, CellGrid([5, 9], [True, True], 3))
+        alone, _, _ = trace_boundary(lambda *_, part=part: part, CellGrid([5, 9], [True, True], 3))
         np.testing.assert_array_equal(mask[i, :, :, j], alone)
     assert together <= 12
 
@@ -208,7 +208,7 @@ def functions(draw):
 @given(functions())
 def test_any_boundary_is_traced(case):
     function, grid, depth = case
-    mask, full, _ = traced(function, grid)
+    mask, full, _ = trace_boundary(function, grid)
     assert_traced(mask, full, depth)
 
 
@@ -219,7 +219,7 @@ def test_random_labels_are_traced(seed, dimensions):
     rng = np.random.default_rng(seed)
     grid = square(3, 3, dimensions)
     full = rng.random(grid.sizes) < rng.choice([0.02, 0.1, 0.5])
-    mask, full, _ = traced(lambda *_: full, grid)
+    mask, full, _ = trace_boundary(lambda *_: full, grid)
     assert_traced(mask, full, 3)
 
 

@@ -38,22 +38,22 @@ def files(folder):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished") / "study"
     return folder, sweep(study(), folder)
 
 
 @pytest.fixture
-def copy(finished, tmp_path):
+def copy(finished_study, tmp_path):
     """A copy of the finished study's folder."""
-    for name, content in files(finished[0]).items():
+    for name, content in files(finished_study[0]).items():
         (tmp_path / "study" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "study" / name).write_bytes(content)
     return tmp_path / "study"
 
 
-def test_what_a_study_leaves(finished):
-    folder, result = finished
+def test_what_a_study_leaves(finished_study):
+    folder, result = finished_study
     assert set(files(folder)) == {"study.toml", "manifest.json", *(f"points/part-0000{i}.parquet" for i in range(3))}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["finished"]
@@ -66,17 +66,17 @@ def test_what_a_study_leaves(finished):
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
 
 
-def test_finished_study_is_only_read(copy, finished, computed):
+def test_finished_study_is_only_read(copy, finished_study, computed):
     before = files(copy)
     result = sweep(study(), copy)
     assert computed == []
     assert result.cost["lanes"] == 0
     assert files(copy) == before
-    pd.testing.assert_frame_equal(result.frame, finished[1].frame)
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
 
 
-def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished, computed):
+def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, computed):
     def interrupt(done, total):
         assert total == 9
         if done == 3:
@@ -92,11 +92,11 @@ def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished, computed
     assert computed == [0, 1, 2]
     assert calls == [(3, 9), (6, 9), (9, 9)]
     assert result.cost["lanes"] == 3
-    pd.testing.assert_frame_equal(result.frame, finished[1].frame)
+    pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "draft only"])
-def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, damage):
+def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, computed, damage):
     part = copy / "points" / "part-00001.parquet"
     content = part.read_bytes()
     part.unlink()
@@ -119,7 +119,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, d
         assert len(list((copy / "damaged").iterdir())) == 1
     # drafts of processes that were killed are gone
     assert not list(copy.rglob(".*"))
-    pd.testing.assert_frame_equal(result.frame, finished[1].frame)
+    pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
 
 
 OTHER = {
@@ -164,7 +164,7 @@ MANIFESTS = {
 
 
 @pytest.mark.parametrize("case", MANIFESTS)
-def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(copy, finished, computed, case):
+def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(copy, finished_study, computed, case):
     file, content = copy / "manifest.json", MANIFESTS[case]
     if content is None:
         file.unlink()
@@ -182,7 +182,7 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
     # as many chunks as there were, whatever is asked for now
     result = sweep(study(sweep={"seeds": 3, "chunk": 100}), copy)
     assert computed == [] and result.damaged == ()
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
     assert len(list((copy / "points").iterdir())) == 3
 
 
@@ -201,7 +201,7 @@ def test_manifest_of_another_version(copy):
         open_study(copy)
 
 
-def flipped(folder, random):
+def flip_bit(folder, random):
     """Flip a bit of one of a folder's files, which is returned."""
     stride = sorted(path for path in folder.rglob("*") if path.is_file())
     sizes = [path.stat().st_size for path in stride]
@@ -212,16 +212,16 @@ def flipped(folder, random):
     return path
 
 
-def test_flipped_bits_are_noticed_and_healed(copy, finished, repeats):
+def test_flipped_bits_are_noticed_and_healed(copy, finished_study, repeats):
     """None gives other numbers in silence, and one more sweep makes all well."""
     random, noticed, flips = Random(7), 0, repeats(20, 1000)
     before = files(copy)
     for _ in range(flips):
-        path = flipped(copy, random)
+        path = flip_bit(copy, random)
         with suppress(InputError):
-            pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
+            pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
         result = sweep(study(), copy)
-        pd.testing.assert_frame_equal(result.frame, finished[1].frame)
+        pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
         noticed += len(result.damaged)
         shutil.rmtree(copy / "damaged", ignore_errors=True)
         healed = files(copy)
@@ -230,7 +230,7 @@ def test_flipped_bits_are_noticed_and_healed(copy, finished, repeats):
     assert noticed > flips / 2
 
 
-def test_parts_that_changed_places_are_computed_anew(copy, finished, computed):
+def test_parts_that_changed_places_are_computed_anew(copy, finished_study, computed):
     one, other = (copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
     content = one.read_bytes(), other.read_bytes()
     one.write_bytes(content[1])
@@ -239,10 +239,10 @@ def test_parts_that_changed_places_are_computed_anew(copy, finished, computed):
         _ = open_study(copy).frame
     assert len(sweep(study(), copy).damaged) == 2
     assert computed == [0, 2]
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
 
 
-def test_an_edited_part_is_kept_aside(copy, finished, computed):
+def test_an_edited_part_is_kept_aside(copy, finished_study, computed):
     part = copy / "points" / "part-00001.parquet"
     frame = pd.read_parquet(part)
     frame["motor.velocity_rmse"] *= 1.01
@@ -340,7 +340,7 @@ def test_two_processes_do_not_write_into_one_folder(copy):
     assert not (copy / ".lock").exists()
 
 
-def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished):
+def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished_study):
     def fill_disk(table, draft, **_):
         Path(draft).write_bytes(b"x")
         raise OSError(28, "No space left on device")
@@ -350,7 +350,7 @@ def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished):
         with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
             sweep(study(), tmp_path / "study")
     assert {*files(tmp_path / "study")} == {"study.toml", "manifest.json"}
-    pd.testing.assert_frame_equal(sweep(study(), tmp_path / "study").frame, finished[1].frame)
+    pd.testing.assert_frame_equal(sweep(study(), tmp_path / "study").frame, finished_study[1].frame)
 
 
 def test_folder_with_other_files_stays_as_it_is(tmp_path):
@@ -406,8 +406,8 @@ def test_files_of_others_are_never_removed(tmp_path):
     assert (tmp_path / "figures" / "mine.png").exists()
 
 
-def test_rows_are_read_as_they_are_asked_for(finished):
-    folder, result = finished
+def test_rows_are_read_as_they_are_asked_for(finished_study):
+    folder, result = finished_study
     opened, full_frame = open_study(folder), result.frame
     assert len(list(opened.batches(["seed"]))) == 3
     columns = ["motor.f_plus", ALPHA]
@@ -423,10 +423,10 @@ def test_rows_are_read_as_they_are_asked_for(finished):
 
 
 @pytest.mark.parametrize("check", [True, False])
-def test_a_dataset_of_the_rows(finished, check):
+def test_a_dataset_of_the_rows(finished_study, check):
     import pyarrow.compute as pc
 
-    folder, result = finished
+    folder, result = finished_study
     dataset = open_study(folder).dataset(check=check)
     assert dataset.count_rows() == 9
     table = dataset.to_table(columns=["seed", "motor.f_plus"], filter=pc.field(ALPHA) == 9.0).to_pandas()
@@ -458,10 +458,10 @@ def test_a_dataset_of_damaged_or_foreign_parts_is_refused(copy, tmp_path):
             open_study(copy).dataset(check=check)
 
 
-def test_parts_are_in_order_beyond_five_digits(tmp_path, finished):
+def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     engine = Engine(read_config(study()), backend="scan")
     store = Store.create(tmp_path, engine.config, engine.layout, engine.backend, 100_001, 9)
-    rows = next(finished[1].source.batches())
+    rows = next(finished_study[1].source.batches())
     for index in (99_999, 100_000, 2):
         store.write_part(index, rows.assign(seed=index))
     store.update_manifest()
@@ -471,15 +471,15 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished):
     assert open_study(tmp_path).source.has_part(100_000)
 
 
-def test_a_study_in_an_object_store_is_read_alike(finished):
+def test_a_study_in_an_object_store_is_read_alike(finished_study):
     place = UPath("memory://reading/study")
-    for name, content in files(finished[0]).items():
+    for name, content in files(finished_study[0]).items():
         (place / name).write_bytes(content)
     opened = open_study("memory://reading/study")
-    pd.testing.assert_frame_equal(opened.frame, finished[1].frame)
+    pd.testing.assert_frame_equal(opened.frame, finished_study[1].frame)
     for check in (True, False):
         table = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
-        pd.testing.assert_frame_equal(table, finished[1].frame[[ALPHA, "seed"]])
+        pd.testing.assert_frame_equal(table, finished_study[1].frame[[ALPHA, "seed"]])
 
 
 def test_the_metrics_asked_for_are_a_sweeps_own():
