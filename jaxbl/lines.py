@@ -12,6 +12,10 @@ TERMINAL_WIDTH = 80
 """Characters a line."""
 
 
+Lines = list[str]
+"""Lines of text, for a terminal or a page."""
+
+
 class NextStep(NamedTuple):
     """A command line that a user may go on with, and the question that it answers, in a sentence."""
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Kinematics, effect_path
+from jaxbl.identification.regression import Kinematics, Samples, SideSamples, effect_path
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
 from jaxbl.records.signal_quality import estimate_white_noise
@@ -120,7 +120,7 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
     return found.T.reshape(values.shape)
 
 
-def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def _mean_around(values: Samples) -> Samples:
     """Mean over the sampling period on either side of each sample, weighted by a triangle, to fourth order."""
     return values.at[1:-1].add(jnp.diff(values, n=2) / 12.0)
 
@@ -170,8 +170,8 @@ class _Equation(NamedTuple):
     modelled: Any
     beyond: Any
     friction: Any
-    by_position: dict[str, Float[Array, " samples"]]
-    by_velocity: dict[str, Float[Array, " samples"]]
+    by_position: SideSamples
+    by_velocity: SideSamples
 
 
 @jit

@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from jaxbl.files import write_json
-from jaxbl.lines import format_table
+from jaxbl.lines import Lines, format_table
 from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
 from .figures import COLOURS, Drawn, style, subplots
@@ -71,7 +71,7 @@ def _table(result: BenchResult, precision: str) -> list[list[str]]:
     return rows
 
 
-def throughput_lines(result: BenchResult) -> list[str]:
+def throughput_lines(result: BenchResult) -> Lines:
     """The benchmark for the terminal."""
     lines = ["Lane-steps/s, best and median of the calls; time of the first call; deviation of the results."]
     for precision in PRECISIONS:
@@ -96,7 +96,7 @@ def throughput_lines(result: BenchResult) -> list[str]:
     return lines + result.failures
 
 
-def write_bench_report(result: BenchResult, folder: Path) -> list[str]:
+def write_bench_report(result: BenchResult, folder: Path) -> Lines:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_json(folder / "bench.json", asdict(result))
     save_all(draw_throughput(result), folder)

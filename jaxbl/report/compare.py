@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 
 from jaxbl.config import Config, is_boolean
 from jaxbl.files import json_with_checksum, write_atomic
-from jaxbl.lines import TERMINAL_WIDTH, format_table
+from jaxbl.lines import TERMINAL_WIDTH, Lines, format_table
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
@@ -33,7 +33,7 @@ _LISTED = 12
 """Rows of a list in the text; `comparison.json` has all."""
 
 
-def write_comparison(comparison: Comparison, config: Config, folder: Path) -> list[str]:
+def write_comparison(comparison: Comparison, config: Config, folder: Path) -> Lines:
     """Write `comparison.json` and a figure into a folder that exists; `config` is the first study's.
 
     Returns the lines for the terminal.
@@ -45,7 +45,7 @@ def write_comparison(comparison: Comparison, config: Config, folder: Path) -> li
     return [*comparison_lines(comparison), *(_wrapped(f"{path}: {caption}", "  ") for path, caption in saved)]
 
 
-def comparison_lines(comparison: Comparison) -> list[str]:
+def comparison_lines(comparison: Comparison) -> Lines:
     """The comparison as text, no line over 80 columns but for what is longer in itself."""
     both, first, second = comparison.points
     lines = [f"first:  {comparison.names[0]}", f"second: {comparison.names[1]}"]
@@ -82,7 +82,7 @@ def _noise(comparison: Comparison) -> str:
     )
 
 
-def _metric_lines(comparison: Comparison) -> list[str]:
+def _metric_lines(comparison: Comparison) -> Lines:
     """What became of the metrics, those that changed most first."""
     counted = [one for one in comparison.metrics if one.count or one.is_sure]
     lines = []
@@ -117,7 +117,7 @@ def _metric_lines(comparison: Comparison) -> list[str]:
     return lines
 
 
-def _changed_most(comparison: Comparison, one: MetricChange) -> list[str]:
+def _changed_most(comparison: Comparison, one: MetricChange) -> Lines:
     """The metric that changed most, and where."""
     assert one.most is not None
     place = {path: one.most[path] for path in comparison.axes}
@@ -167,7 +167,7 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _listed(items: list[str]) -> list[str]:
+def _listed(items: list[str]) -> Lines:
     """Some items, one a line."""
     lines = [_wrapped(f"  {item}", "    ") for item in items[:_LISTED]]
     return [*lines, f"  and {len(items) - _LISTED} more, in comparison.json"] if len(items) > _LISTED else lines

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep
+from jaxbl.lines import Lines, NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone
@@ -23,7 +23,7 @@ _CHANNELS = {
 }  # fmt: skip
 
 
-def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
+def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
     """Write `diagnosis.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
@@ -35,7 +35,7 @@ def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextS
     return write_results(found, folder, "diagnosis", title, model, lead, draw_diagnosis(found), tables, remarks, steps)
 
 
-def diagnosis_lines(summary: JsonObject) -> list[str]:
+def diagnosis_lines(summary: JsonObject) -> Lines:
     """The lines for the terminal, from a `diagnosis.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
@@ -44,7 +44,7 @@ _FAR = 10.0
 """Factor between the torque and what [log] u says from which a unit is rather wrong: torque constants are known better."""
 
 
-def _headline(summary: JsonObject) -> list[str]:
+def _headline(summary: JsonObject) -> Lines:
     gains = [1.0 + one["parameters"]["relative"]["value"] for one in summary["findings"] if "relative" in one["parameters"]]
     lines = [
         f"Doubtful: the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
@@ -64,7 +64,7 @@ def _headline(summary: JsonObject) -> list[str]:
     return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
 
 
-def _contradiction_lines(summary: JsonObject) -> list[str]:
+def _contradiction_lines(summary: JsonObject) -> Lines:
     """Numbers that the logs do not agree on."""
     found = []
     for one in summary["contradictions"]:
@@ -123,7 +123,7 @@ def _percent(share: float) -> str:
 _OVER = {"position": "position", "turn": "position within a turn", "speed": "speed"}
 
 
-def _table_lines(summary: JsonObject) -> list[str]:
+def _table_lines(summary: JsonObject) -> Lines:
     """What tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
@@ -150,7 +150,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _reasons(summary: JsonObject) -> list[str]:
+def _reasons(summary: JsonObject) -> Lines:
     """Why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
@@ -208,7 +208,7 @@ def probability(value: float) -> str:
     return "> 0.999" if value > 0.999 else f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
 
 
-def _gap_lines(gap: JsonObject) -> list[str]:
+def _gap_lines(gap: JsonObject) -> Lines:
     before, after, floor, units = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor", "units"))
     if gap["holdout"]["separate"]:
         place = f"On {Path(gap['holdout']['file']).name}"
@@ -240,7 +240,7 @@ def rms_text(value: float | None) -> str:
     return "diverges" if value is None else f"{value:.3g}"
 
 
-def _remarks(summary: JsonObject) -> list[str]:
+def _remarks(summary: JsonObject) -> Lines:
     lines = []
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"Residual of the model as given: {one['sentence']}." for one in summary["where"].values()]

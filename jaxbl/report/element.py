@@ -6,6 +6,7 @@ import tomli_w
 
 from jaxbl.identification.element import ElementIdentification
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import Lines
 
 from .figures import COLOURS, FAINT, Drawn, legend, outline, stacked, style, subplots
 from .page import PageTable, write_results
@@ -14,7 +15,7 @@ _POINTS = 6000
 """Points of a cloud: a page is about 1000 pixels wide."""
 
 
-def write_element_report(found: ElementIdentification, folder: Path) -> list[str]:
+def write_element_report(found: ElementIdentification, folder: Path) -> Lines:
     """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     Returns the lines for the terminal.
@@ -30,12 +31,12 @@ def write_element_report(found: ElementIdentification, folder: Path) -> list[str
     return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks)
 
 
-def element_lines(summary: JsonObject) -> list[str]:
+def element_lines(summary: JsonObject) -> Lines:
     """The lines for the terminal, from an `identification.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
 
-def _headline(summary: JsonObject) -> list[str]:
+def _headline(summary: JsonObject) -> Lines:
     lines = [*summary["warnings"]]
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
@@ -44,7 +45,7 @@ def _headline(summary: JsonObject) -> list[str]:
     return lines
 
 
-def _remarks(summary: JsonObject) -> list[str]:
+def _remarks(summary: JsonObject) -> Lines:
     element, torque = summary["method"]["element"], summary["torque"]["element"]
     lines = [f"Not identifiable: {next(iter(one['direction']))}: {one['why']}." for one in summary["refused"]]
     for term, gain in element["gains"].items():

@@ -7,14 +7,14 @@ from typing import Any
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import is_noise
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep
+from jaxbl.lines import Lines, NextStep
 
 from .figures import SIDES
 from .identify_figures import draw_identification
 from .page import PageTable, model_text, write_results
 
 
-def write_identification_report(found: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
+def write_identification_report(found: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
     """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
@@ -31,7 +31,7 @@ def write_identification_report(found: Identification, folder: Path, steps: Sequ
     return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks, steps)
 
 
-def identification_lines(summary: JsonObject) -> list[str]:
+def identification_lines(summary: JsonObject) -> Lines:
     """The lines for the terminal, from an `identification.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
@@ -41,7 +41,7 @@ _FAR = 10.0
 know them within a factor of two."""
 
 
-def _headline(summary: JsonObject) -> list[str]:
+def _headline(summary: JsonObject) -> Lines:
     far = [
         f"{path} is {one['value'] / one['nominal']:.3g} times its nominal value"
         for path, one in summary["parameters"].items()
@@ -68,7 +68,7 @@ def _headline(summary: JsonObject) -> list[str]:
     return lines
 
 
-def _backlash(summary: JsonObject) -> list[str]:
+def _backlash(summary: JsonObject) -> Lines:
     """What a log without the load's encoder says of a gap."""
     said = summary.get("backlash")
     if said is None:
@@ -83,7 +83,7 @@ def _backlash(summary: JsonObject) -> list[str]:
     ]
 
 
-def _remarks(summary: JsonObject) -> list[str]:
+def _remarks(summary: JsonObject) -> Lines:
     lines, unseen = [], (summary.get("backlash") or {}).get("why")
     for refusal in summary["refused"]:
         if refusal["why"] == unseen:
@@ -138,7 +138,7 @@ def _share(one: JsonObject, which: str = "") -> str:
     return f"{one[f'{which}rms']:.2g} {one['unit']} rms" if relative is None else f"{100.0 * relative:.2g} %"
 
 
-def _on_holdout(holdout: JsonObject) -> list[str]:
+def _on_holdout(holdout: JsonObject) -> Lines:
     name = Path(holdout["file"]).name
     lines = [
         f"On {name}, {side}: position residual over {holdout['window']:.3g} s {one['rms']:.2g} {one['unit']} rms, "

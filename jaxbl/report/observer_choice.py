@@ -20,6 +20,7 @@ from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import Lines
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MISSING, SIDE_COLOURS, Drawn, style, subplots, with_unit
@@ -217,7 +218,7 @@ def _map(config: Config, summary: JsonObject, side: str) -> Drawn:
     return Drawn(f"observers_{side}", figure, caption)
 
 
-def write_choice_report(choice: ObserverChoice, folder: Path) -> list[str]:
+def write_choice_report(choice: ObserverChoice, folder: Path) -> Lines:
     """Write `tuning.json`, of a single point `gains.toml`, figures and report into a folder that exists. Returns lines for
     the terminal."""
     summary = choice.summary
@@ -266,7 +267,7 @@ def _where(summary: JsonObject) -> str:
     return f"{other}, {last - first + 1} seeds"
 
 
-def choice_headline(summary: JsonObject) -> list[str]:
+def choice_headline(summary: JsonObject) -> Lines:
     """Which kind is best, and by how much, in sentences."""
     points = summary["points"]
     unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
@@ -297,7 +298,7 @@ def _said(side: str, found: JsonObject, summary: JsonObject, unit: str) -> str:
     return f"{lead}: {summary['objective']} error {one['error']:.3g} {unit} rms with {best} ({_where(summary)}).{rest}{bad}"
 
 
-def _said_of_map(side: str, summary: JsonObject) -> list[str]:
+def _said_of_map(side: str, summary: JsonObject) -> Lines:
     points = [one["sides"][side] for one in summary["points"]]
     alone, shared = {}, {}
     for found in points:

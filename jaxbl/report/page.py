@@ -22,7 +22,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, write_atomic
-from jaxbl.lines import NextStep
+from jaxbl.lines import Lines, NextStep
 
 from .figures import Drawn, save
 from .picture import Picture, picture
@@ -50,7 +50,7 @@ def write_report(
     config: str,
     remarks: Sequence[str] = (),
     steps: Sequence[NextStep] = (),
-) -> list[str]:
+) -> Lines:
     """Write figures into `figures/`, and `report.html` with what was found (`lead`), remarks, and what to try next.
 
     Returns lead and remarks, the lines for the terminal.
@@ -78,7 +78,7 @@ def write_results(
     tables: Sequence[PageTable],
     remarks: Sequence[str],
     steps: Sequence[NextStep] = (),
-) -> list[str]:
+) -> Lines:
     """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines

@@ -14,7 +14,7 @@ import pandas as pd
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
-from jaxbl.lines import NextStep
+from jaxbl.lines import Lines, NextStep
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -25,7 +25,7 @@ from .maps import draw
 from .page import PageTable, write_report
 
 
-def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
+def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
     """Write figures, `report.html`, and `laws.json` if figures ask for laws, into a study's folder.
 
     Args:
@@ -110,12 +110,12 @@ class _Survey:
         self.values = {path: one.frame()[path] for path, one in distinct.items()}
 
 
-def headline(result: StudyResult) -> list[str]:
+def headline(result: StudyResult) -> Lines:
     """What a study found, in sentences."""
     return _headline(result, _Survey(result))
 
 
-def _headline(result: StudyResult, found: _Survey) -> list[str]:
+def _headline(result: StudyResult, found: _Survey) -> Lines:
     refined = result.config.sweep.refine is not None
     even = found.even or math.nan
     shares = ", ".join(f"{100 * found.converged[side] / even:.1f} % ({side})" for side in found.sides)
@@ -141,7 +141,7 @@ def _headline(result: StudyResult, found: _Survey) -> list[str]:
     return lines
 
 
-def _law_lines(laws: list[Law]) -> list[str]:
+def _law_lines(laws: list[Law]) -> Lines:
     """How many laws agree with theory, and each that does not."""
     if not laws:
         return []

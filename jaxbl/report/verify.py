@@ -19,6 +19,7 @@ from jaxbl.files import to_jsonable
 from jaxbl.gains.error_system import list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import Lines
 from jaxbl.observer.conditions import CONDITIONS
 
 from .error_plane import draw_worst_planes
@@ -216,7 +217,7 @@ def _claimed(verdict: Verdict) -> Drawn:
     return Drawn("claimed_bound", figure, caption)
 
 
-def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
+def write_verify_report(verdict: Verdict, folder: Path) -> Lines:
     """Draw the figures of a verification and write `report.html` into its folder. Returns the lines for the terminal."""
     lead = [*_headline(verdict), *rule_lines(verdict.summary["rules"])]
     remarks = [*verdict.config.notes, *_mark_lines(verdict)]
@@ -231,7 +232,7 @@ def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
     return write_report(folder, title, lead, draw_verdict(verdict), tables, config, remarks)
 
 
-def _headline(verdict: Verdict) -> list[str]:
+def _headline(verdict: Verdict) -> Lines:
     lines = []
     for level in verdict.summary["levels"]:
         wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
@@ -281,7 +282,7 @@ def _below_line(verdict: Verdict, side: str, below: JsonObject) -> str:
     )
 
 
-def _mark_lines(verdict: Verdict) -> list[str]:
+def _mark_lines(verdict: Verdict) -> Lines:
     lines = []
     for one in verdict.summary["marks"]:
         rho = one["peak_ratio"]

@@ -11,7 +11,7 @@ import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep
+from jaxbl.lines import Lines, NextStep
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
 
 from .figures import COLOURS, SIDE_COLOURS, SIDES, Drawn, legend, limits, outline, stacked, style
@@ -24,7 +24,7 @@ _LABELS = {
 }  # fmt: skip
 
 
-def write_watch_report(found: Watch, folder: Path, steps: list[NextStep] | None = None) -> list[str]:
+def write_watch_report(found: Watch, folder: Path, steps: list[NextStep] | None = None) -> Lines:
     """Write `watch.csv`, `watch.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
     with open_draft(folder / VALUES) as draft:
         found.values.to_csv(draft, index=False)
@@ -71,7 +71,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
         yield add
 
 
-def watch_lines(summary: JsonObject) -> list[str]:
+def watch_lines(summary: JsonObject) -> Lines:
     """The lines for the terminal, from a `watch.json`."""
     first, last, limit = summary["first"], summary["last"], summary["alarm_gap"]
     units, count = summary["units"]["motor"], summary["values"]
@@ -109,7 +109,7 @@ def watch_lines(summary: JsonObject) -> list[str]:
     return [*lines, *_left_out(summary)]
 
 
-def _left_out(summary: JsonObject) -> list[str]:
+def _left_out(summary: JsonObject) -> Lines:
     return [f"Of the stream: {describe_counts(summary['left_out'])}."] if summary["left_out"] else []
 
 
