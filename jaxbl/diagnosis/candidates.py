@@ -320,13 +320,13 @@ def _key(effect: AbstractEffect, from_rest: bool) -> tuple:
 
 def columns_of(candidates: Sequence[Candidate], signals: MotionTorques) -> list[Torques]:
     """Columns of each candidate."""
-    new = [one for one in candidates if one not in signals.known]
+    new = [candidate for candidate in candidates if candidate not in signals.known]
     for from_rest in (False, True):
-        some = [one for one in new if one.from_rest == from_rest]
-        torques = iter(signals.of([effect for one in some for effect in one.effects], from_rest))
-        for one in some:
-            signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
-    return [signals.known[one] for one in candidates]
+        some = [candidate for candidate in new if candidate.from_rest == from_rest]
+        torques = iter(signals.of([effect for candidate in some for effect in candidate.effects], from_rest))
+        for candidate in some:
+            signals.known[candidate] = candidate.columns(signals, [next(torques) for _ in candidate.effects])
+    return [signals.known[candidate] for candidate in candidates]
 
 
 def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> Forces:

@@ -28,8 +28,8 @@ from .diagnosis_summary import (
     extended_study,
     observers_say,
     rival_tables,
+    summarise_test,
     summary_of,
-    tested,
     trace_of,
     where_lacking,
 )
@@ -169,7 +169,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         summary["notes"] += notes
         summary["explained_share"] = share
         summary["contradictions"] = contradictions_of(task.record, fitted, apart)
-        summary["gap"] = proof.gap(fitted, after) | tested(judgement, *errors, expected, controls)
+        summary["gap"] = proof.gap(fitted, after) | summarise_test(judgement, *errors, expected, controls)
         if found.verdict == "unknown_effect":
             segments = setup.fitted.segments
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)

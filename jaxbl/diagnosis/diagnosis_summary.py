@@ -119,7 +119,7 @@ def _finding(record: Record, one: Finding, values: Numbers, errors: Numbers, whe
     }
 
 
-def tested(
+def summarise_test(
     judgement: Judgement,
     before: Errors,
     after: Errors,

@@ -159,29 +159,29 @@ class _Joined:
 
     def __init__(self, residuals: Sequence[Residual]):
         self.parts = residuals
-        self.torque = np.concatenate([one.torque for one in residuals])
-        self.deviation = np.concatenate([one.deviation for one in residuals])
-        ends = np.cumsum([0, *(len(one.time) for one in residuals)])
+        self.torque = np.concatenate([residual.torque for residual in residuals])
+        self.deviation = np.concatenate([residual.deviation for residual in residuals])
+        ends = np.cumsum([0, *(len(residual.time) for residual in residuals)])
         self.slices = [slice(a, b) for a, b in itertools.pairwise(ends)]
         self.count = int(ends[-1])
         self.power, self.noise = float(np.sum(self.torque**2)), float(np.sum(self.deviation**2))
-        self.sizes = [2 ** int(np.ceil(np.log2(2 * len(one.time)))) for one in residuals]
+        self.sizes = [2 ** int(np.ceil(np.log2(2 * len(residual.time)))) for residual in residuals]
         self.spectra = [
-            [noise_spectrum(one.correlation**power, size) for one, size in zip(residuals, self.sizes, strict=True)]
+            [noise_spectrum(residual.correlation**power, size) for residual, size in zip(residuals, self.sizes, strict=True)]
             for power in (1, 2)
         ]
         # samples that count in a power: correlated ones count once
-        widths = [2.0 * np.sum(one.correlation**2) - 1.0 for one in residuals]
-        self.effective = sum(len(one.time) / max(width, 1.0) for one, width in zip(residuals, widths, strict=True))
-        total = sum(one.time[-1] - one.time[0] for one in residuals)
-        slowest = max(width * one.period for one, width in zip(residuals, widths, strict=True))
+        widths = [2.0 * np.sum(residual.correlation**2) - 1.0 for residual in residuals]
+        self.effective = sum(len(residual.time) / max(width, 1.0) for residual, width in zip(residuals, widths, strict=True))
+        total = sum(residual.time[-1] - residual.time[0] for residual in residuals)
+        slowest = max(width * residual.period for residual, width in zip(residuals, widths, strict=True))
         length = max(total / _BLOCKS, 4.0 * slowest)
         self.block = np.empty(self.count, int)
         begun = 0
-        for one, rows in zip(residuals, self.slices, strict=True):
-            span = one.time[-1] - one.time[0]
+        for residual, rows in zip(residuals, self.slices, strict=True):
+            span = residual.time[-1] - residual.time[0]
             number = max(round(span / length), 1)
-            along = (one.time - one.time[0]) / max(span, np.finfo(float).tiny)
+            along = (residual.time - residual.time[0]) / max(span, np.finfo(float).tiny)
             self.block[rows] = begun + np.minimum((along * number).astype(int), number - 1)
             begun += number
         self.blocks = begun

@@ -66,11 +66,11 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
     added = [_neutral(name) for name in candidates(experiment) if name in acting or not has_state(name)]
     if not added:
         return experiment
-    effects = with_added(experiment.effects, added, lambda one: one.name)
+    effects = with_added(experiment.effects, added, lambda effect: effect.name)
     kinds = list(EFFECTS)
-    if len({one.name for one in effects}) == len(effects):
+    if len({effect.name for effect in effects}) == len(effects):
         # one order whatever was given, so that models share their programs; that of the actuator's matters
-        effects.sort(key=lambda one: len(kinds) if one.place == "actuator" else kinds.index(one.name))
+        effects.sort(key=lambda effect: len(kinds) if effect.place == "actuator" else kinds.index(effect.name))
     return with_effects(experiment, tuple(effects))
 
 
@@ -87,9 +87,9 @@ def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) 
     """
     may = {path.rpartition(".")[0].removeprefix("effects.") for path in free if path.startswith("effects.")}
     both = [
-        (one, own)
-        for one, own in zip(experiment.effects, state.effects, strict=True)
-        if one.name in may or jax.tree.leaves(own) or not _is_neutral(one)
+        (effect, own)
+        for effect, own in zip(experiment.effects, state.effects, strict=True)
+        if effect.name in may or jax.tree.leaves(own) or not _is_neutral(effect)
     ]
     effects, own = (tuple(some) for some in zip(*both, strict=True)) if both else ((), ())
     return with_effects(experiment, effects), dataclasses.replace(state, effects=own)

@@ -149,12 +149,12 @@ def _path(name: str) -> str:
     return f"effects.{effect}.{key}" if effect else name
 
 
-def _entry(one: Number) -> JsonObject:
+def _entry(number: Number) -> JsonObject:
     return {
-        "value": one.value,
-        "standard_error": one.error,
-        "interval": list(one.interval),
-        "unit": one.unit,
+        "value": number.value,
+        "standard_error": number.error,
+        "interval": list(number.interval),
+        "unit": number.unit,
         "nominal": None,
     }
 

@@ -82,14 +82,14 @@ def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: 
     """Values with standard errors and 95 % intervals, by path."""
     theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
     return {
-        one.path: {
-            "value": float(one.value(theta[i])),
-            "standard_error": float(one.slope(theta[i])) * deviation[i],
-            "interval": list(interval(one, theta[i], deviation[i])),
-            "unit": record.unit_of(one.path, one.unit),
-            "nominal": one.nominal,
+        parameter.path: {
+            "value": float(parameter.value(theta[i])),
+            "standard_error": float(parameter.slope(theta[i])) * deviation[i],
+            "interval": list(interval(parameter, theta[i], deviation[i])),
+            "unit": record.unit_of(parameter.path, parameter.unit),
+            "nominal": parameter.nominal,
         }
-        for i, one in enumerate(free)
+        for i, parameter in enumerate(free)
     }
 
 

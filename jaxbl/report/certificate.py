@@ -37,7 +37,7 @@ def certificate_lines(summary: JsonObject) -> list[str]:
     return [line for side in found for line in _lines(side, found[side], summary["passed_over"][side])]
 
 
-def refuted(summary: JsonObject) -> bool:
+def is_refuted(summary: JsonObject) -> bool:
     """Whether the search found an error above what was proven: that is said before all else."""
     return any(found.get("search", {}).get("violations") for found in summary.get("certificates", {}).values())
 

@@ -20,7 +20,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .certificate import certificate_lines, certificate_tables, draw_certificates, refuted, write_certificates
+from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import cell_edges, color_norm, condition_curves, fit_axes, hatch_failures
@@ -322,7 +322,7 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
     summary = tuning.summary
     certified = certificate_lines(summary)
-    lead = [*certified, *tune_headline(summary)] if refuted(summary) else [*tune_headline(summary), *certified]
+    lead = [*certified, *tune_headline(summary)] if is_refuted(summary) else [*tune_headline(summary), *certified]
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_certificates(summary, folder)
     write_json(folder / "tuning.json", summary, allow_nan=False)

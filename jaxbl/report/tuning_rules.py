@@ -28,19 +28,19 @@ _MARKERS = ("D", "o", "s", "^")
 def draw_rules(rules: list[JsonObject]) -> Drawn:
     """The plane of gains with the exact border and the borders of all rules (`rules` of a verdict) at f⁺ = 1 rad/s²."""
     figure, axes = subplots(10.4, 6.4, columns=2, beside=True, sharex=True, sharey=True)
-    wrong = [one for one in rules if not one["sufficient"]]
+    wrong = [rule for rule in rules if not rule["sufficient"]]
     for ax, shown, title in (
-        (axes[0], [one for one in rules if one["sufficient"]], "Sufficient: all gains that they allow converge"),
+        (axes[0], [rule for rule in rules if rule["sufficient"]], "Sufficient: all gains that they allow converge"),
         (axes[1], wrong, "Not sufficient: where shaded, gains that they allow do not converge"),
     ):
         handles = _plane(ax)
         looks = zip(_RULE_COLOURS, _DASHES, strict=False)
-        for one, (colour, dashes) in zip([one for one in shown if one["kind"] == "region"], looks, strict=False):
-            handles.append(_region(ax, one, colour, dashes))
-        for one, marker in zip([one for one in shown if one["kind"] == "gains"], _MARKERS, strict=False):
+        for rule, (colour, dashes) in zip([rule for rule in shown if rule["kind"] == "region"], looks, strict=False):
+            handles.append(_region(ax, rule, colour, dashes))
+        for rule, marker in zip([rule for rule in shown if rule["kind"] == "gains"], _MARKERS, strict=False):
             look: Any = {"ls": "", "marker": marker, "mfc": "white", "mec": "black", "mew": 1.2}
-            ax.plot(one["gains"]["alpha"], one["gains"]["lambda"], zorder=6, ms=7, **look)
-            handles.append(Line2D([], [], label=one["title"], **look))
+            ax.plot(rule["gains"]["alpha"], rule["gains"]["lambda"], zorder=6, ms=7, **look)
+            handles.append(Line2D([], [], label=rule["title"], **look))
         ax.set_title(title)
         ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, handlelength=3.2)
     axes[0].set_ylabel("λ / √f⁺")
@@ -100,18 +100,20 @@ def _region(ax: Axes, one: JsonObject, colour: str, dashes: Any) -> Line2D:
 
 def rule_lines(rules: list[JsonObject]) -> list[str]:
     """What was found about the rules, in sentences."""
-    good = [one for one in rules if one["sufficient"]]
+    good = [rule for rule in rules if rule["sufficient"]]
     shares = "; ".join(
-        f"{one['title']} {_covers(one)}"
-        if one["kind"] == "region"
-        else f"{one['title']} one pair, λ {one['margin']:.3g} times the least"
-        for one in good
+        f"{rule['title']} {_covers(rule)}"
+        if rule["kind"] == "region"
+        else f"{rule['title']} one pair, λ {rule['margin']:.3g} times the least"
+        for rule in good
     )
     lines = [
         f"{len(good)} of {len(rules)} public tuning rules are sufficient. Of the converging gains of the map they allow: "
         f"{shares}."
     ]
-    return lines + [f"Tuning rule {one['title']}: not sufficient. {_wrong(one)}" for one in rules if not one["sufficient"]]
+    return lines + [
+        f"Tuning rule {rule['title']}: not sufficient. {_wrong(rule)}" for rule in rules if not rule["sufficient"]
+    ]
 
 
 def _covers(one: JsonObject) -> str:
@@ -136,17 +138,17 @@ def rule_table(rules: list[JsonObject]) -> PageTable:
     """All rules, with what was read of each."""
     rows = [
         [
-            one["title"],
+            rule["title"],
             # lines break between conditions
-            one["states"].replace(" ", "\u00a0").replace(",\u00a0", ", "),
-            one["sufficient"],
-            one["margin"],
-            _covers(one) if one["kind"] == "region" else None,
-            one["cells"]["counterexamples"] if one["kind"] == "region" else None,
-            None if one["counterexample"] is None else _wrong(one),
-            one["source"],
+            rule["states"].replace(" ", "\u00a0").replace(",\u00a0", ", "),
+            rule["sufficient"],
+            rule["margin"],
+            _covers(rule) if rule["kind"] == "region" else None,
+            rule["cells"]["counterexamples"] if rule["kind"] == "region" else None,
+            None if rule["counterexample"] is None else _wrong(rule),
+            rule["source"],
         ]
-        for one in rules
+        for rule in rules
     ]
     head = ["rule", "asks for", "sufficient", "least λ / exact", "covers", "wrong cells", "counterexample", "source"]
     return PageTable("Public tuning rules, judged by the exact condition", head, rows)
