@@ -30,10 +30,11 @@ include_patterns = [
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
 # tutorials run where their page is read
-TUTORIALS = {"docs/tutorial": "axis.toml", "docs/log_tutorial": ""}
+TUTORIALS = {"tutorial": "axis.toml", "log_tutorial": ""}
+"""Pages, and the file that their TOML makes."""
 nb_custom_formats = {
-    f"/{page}.md": ["page_notebook.read_page", {"name": Path(page).name, "study": study}]
-    for page, study in TUTORIALS.items()
+    f"{HERE.name}/{name}.md": ["page_notebook.read_page", {"name": name, "study": study}]
+    for name, study in TUTORIALS.items()
 }
 nb_output_stderr = "remove"  # progress
 nb_execution_mode = "force"

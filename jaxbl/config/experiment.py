@@ -80,7 +80,7 @@ class _ObserverTable(Table):
     """Observers of both sides."""
 
     discretisation: Literal[tuple(DISCRETISATIONS)] = Field(
-        "implicit",
+        default="implicit",
         description="of kind super_twisting. implicit: proximal backward Euler; explicit: forward Euler of (7)",
     )
 

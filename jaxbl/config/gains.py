@@ -57,31 +57,31 @@ class SideCertificateTable(Table):
     """Assumptions of a certificate for one observer, and limits that its gains must provably keep."""
 
     noise: float | None = Field(
-        None, ge=0.0, json_schema_extra={"unit": "rad"},
+        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
         description="bound of the error of a reading; left out: half a count and five times the rms noise of [encoders]",
     )  # fmt: skip
     f_plus: float | None = Field(
-        None, gt=0.0, json_schema_extra={"unit": "rad/s²"},
+        default=None, gt=0.0, json_schema_extra={"unit": "rad/s²"},
         description="bound of the acceleration that the nominal model lacks; left out: the f⁺ that tune finds",
     )  # fmt: skip
     velocity_error: float | None = Field(
-        None, ge=0.0, json_schema_extra={"unit": "rad/s"},
+        default=None, ge=0.0, json_schema_extra={"unit": "rad/s"},
         description="largest velocity error at the start; left out: that of tune's runs",
     )  # fmt: skip
     position_error: float | None = Field(
-        None, ge=0.0, json_schema_extra={"unit": "rad"},
+        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
         description="largest position error at the start; left out: the study's, at least that of a reading",
     )  # fmt: skip
     acceleration: float | None = Field(
-        None, ge=0.0, json_schema_extra={"unit": "rad/s²"},
+        default=None, ge=0.0, json_schema_extra={"unit": "rad/s²"},
         description="bound of the nominal acceleration, for the explicit form; left out: largest of the pilot run, and f⁺",
     )  # fmt: skip
     accuracy: float | None = Field(
-        None, gt=0.0, description="velocity error that must provably not be exceeded",
+        default=None, gt=0.0, description="velocity error that must provably not be exceeded",
         json_schema_extra={"unit": "rad/s"},
     )  # fmt: skip
     reaching_time: float | None = Field(
-        None, gt=0.0, description="time after which that must hold", json_schema_extra={"unit": "s"}
+        default=None, gt=0.0, description="time after which that must hold", json_schema_extra={"unit": "s"}
     )
 
 
@@ -104,18 +104,18 @@ class TuneTable(Table):
     """
 
     objective: Literal["velocity", "torque"] = Field(
-        "velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
+        default="velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
     )
     worst_over_uncertainty: bool = Field(
-        False,
+        default=False,
         description="worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)",
     )
     margin_exact: float = Field(
-        1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
+        default=1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
     )
     margin_alpha: float = Field(1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
     longest_convergence: float | None = Field(
-        None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
+        default=None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
         json_schema_extra={"unit": "s"},
     )  # fmt: skip
     alpha_ratio: AlphaRatioTable = Field(default_factory=AlphaRatioTable)
@@ -128,22 +128,22 @@ class TuneTable(Table):
     )
     compare: list[CompareTable] = Field([], max_length=50, description="named gains to compare with")
     observers: list[str] = Field(
-        [],
+        default=[],
         max_length=50,
         description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, "
         "alpha_ratio, lambda_ratio, num, compare and certificate do not apply",
     )
     trials: int = Field(
-        256,
+        default=256,
         ge=8,
         le=65536,
         description="of observers: gains tried of each kind, over its whole range and in each zoom",
     )
     axes: list[AxisTable] = Field(
-        [], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
+        default=[], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
     )
     certificate: CertificateTable | None = Field(
-        None, description="a table, which may be empty: prove bounds for the gains; left out: none"
+        default=None, description="a table, which may be empty: prove bounds for the gains; left out: none"
     )
 
     @model_validator(mode="after")
@@ -215,7 +215,7 @@ class VerifyTable(Table):
         default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
     )
     damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
-        [0.1, 0.3, 1.0],
+        default=[0.1, 0.3, 1.0],
         max_length=100,
         description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
     )

@@ -12,7 +12,7 @@ class UncertaintyTable(Table):
 
     relative: float = Field(0.02, gt=0.0, description="relative standard deviation of every number not in exact")
     exact: list[str] = Field(
-        ["drive.gear_ratio"],
+        default=["drive.gear_ratio"],
         description="dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
     )
 
@@ -21,17 +21,17 @@ class IdentifyTable(Table):
     """Settings of `jaxbl identify`."""
 
     parameters: list[str] | None = Field(
-        None,
+        default=None,
         description="dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
         "uncertainty.exact and have a value to start from",
     )
     method: Literal["output_error", "prediction_error"] = Field(
-        "output_error",
+        default="output_error",
         description="output_error: the model runs freely over each window; prediction_error: each reading corrects it, "
         "which is better where disturbances act that the model does not know",
     )
     window: float | None = Field(
-        None,
+        default=None,
         gt=0.0,
         description="length of the windows that the model runs over; left out: chosen by the width of the intervals",
         json_schema_extra={"unit": "s"},
@@ -41,7 +41,7 @@ class IdentifyTable(Table):
     seed: int = Field(0, ge=0, description="seed of the starts")
     profile: bool = Field(False, description="whether to compute profile-likelihood intervals as well")
     bandwidth: float | None = Field(
-        None,
+        default=None,
         gt=0.0,
         description="of the torques in the equations of motion; left out: a twentieth of the sampling rate",
         json_schema_extra={"unit": "Hz"},

@@ -189,7 +189,7 @@ def _merge_includes(
     return merged, origins
 
 
-def _origins_from_file(data: JsonObject, file: str) -> Origins:
+def _origins_from_file(data: Mapping[str, Any], file: str) -> Origins:
     """Return origins of keys that all come from one file."""
     return {
         name: Origin(file, _origins_from_file(element, file) if isinstance(element, Mapping) else {})

@@ -47,7 +47,7 @@ class Config(Table):
     """A study: everything that a run needs, validated."""
 
     include: str | list[str] = Field(
-        [],
+        default=[],
         exclude=True,
         description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
         "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",

@@ -22,34 +22,34 @@ class SweepTable(Table):
     """Combination and repetition of the axes."""
 
     seeds: int = Field(
-        1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
+        default=1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
     )
     first_seed: int = Field(0, ge=0, le=2**31 - 1, description="first of the noise seeds")
     design: Literal["grid", "sobol", "latin_hypercube"] = Field(
-        "grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
+        default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
     )
     points: int | None = Field(None, ge=1, le=100_000_000, description="number of quasi-random points")
     design_seed: int = Field(0, ge=0, description="seed of the quasi-random design")
     metrics: list[str] | None = Field(
-        None,
+        default=None,
         description="metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
         "left out: all; `finite` then counts what overflowed before all of these were known",
     )
     chunk: int | None = Field(None, ge=1, description="lanes computed at once; left out: chosen for the machine")
     refine: int | None = Field(
-        None,
+        default=None,
         ge=1,
         le=30,
         description="how often to halve the grid where neighbours disagree, along the axes with start, stop and num; "
         "left out: never",
     )
     refine_metric: str | None = Field(
-        None,
+        default=None,
         description="metric that decides where to refine; left out: converged, of the observer whose gains vary, otherwise "
         "of both",
     )
     refine_tolerance: float | None = Field(
-        None,
+        default=None,
         gt=0.0,
         description="relative difference beyond which they disagree in a numeric refine_metric; "
         f"left out: {DEFAULT_TOLERANCE:g}",
@@ -84,7 +84,9 @@ class AxisTable(Table):
     values: list[float | int | str] | None = Field(None, description="listed values")
     start: float | None = Field(None, description="first value")
     stop: float | None = Field(None, description="last value")
-    num: int | None = Field(None, ge=1, le=10_000_000, description="number of values; left out in quasi-random designs")
+    num: int | None = Field(
+        default=None, ge=1, le=10_000_000, description="number of values; left out in quasi-random designs"
+    )
     scale: Literal["linear", "log"] = Field("linear", description="spacing")
     zip: str | None = Field(None, description="axes with the same label advance together")
 
@@ -137,15 +139,15 @@ class FigureTable(Table):
     facet: str | None = Field(None, description="axis path: one panel for each value")
     series: str | None = Field(None, description="axis path: one line for each value (line)")
     where: dict[str, float | int | str] | None = Field(
-        None,
+        default=None,
         description="axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them",
     )
     theory: float | None = Field(
-        None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
+        default=None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
     )
     scale: Literal["auto", "linear", "log"] = Field("auto", description="scale of the value")
     overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
-        [], description="gain conditions drawn over a map of alpha and lambda"
+        default=[], description="gain conditions drawn over a map of alpha and lambda"
     )
 
     @model_validator(mode="after")

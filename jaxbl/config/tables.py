@@ -48,7 +48,7 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
         fields[field.name] = (
             kind | None if optional else kind,
             Field(
-                ... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
+                default=... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
                 alias=config_key(field.name) if config_key(field.name) != field.name else None,
                 description=parameter.doc,
                 json_schema_extra={"unit": parameter.unit} if parameter.unit else None,
