@@ -390,7 +390,7 @@ def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: tuple)
     states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     start = _window_start_time(experiment)
     metrics = _loop_metrics(experiment, names)
-    flags: list[Any] = [metric.is_final(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    flags: Any = [metric.is_final(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
     return None if not flags or any(flag is None for flag in flags) else functools.reduce(jnp.logical_and, flags)
 
 

@@ -103,8 +103,7 @@ class RunTotals(NamedTuple):
     damaged: tuple[str, ...] = ()
 
     def __add__(self, other: Any) -> "RunTotals":
-        sums = [a + b for a, b in zip(self, other, strict=True)]
-        totals = RunTotals(*sums)
+        totals = RunTotals(*(a + b for a, b in zip(self, other, strict=True)))
         return totals._replace(fallback_reasons=tuple(dict.fromkeys(totals.fallback_reasons)))
 
 

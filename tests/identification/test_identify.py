@@ -141,7 +141,7 @@ def open_ended(study):
 
 
 @pytest.fixture(scope="module")
-def measure_errors(tmp_path_factory):
+def sensor_logs(tmp_path_factory):
     """Two logs of the drive with a torque sensor, the second one with another input."""
     folder = tmp_path_factory.mktemp("measured")
     for i, frequency in enumerate((0.5, 0.37)):
@@ -153,7 +153,7 @@ def measure_errors(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def everything(measure_errors):
+def everything(sensor_logs):
     """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
     study = open_ended(NOMINAL)
     # the log is sampled twice as often
@@ -161,7 +161,7 @@ def everything(measure_errors):
     study["log"] = {"transmitted": "sensor", "initial_state": "rest"}
     study["identify"] = {"starts": 2, "window": 0.5, "method": "prediction_error", "parameters": list(TRUTH)[4:]}
     study["drive"] = geared_study()["drive"]
-    return identify(measure_errors / "log0.csv", study, holdout=measure_errors / "log1.csv", profile=True)
+    return identify(sensor_logs / "log0.csv", study, holdout=sensor_logs / "log1.csv", profile=True)
 
 
 def test_a_measured_torque_is_regressed_directly(everything):
@@ -217,12 +217,12 @@ def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp
     assert "with the measured transmitted torque" in page
 
 
-def test_several_logs_are_one_record(measure_errors, found, tmp_path):
+def test_several_logs_are_one_record(sensor_logs, found, tmp_path):
     """Halves of two logs say as much as one whole log."""
     study = geared_study(identify={"starts": 1, "window": 0.5})
     halves = [tmp_path / "half0.csv", tmp_path / "half1.csv"]
     for i, half in enumerate(halves):
-        pd.read_csv(measure_errors / f"log{i}.csv").iloc[:750].to_csv(half, index=False)
+        pd.read_csv(sensor_logs / f"log{i}.csv").iloc[:750].to_csv(half, index=False)
     identification = identify(halves, study)
     assert len(identification.trace) == 1500
     assert identification.summary["method"]["trajectory"]["windows"] == 6
