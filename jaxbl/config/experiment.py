@@ -31,9 +31,9 @@ class RecordedTable(Table):
 
     kind: Literal["recorded"]
     file: str = Field(description="CSV or Parquet file; relative to the config file")
-    time_column: str = Field("t", description="column of times in s")
-    torque_column: str = Field("u", description="column of torques in N m")
-    gain: float = Field(1.0, description="factor on the recorded torque")
+    time_column: str = Field(default="t", description="column of times in s")
+    torque_column: str = Field(default="u", description="column of torques in N m")
+    gain: float = Field(default=1.0, description="factor on the recorded torque")
 
     def build(self) -> Recorded:
         times, torques = self._columns()
@@ -100,14 +100,14 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
     """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
     keys = {field.name for field, _ in parameters(cls)}
     other_keys: dict[str, Any] = {
-        name: (float | None, Field(None, alias=key if key != name else None, description=OTHER_KINDS))
+        name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHER_KINDS))
         for name, key in _GAINS.items()
         if name not in keys
     }
     gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **other_keys))
     sides: dict[str, Any] = {
         "motor": (gains, Field(description="gains of the motor observer")),
-        "load": (gains | None, Field(None, description="gains of the load observer; none on a rigid drive")),
+        "load": (gains | None, Field(default=None, description="gains of the load observer; none on a rigid drive")),
     }
     tag: Any = (Literal[kind], Field(kind if kind == _USUAL else ..., description="kind of observer"))
     return create_model(f"{cls.__name__}Table", __base__=_ObserverTable, __doc__=cls.__doc__, kind=tag, **sides)
@@ -127,8 +127,8 @@ _MOST_STEPS = 2e9
 class _RunTable(Table):
     """The keys of a run from which its number of samples and the type of its numbers follow."""
 
-    duration: float = Field(20.0, gt=0.0, description="length of the run", json_schema_extra={"unit": "s"})
-    precision: Literal["float64", "float32"] = Field("float64", description="floating-point type of the run")
+    duration: float = Field(default=20.0, gt=0.0, description="length of the run", json_schema_extra={"unit": "s"})
+    precision: Literal["float64", "float32"] = Field(default="float64", description="floating-point type of the run")
 
     @property
     def steps(self) -> int:

@@ -27,15 +27,15 @@ class _SpanTable(Table):
 class AlphaRatioTable(_SpanTable):
     """Range of alpha / f⁺ that is searched, in equal ratios."""
 
-    start: float = Field(1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
-    stop: float = Field(100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
+    start: float = Field(default=1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
+    stop: float = Field(default=100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
 
 
 class LambdaRatioTable(_SpanTable):
     """Range of lambda / √f⁺ that is searched, in equal ratios."""
 
-    start: float = Field(0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
-    stop: float = Field(50.0, gt=0.0, le=1e9, description="largest lambda / √f⁺")
+    start: float = Field(default=0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
+    stop: float = Field(default=50.0, gt=0.0, le=1e9, description="largest lambda / √f⁺")
 
 
 class GainPairTable(Table):
@@ -50,7 +50,7 @@ class CompareTable(Table):
 
     name: str = Field(min_length=1, max_length=100, description="how tables and figures call them")
     motor: GainPairTable = Field(description="gains of the motor observer")
-    load: GainPairTable | None = Field(None, description="gains of the load observer; none on a rigid drive")
+    load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
 
 
 class SideCertificateTable(Table):
@@ -89,8 +89,8 @@ class CertificateTable(Table):
     """Bounds that gains provably hold for all noise and disturbance within limits; super-twisting observers only."""
 
     motor: SideCertificateTable = Field(default_factory=SideCertificateTable)
-    load: SideCertificateTable | None = Field(None, description="as motor; none on a rigid drive")
-    runs: int = Field(1_000_000, ge=1, le=10**9, description="adversarial runs that look for a counterexample")
+    load: SideCertificateTable | None = Field(default=None, description="as motor; none on a rigid drive")
+    runs: int = Field(default=1_000_000, ge=1, le=10**9, description="adversarial runs that look for a counterexample")
 
 
 TUNE_NAMES = ("tuned", "usual rule", "config")
@@ -113,20 +113,20 @@ class TuneTable(Table):
     margin_exact: float = Field(
         default=1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
     )
-    margin_alpha: float = Field(1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
+    margin_alpha: float = Field(default=1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
     longest_convergence: float | None = Field(
         default=None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
         json_schema_extra={"unit": "s"},
     )  # fmt: skip
     alpha_ratio: AlphaRatioTable = Field(default_factory=AlphaRatioTable)
     lambda_ratio: LambdaRatioTable = Field(default_factory=LambdaRatioTable)
-    num: int = Field(16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
-    refine: int = Field(2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
+    num: int = Field(default=16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
+    refine: int = Field(default=2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
     holdout: ExcitationTable | None = Field(  # pyright: ignore[reportInvalidTypeForm]
         default=None,
         description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
     )
-    compare: list[CompareTable] = Field([], max_length=50, description="named gains to compare with")
+    compare: list[CompareTable] = Field(default=[], max_length=50, description="named gains to compare with")
     observers: list[str] = Field(
         default=[],
         max_length=50,
@@ -201,13 +201,13 @@ class MarkTable(GainPairTable):
     """A pair of gains to be marked in the atlas, run once on the study's drive."""
 
     name: str = Field(max_length=100, description="label")
-    side: Literal["motor", "load"] = Field("motor", description="observer that has these gains")
+    side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
 
 
 class VerifyTable(Table):
     """Settings of `jaxbl verify` besides the study's own points: the normalised error system, and marks."""
 
-    q: float | None = Field(None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
+    q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
     alpha_ratio: RangeTable = Field(
         default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512), description="alpha / f_plus of the atlas"
     )
@@ -219,7 +219,7 @@ class VerifyTable(Table):
         max_length=100,
         description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
     )
-    marks: list[MarkTable] = Field([], max_length=100, description="gains to be marked")
+    marks: list[MarkTable] = Field(default=[], max_length=100, description="gains to be marked")
 
     @model_validator(mode="after")
     def _possible(self) -> "VerifyTable":

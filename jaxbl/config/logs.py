@@ -10,7 +10,7 @@ from .tables import Table
 class UncertaintyTable(Table):
     """Uncertainty of the drive's numbers. Accepted in every study; simulate and sweep do not use it, tune can."""
 
-    relative: float = Field(0.02, gt=0.0, description="relative standard deviation of every number not in exact")
+    relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
     exact: list[str] = Field(
         default=["drive.gear_ratio"],
         description="dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
@@ -36,10 +36,10 @@ class IdentifyTable(Table):
         description="length of the windows that the model runs over; left out: chosen by the width of the intervals",
         json_schema_extra={"unit": "s"},
     )
-    starts: int = Field(8, ge=1, le=1000, description="starts of the fit, the first at the nominal numbers")
-    spread: float = Field(2.0, gt=1.0, le=100.0, description="the others lie within this factor of them")
-    seed: int = Field(0, ge=0, description="seed of the starts")
-    profile: bool = Field(False, description="whether to compute profile-likelihood intervals as well")
+    starts: int = Field(default=8, ge=1, le=1000, description="starts of the fit, the first at the nominal numbers")
+    spread: float = Field(default=2.0, gt=1.0, le=100.0, description="the others lie within this factor of them")
+    seed: int = Field(default=0, ge=0, description="seed of the starts")
+    profile: bool = Field(default=False, description="whether to compute profile-likelihood intervals as well")
     bandwidth: float | None = Field(
         default=None,
         gt=0.0,

@@ -52,11 +52,11 @@ class Config(Table):
         description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
         "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
     )
-    title: str = Field("", max_length=500, description="headline of the report")
-    notes: list[str] = Field([], description="remarks of the author, repeated in summary and report")
+    title: str = Field(default="", max_length=500, description="headline of the report")
+    notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
     drive: DriveTable = Field(description="what is driven")
-    transmission: TransmissionTable | None = Field(None, description="law of the gear; none on a rigid drive")
-    effects: list[EffectTable] = Field([], max_length=100, description="effects beyond the nominal drive")
+    transmission: TransmissionTable | None = Field(default=None, description="law of the gear; none on a rigid drive")
+    effects: list[EffectTable] = Field(default=[], max_length=100, description="effects beyond the nominal drive")
     initial: InitialTable = Field(default_factory=InitialTable, description="state at t = 0")
     excitation: ExcitationTable = Field(description="input torque")
     encoders: EncodersTable = Field(default_factory=EncodersTable, description="position sensors")
@@ -68,12 +68,12 @@ class Config(Table):
     run: RunTable = Field(default_factory=RunTable)
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
-    tune: TuneTable | None = Field(None)
+    tune: TuneTable | None = Field(default=None)
     log: LogTable = Field(default_factory=LogTable)
     identify: IdentifyTable = Field(default_factory=IdentifyTable)
     verify: VerifyTable = Field(default_factory=VerifyTable)
-    axes: list[AxisTable] = Field([], max_length=50)
-    figures: list[FigureTable] = Field([], max_length=200)
+    axes: list[AxisTable] = Field(default=[], max_length=50)
+    figures: list[FigureTable] = Field(default=[], max_length=200)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":

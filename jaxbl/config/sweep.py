@@ -24,18 +24,18 @@ class SweepTable(Table):
     seeds: int = Field(
         default=1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
     )
-    first_seed: int = Field(0, ge=0, le=2**31 - 1, description="first of the noise seeds")
+    first_seed: int = Field(default=0, ge=0, le=2**31 - 1, description="first of the noise seeds")
     design: Literal["grid", "sobol", "latin_hypercube"] = Field(
         default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
     )
-    points: int | None = Field(None, ge=1, le=100_000_000, description="number of quasi-random points")
-    design_seed: int = Field(0, ge=0, description="seed of the quasi-random design")
+    points: int | None = Field(default=None, ge=1, le=100_000_000, description="number of quasi-random points")
+    design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
     metrics: list[str] | None = Field(
         default=None,
         description="metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
         "left out: all; `finite` then counts what overflowed before all of these were known",
     )
-    chunk: int | None = Field(None, ge=1, description="lanes computed at once; left out: chosen for the machine")
+    chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
     refine: int | None = Field(
         default=None,
         ge=1,
@@ -81,14 +81,14 @@ class AxisTable(Table):
     """One axis: a dotted path and its values."""
 
     path: str = Field(description="dotted path of the number to vary, e.g. observer.motor.alpha")
-    values: list[float | int | str] | None = Field(None, description="listed values")
-    start: float | None = Field(None, description="first value")
-    stop: float | None = Field(None, description="last value")
+    values: list[float | int | str] | None = Field(default=None, description="listed values")
+    start: float | None = Field(default=None, description="first value")
+    stop: float | None = Field(default=None, description="last value")
     num: int | None = Field(
         default=None, ge=1, le=10_000_000, description="number of values; left out in quasi-random designs"
     )
-    scale: Literal["linear", "log"] = Field("linear", description="spacing")
-    zip: str | None = Field(None, description="axes with the same label advance together")
+    scale: Literal["linear", "log"] = Field(default="linear", description="spacing")
+    zip: str | None = Field(default=None, description="axes with the same label advance together")
 
     @model_validator(mode="after")
     def _complete(self) -> "AxisTable":
@@ -134,10 +134,10 @@ class FigureTable(Table):
 
     kind: Literal["heatmap", "line"] = Field(description="heatmap over two axes, or lines over one")
     x: str = Field(description="axis path")
-    y: str | None = Field(None, description="axis path (heatmap)")
+    y: str | None = Field(default=None, description="axis path (heatmap)")
     value: str = Field(description="metric, e.g. motor.velocity_rmse")
-    facet: str | None = Field(None, description="axis path: one panel for each value")
-    series: str | None = Field(None, description="axis path: one line for each value (line)")
+    facet: str | None = Field(default=None, description="axis path: one panel for each value")
+    series: str | None = Field(default=None, description="axis path: one line for each value (line)")
     where: dict[str, float | int | str] | None = Field(
         default=None,
         description="axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them",
@@ -145,7 +145,7 @@ class FigureTable(Table):
     theory: float | None = Field(
         default=None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
     )
-    scale: Literal["auto", "linear", "log"] = Field("auto", description="scale of the value")
+    scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
     overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
         default=[], description="gain conditions drawn over a map of alpha and lambda"
     )
