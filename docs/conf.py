@@ -37,6 +37,7 @@ nb_custom_formats = {
     for name, study in TUTORIALS.items()
 }
 nb_output_stderr = "remove"  # progress
+nb_merge_streams = True  # they come in pieces
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True

@@ -1,6 +1,5 @@
 """The documentation's site: every page in a browser, and where its links lead."""
 
-import json
 import os
 import re
 import subprocess
@@ -10,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlsplit
 
+import nbformat
 import pytest
 from browser import accessible, needs_chromium, opened
 from markdown_blocks import blocks_of, without_numbers
@@ -65,12 +65,12 @@ def test_tutorials_print_what_their_texts_say(pages, name):
     blocks = blocks_of(ROOT / "docs" / f"{name}.md")
     expected = [line for block in blocks if block.language == "output" for line in without_numbers(block.text)]
     assert [line for line in expected if line not in printed] == []
-    notebook = json.loads((SITE.parent / "jupyter_execute" / "docs" / f"{name}.ipynb").read_text(encoding="utf-8"))
-    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    notebook = nbformat.read(SITE.parent / "jupyter_execute" / "docs" / f"{name}.ipynb", as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     run = [block for block in blocks if block.language in ("python", "toml") or block.text.startswith("jaxbl ")]
     assert len(cells) == len(run)
-    streams = [output for cell in cells for output in cell["outputs"] if output["output_type"] == "stream"]
-    assert without_progress("".join(stream["text"] for stream in streams if stream["name"] == "stderr")) == ""
+    errors = [output.text for cell in cells for output in cell.outputs if output.get("name") == "stderr"]
+    assert without_progress("".join(errors)) == ""
     assert "<figure>" in page
 
 
