@@ -10,20 +10,20 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (396577, 4.92, 5.71, 8.6),
-    "report": (63294, 8.8, 6.33, 17.03),
-    "diagnosis": (61881, 10.76, 16.76, 14.76),
+    "all": (396736, 3.81, 4.48, 5.73),
+    "report": (63294, 8.71, 6.12, 16.67),
+    "diagnosis": (61881, 10.65, 16.54, 14.57),
     "records": (45838, 0.0, 0.0, 0.0),
     "gains": (38326, 0.03, 0.0, 0.0),
-    "identification": (33847, 9.05, 16.89, 18.05),
-    "sweeps": (28795, 0.13, 0.0, 0.0),
+    "identification": (33847, 9.01, 16.82, 17.97),
+    "sweeps": (28794, 0.13, 0.0, 0.0),
     "exports": (24764, 0.02, 0.0, 0.68),
     "fused": (24004, 0.1, 0.0, 0.0),
     ".": (17546, 0.03, 0.0, 0.0),
-    "drive": (12780, 0.0, 2.24, 0.0),
+    "drive": (12780, 0.0, 2.23, 0.0),
     "throughput": (11813, 0.0, 0.0, 0.0),
     "cli": (9733, 0.09, 0.0, 0.0),
-    "config": (9482, 0.0, 0.0, 0.0),
+    "config": (9647, 0.0, 0.0, 0.0),
     "observer": (8968, 0.0, 0.0, 0.0),
     "monitoring": (5501, 0.0, 0.0, 0.0),
 }
