@@ -8,8 +8,9 @@ Units: T = 1, f⁺ = 1. Noise N in T² f⁺. Starting velocity error 100 T f⁺.
 import sys
 import time
 
+from differentiation_bound import least_worst_error
+
 from jaxbl.gains.certificate import certify
-from jaxbl.gains.differentiation_bound import least_worst_error
 
 SIZES = (0.0, 1.0, 10.0, 100.0)
 GAINS = ((1.5, 1.1), (2.0, 4.0))

@@ -9,7 +9,7 @@ velocity error beside the least one that any causal differentiator can have. For
 sensitivities. For switching ones it is the largest of those that adversaries find, a lower bound of the worst case:
 
 - the search over reachable errors of jaxbl.gains.reachable, over both sides of d and many values of eta.
-- the two pairs of signals behind the bounds of jaxbl.gains.differentiation_bound.
+- the two pairs of signals behind the bounds of benchmarks/differentiation_bound.py.
 
 Units there: T = 1, L = 1.
 """
@@ -20,8 +20,8 @@ from math import factorial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from differentiation_bound import best_samples, least_exact_error, least_worst_error, worst_signal
 
-from jaxbl.gains.differentiation_bound import best_samples, least_exact_error, least_worst_error, worst_signal
 from jaxbl.gains.reachable import build_error_step, explore
 from jaxbl.observer import (
     COEFFICIENTS,

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from differentiation_bound import least_exact_error, least_worst_error
 
-from jaxbl.gains.differentiation_bound import least_exact_error, least_worst_error
 from jaxbl.observer import ImplicitSuperTwisting, Luenberger
 
 

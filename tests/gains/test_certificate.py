@@ -9,6 +9,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from differentiation_bound import least_worst_error
 from small_study import rigid
 
 import jaxbl
@@ -16,7 +17,6 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.gains import certificate
 from jaxbl.gains.certificate import certify
-from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.tune import tune
 from jaxbl.report.certificate import certificate_lines, certificate_tables
 from jaxbl.report.tune import write_tune_report

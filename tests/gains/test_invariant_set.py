@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from differentiation_bound import least_worst_error
 from error_steps import stepped
 
 from jaxbl.errors import NoResult
 from jaxbl.gains.adversary import explore_errors
-from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
 from jaxbl.observer import ExplicitSuperTwisting
 from jaxbl.observer.conditions import convergence_time_worst

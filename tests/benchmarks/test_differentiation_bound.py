@@ -4,9 +4,7 @@ import math
 
 import numpy as np
 import pytest
-
-from jaxbl.errors import InputError
-from jaxbl.gains.differentiation_bound import (
+from differentiation_bound import (
     adaptive_quotient,
     best_samples,
     difference_error,
@@ -14,6 +12,8 @@ from jaxbl.gains.differentiation_bound import (
     least_worst_error,
     worst_signal,
 )
+
+from jaxbl.errors import InputError
 
 CASES = [(1e-5, 8.0, 1e-3), (0.0, 8.0, 1e-3), (1.0, 1.0, 1.0), (3e-4, 2.0, 2e-3), (1e-6, 100.0, 1e-4), (0.2, 1.0, 1.0)]
 
