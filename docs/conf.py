@@ -7,6 +7,7 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
+from nbclient import NotebookClient
 from sphinx.util import logging
 
 HERE = Path(__file__).parent
@@ -29,7 +30,8 @@ include_patterns = [
 ]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
-# tutorials run where their page is read
+# tutorials run where their page is read; what a command prints comes in pieces
+NotebookClient.coalesce_streams = True
 TUTORIALS = {"tutorial": "axis.toml", "log_tutorial": ""}
 """Pages, and the file that their TOML makes."""
 nb_custom_formats = {
@@ -37,7 +39,6 @@ nb_custom_formats = {
     for name, study in TUTORIALS.items()
 }
 nb_output_stderr = "remove"  # progress
-nb_merge_streams = True  # they come in pieces
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True

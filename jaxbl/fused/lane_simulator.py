@@ -280,7 +280,7 @@ class _ThreadLanes:
         self._values_and_carry = np.empty((len(values) + carry_count, values.shape[1]), values.dtype)
         self._values_and_carry[: len(values)] = values
         self._prepared: tuple[Arrays, Arrays, LoopArrays] | None = None
-        self._done: list[tuple[np.ndarray, np.ndarray]] = []
+        self._finished_lanes: list[tuple[np.ndarray, np.ndarray]] = []
         self._results: list[tuple[np.ndarray, Arrays]] = []
 
     def simulate_span(self, inputs: SharedInputs) -> None:
@@ -301,9 +301,11 @@ class _ThreadLanes:
             elif len(flags):
                 self._remove_done_lanes(flags[0][(end - 1) // self._block_length])
         self._prepared = None
-        if inputs.final_inputs is not None and self._done:
+        if inputs.final_inputs is not None and self._finished_lanes:
             # metrics of the lanes that were removed
-            self._lanes, self._values_and_carry = (np.concatenate(parts, axis=-1) for parts in zip(*self._done, strict=True))
+            self._lanes, self._values_and_carry = (
+                np.concatenate(parts, axis=-1) for parts in zip(*self._finished_lanes, strict=True)
+            )
             self._select_lanes(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare_arrays(inputs)
             self._loop(arrays, 0, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
@@ -331,7 +333,7 @@ class _ThreadLanes:
     @property
     def results(self) -> Arrays:
         """Results of all lanes, an array `(metrics, lanes)` for each type of number."""
-        if not self._done:
+        if not self._finished_lanes:
             return self._results[0][1]
         count = sum(len(lanes) for lanes, _ in self._results)
         merged = [np.empty((len(rows), count), rows.dtype) for rows in self._results[0][1]]
@@ -347,7 +349,7 @@ class _ThreadLanes:
         padded = -(-len(remaining) // self._loop.lanes) * self._loop.lanes
         if padded <= _COMPACTION_SHARE * self._values_and_carry.shape[1]:
             done = np.flatnonzero(is_done)
-            self._done.append((self._lanes[done], self._values_and_carry[:, done]))
+            self._finished_lanes.append((self._lanes[done], self._values_and_carry[:, done]))
             self._select_lanes(remaining)
 
     def _select_lanes(self, places: np.ndarray) -> None:

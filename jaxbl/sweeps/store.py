@@ -197,7 +197,7 @@ class Store:
         self.manifest = manifest
         self.damaged: list[str] = []
         self._copy_folder: Path | None = None
-        self._saved, self._save_interval = 0.0, _SAVE_INTERVAL
+        self._saved_at, self._save_interval = 0.0, _SAVE_INTERVAL
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
@@ -284,9 +284,9 @@ class Store:
         self.manifest |= entries
         start = time.monotonic()
         write_atomic(self.folder / "manifest.json", json_with_checksum(self.manifest))
-        self._saved = time.monotonic()
+        self._saved_at = time.monotonic()
         # with very many parts the manifest is long: writing it should take at most 1 % of the time
-        self._save_interval = max(_SAVE_INTERVAL, 100.0 * (self._saved - start))
+        self._save_interval = max(_SAVE_INTERVAL, 100.0 * (self._saved_at - start))
 
     def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
@@ -355,7 +355,7 @@ class Store:
     def add_checksums(self, checksums: dict[int, str]) -> None:
         """Add checksums of written parts, by index, to the manifest; write it from time to time."""
         self.manifest["checksums"] |= {str(index): checksum for index, checksum in checksums.items()}
-        if self.writes_manifest and time.monotonic() - self._saved > self._save_interval:
+        if self.writes_manifest and time.monotonic() - self._saved_at > self._save_interval:
             self.update_manifest()
 
     def list_part_files(self) -> list[Path]:
