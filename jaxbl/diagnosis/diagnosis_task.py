@@ -107,7 +107,7 @@ def _check_machine(record: Record, other: Record) -> None:
     if not np.isclose(record.sample_period, other.sample_period, rtol=1e-2, atol=0.0):
         raise InputError(
             f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
-            f"[log] resample = {record.sample_period:.6g} reads both alike"
+            f"set [log] resample = {record.sample_period:.6g} to read both at the same period"
         )
     gears = record.statistics.gearing, other.statistics.gearing
     if gears[0] is not None and gears[1] is not None and not (gears[0].is_loose or gears[1].is_loose):
