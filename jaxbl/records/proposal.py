@@ -151,8 +151,7 @@ def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses
 def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> dict[str, Any]:
     plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
     if unit in ("A", "V", "%", "mA", "counts"):
-        quantity = "100 %" if unit == "%" else f"one {unit}"
-        guesses.append(f"u.factor: put in the torque of {quantity}; 1 N m for each A or V, or for 100 %, is a placeholder.")
+        guesses.append(f"u.factor: put in the torque of one {unit}; 1 N m for each A or V, or for 100 %, is a placeholder.")
     if unit in plain:
         unit, factor = plain[unit]
         return {"column": column, "unit": unit, "factor": factor}

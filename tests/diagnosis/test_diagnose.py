@@ -307,7 +307,10 @@ def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
         for record in (task.record, task.holdout):
             assert record.sample_period == pytest.approx(0.004)
         output = [
-            note for record in (task.record, task.holdout) for note in record.notes if "every 4 ms, in the log every 2" in note
+            note
+            for record in (task.record, task.holdout)
+            for note in record.notes
+            if "every 4 ms, in the log every 2" in note
         ]
         assert output
 
