@@ -1,13 +1,17 @@
 """Figures in tests: one of each kind is drawn in a process, and its picture stands for the others of that kind."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+with warnings.catch_warnings():
+    # the oldest Matplotlib calls the newest pyparsing by old names
+    warnings.simplefilter("ignore")
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _draw = Figure.savefig
 _pictures: dict[tuple[str, Any], bytes] = {}

@@ -28,6 +28,9 @@ def _name_function(nodeid: str) -> str:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--measure", action="store_true", help=f"write the durations of slow tests to {DURATIONS.name}")
+    parser.addoption(
+        "--longest", type=float, default=float("inf"), help="seconds of the longest test functions that are run"
+    )
     parser.addoption("--long", action="store_true", help="repeat as often as the fixture `repeats` may")
 
 
@@ -37,9 +40,11 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(_Stopwatch())
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests, and put files with much slow work first, each as a whole: workers end together."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Choose and mark tests, and put files with much slow work first, each as a whole: workers end together."""
     durations = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    longest = config.getoption("--longest")
+    items[:] = [item for item in items if durations.get(_name_function(item.nodeid), 0.0) <= longest]
     seconds = Counter()
     for function, duration in durations.items():
         seconds[function.partition("::")[0]] += duration
