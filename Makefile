@@ -17,7 +17,7 @@ test: .venv/installed-dev
 test-fast: .venv/installed-dev
 	$(PYTEST) -m "not slow and not program"
 
-# hundreds of kills, damages and random inputs, a million steps: a quarter of an hour and more
+# hundreds of kills, damages and random inputs, a million steps
 test-long: .venv/installed-dev
 	$(PYTEST) -m long --long
 

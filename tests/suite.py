@@ -12,7 +12,7 @@ import pytest
 
 DURATIONS = Path(__file__).with_name("durations.json")
 SLOW = 1.0
-"""Seconds from which a test function is slow: the others together are the quick suite, 90 s on two cores."""
+"""Seconds from which a test function is slow, over all of its cases: the quick suite leaves it out."""
 
 _PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
@@ -28,9 +28,7 @@ def _name_function(nodeid: str) -> str:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--measure", action="store_true", help=f"write the durations of slow tests to {DURATIONS.name}")
-    parser.addoption(
-        "--longest", type=float, default=float("inf"), help="seconds of the longest test functions that are run"
-    )
+    parser.addoption("--longest", type=float, default=float("inf"), help="leave out test functions that took longer, s")
     parser.addoption("--long", action="store_true", help="repeat as often as the fixture `repeats` may")
 
 

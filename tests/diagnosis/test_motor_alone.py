@@ -41,7 +41,7 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     assert lines[0].startswith("No load position")
     assert any("predicted one sample ahead" in line for line in lines)
     assert json.loads((tmp_path / "diagnosis.json").read_text())["backlash"]["shown"]
-    assert {finding.name for finding in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
+    assert {file.name for file in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
     assert {effect.kind for effect in diagnosis.model.effects} == set(numbers)
 
 
