@@ -1,18 +1,22 @@
 """The suite's own rules: which tests are slow, as measured; which files begin; programs that a test needs; repeats.
 
-`pytest --measure` writes `durations.json`: the seconds of each slow test function, over all of its cases.
+`pytest --measure` writes `durations.json`: the seconds of each slow test function, over all of its cases, and of each slow
+fixture, by its file, or by its name alone where several files use it. Of a function that was measured before, the longer
+time stays: in a part of the suite it may compile what another test does in the whole. Delete the file to begin anew.
 """
 
 import json
 import shutil
+import time
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
 DURATIONS = Path(__file__).with_name("durations.json")
 SLOW = 1.0
-"""Seconds from which a test function is slow, over all of its cases: the quick suite leaves it out."""
+"""Seconds from which a test function, over all of its cases, or a fixture is slow: the quick suite leaves it out."""
 
 _PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
@@ -24,6 +28,17 @@ _PACKAGES = {
 
 def _name_function(nodeid: str) -> str:
     return nodeid.partition("[")[0].rpartition("tests/")[2]
+
+
+def _read_durations() -> dict[str, float]:
+    return json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.exists() else {}
+
+
+def _is_slow(item: pytest.Item, durations: Mapping[str, float]) -> bool:
+    function = _name_function(item.nodeid)
+    file = function.partition("::")[0]
+    fixtures = getattr(item, "fixturenames", ())
+    return any(name in durations for name in (function, *fixtures, *(f"{file}::{fixture}" for fixture in fixtures)))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -40,14 +55,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Choose and mark tests, and put files with much slow work first, each as a whole: workers end together."""
-    durations = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    durations = _read_durations()
     longest = config.getoption("--longest")
     items[:] = [item for item in items if durations.get(_name_function(item.nodeid), 0.0) <= longest]
     seconds = Counter()
     for function, duration in durations.items():
         seconds[function.partition("::")[0]] += duration
     for item in items:
-        if _name_function(item.nodeid) in durations:
+        if _is_slow(item, durations):
             item.add_marker("slow")
         if "repeats" in getattr(item, "fixturenames", ()):
             item.add_marker("long")
@@ -68,15 +83,48 @@ def repeats(request: pytest.FixtureRequest):
     return lambda few, many: many if request.config.getoption("--long") else few
 
 
+_fixtures = Counter()
+"""Seconds of the fixtures that the running test has set up, without those of the fixtures that they use."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef) -> Iterator[None]:
+    started, before = time.perf_counter(), _fixtures.total()
+    try:
+        return (yield)
+    finally:
+        file = _name_function(fixturedef.baseid)
+        name = f"{file}::{fixturedef.argname}" if file.endswith(".py") else fixturedef.argname
+        _fixtures[name] += time.perf_counter() - started - (_fixtures.total() - before)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(call: pytest.CallInfo) -> Iterator[None]:
+    report = yield
+    if call.when == "setup":
+        # workers send what a report holds
+        report.fixtures = dict(_fixtures)
+        _fixtures.clear()
+    return report
+
+
 class _Stopwatch:
-    """Sums up the durations of test functions, and writes those that are slow."""
+    """Sums up the durations of test functions and fixtures, and writes those that are slow."""
 
     def __init__(self) -> None:
         self.seconds = Counter()
+        self.fixtures = Counter()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.seconds[_name_function(report.nodeid)] += report.duration
+        fixtures = getattr(report, "fixtures", {})
+        self.seconds[_name_function(report.nodeid)] += report.duration - sum(fixtures.values())
+        for name, duration in fixtures.items():
+            # each worker makes its own, and so may each case
+            self.fixtures[name] = max(self.fixtures[name], duration)
 
     def pytest_sessionfinish(self) -> None:
-        slow = {function: round(duration, 1) for function, duration in sorted(self.seconds.items()) if duration >= SLOW}
-        DURATIONS.write_text(json.dumps(slow, indent=0) + "\n", encoding="utf-8")
+        measured = {
+            name: round(duration, 1) for name, duration in (self.seconds | self.fixtures).items() if duration >= SLOW
+        }
+        durations = Counter(measured) | Counter(_read_durations())
+        DURATIONS.write_text(json.dumps(dict(sorted(durations.items())), indent=0) + "\n", encoding="utf-8")
