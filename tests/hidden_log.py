@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 from hidden.cases import Log
 from hidden.simulator import Machine, Run, simulate
+
+from jaxbl.records import Record, read_record
 
 DRIVE = {"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}
 FRICTION = {"kind": "motor.coulomb_friction", "torque": 0.06}
@@ -63,6 +66,35 @@ def driven(torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed
 def part(log: Log, rows: Any) -> Log:
     """Some samples of a log of a motor."""
     return replace(log, t=log.t[rows], u=log.u[rows], theta_e=log.theta_e[rows])
+
+
+def simulate_study(study: dict[str, Any], seed: int = 1) -> pd.DataFrame:
+    """Simulate a study's drive under its multisine: readings as in the package's trace, true velocities and torque."""
+    drive, law, settings, excitation = study["drive"], study.get("transmission"), study["run"], study["excitation"]
+    period, harmonics = settings.get("sample_period", 1e-3), np.arange(1, 9)
+    t = period * np.arange(round(settings["duration"] / period))
+    phases = 2.0 * np.pi * excitation["frequency"] * t[:, None] * harmonics - np.pi * harmonics * (harmonics - 1) / 8.0
+    torque = excitation["amplitude"] / np.sqrt(8.0) * np.cos(phases).sum(axis=1)
+    noise = study["encoders"]["noise"]
+    run = Run(
+        Machine(drive, law, study.get("effects", ())), period, torque,
+        motor_noise=noise, load_noise=noise / drive.get("gear_ratio", 1.0), seed=seed,
+    )  # fmt: skip
+    (trace,) = simulate([run])
+    columns = {"t": trace.t, "u": trace.u, "theta_e": trace.theta_e, "motor.velocity": trace.states[1]}
+    if law is not None:
+        half_gap = law.get("half_gap", 0.0)
+        twist = trace.states[0] - drive["gear_ratio"] * trace.states[2]
+        torque = law["stiffness"] * (twist - np.clip(twist, -half_gap, half_gap))
+        columns |= {"theta_s": trace.theta_s, "load.velocity": trace.states[3], "torque": torque}
+    return pd.DataFrame(columns)
+
+
+def record_study(study: dict[str, Any], folder: Path) -> Record:
+    """Simulate a study's drive, and read the log of it."""
+    file, trace = folder / "log.csv", simulate_study(study)
+    trace[[name for name in ("t", "u", "theta_e", "theta_s") if name in trace]].to_csv(file, index=False)
+    return read_record(file)
 
 
 @cache

@@ -8,11 +8,9 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import read_config
-from jaxbl.records import Record, read_record
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
-from jaxbl.sweeps.trial import run
 
 ALPHA, LAMBDA, NOISE = "observer.motor.alpha", "observer.motor.lambda", "encoders.noise"
 
@@ -69,13 +67,6 @@ def swung(duration: float, **tables: Any) -> dict[str, Any]:
     excitation = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.7}
     changes = {"run.duration": duration, "run.substeps": 5}
     return small(changes, **{"excitation": excitation, "observer": observer} | tables)
-
-
-def recorded(data: dict[str, Any], folder: Path) -> Record:
-    """The log of a study's run."""
-    file = folder / "log.csv"
-    run(data, seed=1).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
-    return read_record(file)
 
 
 def rigid(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_study import recorded, swung
+from hidden_log import record_study
+from small_study import swung
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.free_starts import best_runs
@@ -25,17 +26,17 @@ STUDY = swung(
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    record = recorded(STUDY, tmp_path_factory.mktemp("log"))
+    record = record_study(STUDY, tmp_path_factory.mktemp("log"))
     model = as_arrays(prepare(read_config(STUDY)), float)
     return with_torques(set_leaves(model, {"drive.load_inertia": model.drive.load_inertia * 1.1})), record
 
 
-@pytest.mark.parametrize("rest", [False, True])
-def test_runs_are_those_of_the_fit(log, rest):
+@pytest.mark.parametrize("from_rest", [False, True])
+def test_runs_are_those_of_the_fit(log, from_rest):
     (model, _), record = log
-    windows, _ = windows_of(segments_of(record, model.sides), model, 250, rest)
-    actual = best_runs(model, windows, 8, rest)
-    expected, start = jit(projected_residual)(model, windows, 8, rest)
+    windows, _ = windows_of(segments_of(record, model.sides), model, 250, from_rest)
+    actual = best_runs(model, windows, 8, from_rest)
+    expected, start = jit(projected_residual)(model, windows, 8, from_rest)
     assert actual.residual.shape == (8, 250, 2)
     assert np.sqrt(np.mean(np.square(expected))) > 1.5
     assert actual.residual == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
@@ -44,7 +45,7 @@ def test_runs_are_those_of_the_fit(log, rest):
 
 
 def test_torques_may_be_added_sample_by_sample(log):
-    """Where all of the input goes over the motor's added torque, without a dead time, nothing changes."""
+    """Nothing changes where all of the input goes over the motor's added torque, without a dead time."""
     (model, paths), record = log
     model = set_leaves(model, {"effects.actuator.delay.delay": jnp.asarray(1e-30)})
     windows, _ = windows_of(segments_of(record, model.sides), model, 250)
@@ -54,13 +55,13 @@ def test_torques_may_be_added_sample_by_sample(log):
     assert actual.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize("rest", [False, True])
-def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(log, rest):
+@pytest.mark.parametrize("from_rest", [False, True])
+def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(log, from_rest):
     (model, _), record = log
     swinging = make_effect("load.flexibility", inertia=0.5, frequency=3.0)
     model = with_effects(model, (*model.effects, as_arrays(swinging, float)))
-    windows, _ = windows_of(segments_of(record, model.sides, rest), model, 250, rest)
-    result = best_runs(model, windows, 4, rest)
-    for have, start in zip(result.states.effects[-1], windows.start.effects[-1], strict=True):
+    windows, _ = windows_of(segments_of(record, model.sides, from_rest), model, 250, from_rest)
+    runs = best_runs(model, windows, 4, from_rest)
+    for have, start in zip(runs.states.effects[-1], windows.start.effects[-1], strict=True):
         moved = np.asarray(have)[:, 0] != np.asarray(start)
-        assert not moved[1:].any() and moved[0] == (not rest)
+        assert not moved[1:].any() and moved[0] == (not from_rest)

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from hidden_log import simulate_study
 from scipy.signal import lfilter
 from small_study import rigid, small
 from trace_segment import segment_of
@@ -14,7 +15,6 @@ from jaxbl.diagnosis.coordinates import CoordinateValues, all_coordinates, coord
 from jaxbl.diagnosis.localise import SIGNIFICANT, localise, locate
 from jaxbl.diagnosis.residuals import Residual, residual_torques
 from jaxbl.diagnosis.sentences import sentence_of
-from jaxbl.sweeps.trial import run
 
 PERIOD, COUNT = 5e-3, 4000
 TIME = PERIOD * np.arange(COUNT)
@@ -28,9 +28,9 @@ POLE = 0.9
 def coordinates(**more):
     crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
     near = np.zeros(COUNT, int)
-    for index in crossing:
-        near[max(index - 12, 0) : index + 12] = 1 if VELOCITY[index + 1] > 0.0 else 2
-    result = {
+    for row in crossing:
+        near[max(row - 12, 0) : row + 12] = 1 if VELOCITY[row + 1] > 0.0 else 2
+    values = {
         "all": CoordinateValues(np.zeros(COUNT, int), classes=("everywhere",)),
         "direction": CoordinateValues((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
         "reversals": CoordinateValues(
@@ -42,7 +42,7 @@ def coordinates(**more):
         "position": CoordinateValues(POSITION, "rad", symbol="θe"),
         "time": CoordinateValues(TIME, "s", symbol="t"),
     }
-    return result | more
+    return values | more
 
 
 def noise(seed, pole=0.0):
@@ -61,33 +61,33 @@ def locate_torque(torque, seed=0, pole=0.0, **more):
 
 
 @pytest.mark.parametrize("pole", [0.0, POLE], ids=["white", "correlated"])
-def test_noise_is_found_nowhere(pole):
-    """One false region in all of sixty logs would be chance; z-scores have the spread that they claim."""
-    false, z, excess, explained = 0, [], [], []
-    for seed in range(60):
-        one = locate_torque(np.zeros(COUNT), seed, pole)
-        false += one.significant
+def test_noise_is_found_nowhere(pole, repeats):
+    """A false region in sixty logs would be chance; z-scores have the spread that they claim."""
+    count, false, z, excess, explained = repeats(15, 60), 0, [], [], []
+    for seed in range(count):
+        location = locate_torque(np.zeros(COUNT), seed, pole)
+        false += location.significant
         for name in ("speed", "position", "time"):
-            z += [region.mean_z for region in one.coordinates[name].regions]
-            excess += [region.excess_z for region in one.coordinates[name].regions]
-        explained += [coordinate.explained for coordinate in one.coordinates.values()]
-        assert one.significant or sentence_of(one).startswith("motor side: nothing beyond noise")
-    assert false <= 1
+            z += [region.mean_z for region in location.coordinates[name].regions]
+            excess += [region.excess_z for region in location.coordinates[name].regions]
+        explained += [coordinate.explained for coordinate in location.coordinates.values()]
+        assert location.significant or sentence_of(location).startswith("motor side: nothing beyond noise")
+    assert false <= count // 60
     assert 0.75 < np.std(z) < 1.1
     assert 0.7 < np.std(excess) < 1.15 and abs(np.mean(excess)) < 0.2
     assert max(explained) == 0.0
 
 
-def test_a_slow_disturbance_is_no_function_of_the_motion():
+def test_a_slow_disturbance_is_no_function_of_the_motion(repeats):
     """Noise that the stated level does not know of, over half a second: power is missing, but at no place of the motion."""
-    false = 0
-    for seed in range(20):
-        one = locate_torque(0.2 * noise(100 + seed, 0.99), seed)
-        assert one.significant and one.excess_z > SIGNIFICANT
+    count, false = repeats(6, 20), 0
+    for seed in range(count):
+        location = locate_torque(0.2 * noise(100 + seed, 0.99), seed)
+        assert location.significant and location.excess_z > SIGNIFICANT
         for name in ("direction", "reversals", "|speed|", "speed", "turn"):
-            assert one.coordinates[name].explained < 0.25
-            false += any(abs(region.mean_z) > SIGNIFICANT for region in one.coordinates[name].regions)
-    assert false <= 1
+            assert location.coordinates[name].explained < 0.25
+            false += any(abs(region.mean_z) > SIGNIFICANT for region in location.coordinates[name].regions)
+    assert false <= count // 20
 
 
 CASES = {
@@ -103,20 +103,20 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_each_coordinate_is_found_for_what_lives_there(case):
     name, torque, words = CASES[case]
-    one = locate_torque(torque)
-    assert one.significant
-    assert one.coordinates[name].explained > 0.9
-    assert words in sentence_of(one)
-    assert one.missing == pytest.approx(np.sqrt(np.mean(torque**2)), rel=0.1)
-    assert sum(region.power_share for region in one.coordinates[name].regions) == pytest.approx(1.0, abs=0.05)
+    location = locate_torque(torque)
+    assert location.significant
+    assert location.coordinates[name].explained > 0.9
+    assert words in sentence_of(location)
+    assert location.missing == pytest.approx(np.sqrt(np.mean(torque**2)), rel=0.1)
+    assert sum(region.power_share for region in location.coordinates[name].regions) == pytest.approx(1.0, abs=0.05)
 
 
 def test_reversals_low_speed_places_and_times_are_told():
     slow = np.where(np.abs(VELOCITY) < 1.0, -0.6 * np.sign(VELOCITY), 0.0)
-    one = locate_torque(slow)
-    near = [region for region in one.coordinates["reversals"].regions if region.label.startswith("reversals")]
+    location = locate_torque(slow)
+    near = [region for region in location.coordinates["reversals"].regions if region.label.startswith("reversals")]
     assert sum(region.power_share for region in near) > 0.6 and sum(region.time_share for region in near) < 0.3
-    sentence = sentence_of(one)
+    sentence = sentence_of(location)
     assert sentence.startswith("motor side, at ") and "of the residual power lies" in sentence
     dent = np.where(np.abs(POSITION - 2.0) < 0.3, 0.8, 0.0)
     assert "< θe <" in sentence_of(locate_torque(dent))
@@ -127,25 +127,25 @@ def test_reversals_low_speed_places_and_times_are_told():
 def test_the_gap_is_told():
     inside = (np.abs(np.sin(3.0 * TIME)) < 0.2).astype(int)
     gap = CoordinateValues(inside, classes=("outside", "inside of the gap"))
-    one = locate_torque(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
-    assert "inside of the gap" in sentence_of(one)
+    location = locate_torque(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
+    assert "inside of the gap" in sentence_of(location)
 
 
 def test_a_disturbance_of_its_own_frequency_is_a_narrow_peak():
-    one = locate_torque(0.2 * np.sin(2.0 * np.pi * 7.3 * TIME))
-    peak = one.peaks[0]
+    location = locate_torque(0.2 * np.sin(2.0 * np.pi * 7.3 * TIME))
+    peak = location.peaks[0]
     assert peak.frequency == pytest.approx(7.3, abs=0.05)
     assert peak.amplitude == pytest.approx(0.2, rel=0.1)
-    assert not peak.in_motion and "7.3 Hz" in sentence_of(one)
+    assert not peak.in_motion and "7.3 Hz" in sentence_of(location)
     # friction has peaks, too, but where the motion has them
     friction = locate_torque(-0.3 * np.sign(VELOCITY))
     assert friction.peaks[0].in_motion and "Hz" not in sentence_of(friction)
 
 
 def test_weak_torques_are_found_below_the_noise_of_a_sample():
-    one = locate_torque(-0.03 * np.sign(VELOCITY))
-    assert one.significant and one.coordinates["direction"].explained > 0.7
-    backward, forward = one.coordinates["direction"].regions
+    location = locate_torque(-0.03 * np.sign(VELOCITY))
+    assert location.significant and location.coordinates["direction"].explained > 0.7
+    backward, forward = location.coordinates["direction"].regions
     assert backward.mean == pytest.approx(0.03, abs=4.0 * backward.mean_error)
     assert forward.mean == pytest.approx(-0.03, abs=4.0 * forward.mean_error)
     # a torque below the floor is not spoken of
@@ -161,12 +161,12 @@ def test_parts_of_a_record_are_counted_together():
         dataclasses.replace(full_residual, time=TIME[r], torque=torque[r], deviation=full_residual.deviation[r])
         for r in rows
     ]  # fmt: skip
-    each = [
-        {name: coordinate._replace(values=coordinate.values[r]) for name, coordinate in coordinates().items()} for r in rows
+    part_coordinates = [
+        {name: location._replace(values=location.values[r]) for name, location in coordinates().items()} for r in rows
     ]
-    coordinate = locate(parts, each)
-    assert coordinate.coordinates["direction"].explained > 0.85
-    assert sum(region.time_share for region in coordinate.coordinates["speed"].regions) == pytest.approx(1.0)
+    location = locate(parts, part_coordinates)
+    assert location.coordinates["direction"].explained > 0.85
+    assert sum(region.time_share for region in location.coordinates["speed"].regions) == pytest.approx(1.0)
 
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
@@ -179,7 +179,7 @@ GEARED = {
 
 
 def residuals_of(true, model):
-    segment = segment_of(run(true).trace)
+    segment = segment_of(simulate_study(true))
     experiment = prepare(read_config(model))
     return experiment, residual_torques(experiment, [segment]), segment
 

