@@ -480,7 +480,7 @@ def places(data, prefix=()):
             yield from places(value, (*prefix, key))
 
 
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(
         st.tuples(st.sampled_from(list(places(COMPLETE))), JUNK, st.none() | st.text(max_size=3)), min_size=1, max_size=3

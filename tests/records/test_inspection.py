@@ -128,7 +128,7 @@ def odd_signal(random, count):
     ]) * random.choice([1.0, 1e-9, 1e9])  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.integers(0, 2**20),
     st.sampled_from([64, 65, 100, 300]),

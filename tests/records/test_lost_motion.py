@@ -36,11 +36,12 @@ def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
     ("gap", "quality"),
     [(0.1, {"noise": 1e-2}), (0.5, {"noise": 1e-3, "skew": 1.3e-3}), (0.05, {"noise": 1e-3, "resolution": 5e-3})],
 )
-def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality):
-    fits = [fit_frame(simulate_log(gap=gap, seed=seed, **quality)) for seed in range(50)]
+def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality, repeats):
+    count = repeats(16, 50)
+    fits = [fit_frame(simulate_log(gap=gap, seed=seed, **quality)) for seed in range(count)]
     assert all(f.flank == "motion" and f.flank_changes >= 2 for f in fits)
     covered = sum(f.lost_motion_interval[0] <= gap <= f.lost_motion_interval[1] for f in fits)
-    assert covered >= 45
+    assert covered >= 0.9 * count
     # not by being wide
     spread = np.std([f.lost_motion for f in fits])
     assert np.mean([f.lost_motion_error for f in fits]) < 1.6 * spread + 2e-4 * gap
@@ -48,11 +49,12 @@ def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality):
 
 
 @pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"around": True}])
-def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
-    fits = [fit_frame(load_driven(seed, **options), 1.0) for seed in range(30)]
+def test_intervals_by_the_side_of_the_load_cover_the_gap(options, repeats):
+    count = repeats(10, 30)
+    fits = [fit_frame(load_driven(seed, **options), 1.0) for seed in range(count)]
     assert all(f.flank == "load" and f.flank_changes == len(options.get("changes", (61.0,))) for f in fits)
     covered = sum(f.lost_motion_interval[0] <= 0.02 <= f.lost_motion_interval[1] for f in fits)
-    assert covered >= 27
+    assert covered >= 0.9 * count
     spread = np.std([f.lost_motion for f in fits])
     assert np.mean([f.lost_motion_error for f in fits]) < 2.0 * spread
     times = np.array([f.flank_times for f in fits])
@@ -60,8 +62,8 @@ def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
 
 
 @pytest.mark.parametrize("around", [False, True])
-def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around):
-    for seed in range(10):
+def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around, repeats):
+    for seed in range(repeats(4, 10)):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
             fit = fit_frame(load_driven(seed, around=around, **options), 1.0)
             assert fit.flank == "motion", (seed, options)
