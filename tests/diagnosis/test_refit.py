@@ -17,7 +17,7 @@ from jaxbl.identification.free_parameters import make_free_parameters, set_free_
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import segments_of
-from jaxbl.simulate import plant_trajectory
+from jaxbl.simulate import plant_trajectory, with_effects
 
 NAME = "motor.coulomb_friction"
 
@@ -37,18 +37,20 @@ def setting(tmp_path_factory):
 
 
 def test_prediction_errors_are_least(setting):
-    """Of the same predictor, by a search without derivatives that begins elsewhere."""
+    """A search without derivatives that begins elsewhere finds none smaller of the same predictor."""
     experiment, free, width, segments = setting
     (segment,) = segments
+    # without the effects that do nothing
+    plain = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.name == NAME))
     result = refined(experiment, free, np.zeros(len(free)), width, segments)
     gain = {"motor": Linear.gain_of(result.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
     def predicted(inputs):
-        one = set_free_parameters(experiment, free, inputs[2:] * 0.01)
-        start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(one, torque[0]))
-        return plant_trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
+        candidate = set_free_parameters(plain, free, inputs[2:] * 0.01)
+        start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(candidate, torque[0]))
+        return plant_trajectory(candidate, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(inputs):
         errors = np.asarray(reading - predicted(jnp.asarray(inputs)))
@@ -84,7 +86,7 @@ def test_deviations_are_those_of_repetitions(tmp_path):
 
 
 def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
-    """Without a word: what is not finite has no likelihood."""
+    """Errors that are not finite have no likelihood, and nothing is said of them."""
     experiment, free, width, segments = setting
     wild = with_numbers(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
     refiner = _Refiner(wild, free, width, segments)
