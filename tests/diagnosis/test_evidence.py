@@ -32,15 +32,15 @@ def draw_regression(size=1.0):
     return design, design @ [0.3, -0.2, 0.5] + random.standard_normal(40)
 
 
-@pytest.mark.parametrize("which", [None, 0])
-def test_evidence_is_that_of_a_gaussian(which):
+@pytest.mark.parametrize("candidate", [None, 0])
+def test_evidence_is_that_of_a_gaussian(candidate):
     design, errors = draw_regression()
     scale, centre = np.array([0.4, 0.2, 0.7]), np.array([0.1, 0.0, -0.1])
-    count = 2 if which is None else 3
+    count = 2 if candidate is None else 3
     used = design[:, :count]
     covariance = np.eye(40) + used @ np.diag(scale[:count] ** 2) @ used.T
     exact = multivariate_normal(-used @ centre[:count], covariance).logpdf(errors)
-    result = evidence_of(columns(design, errors, scale, centre), [Candidate()], which)
+    result = evidence_of(columns(design, errors, scale, centre), [Candidate()], candidate)
     assert result.log_evidence + -0.5 * 40 * np.log(2.0 * np.pi) == pytest.approx(exact, rel=1e-9)
 
 
@@ -72,16 +72,17 @@ def test_a_number_is_held_at_its_bound():
     design, errors = draw_regression()
     scale, centre = np.array([0.05, 0.5, 0.7]), np.array([0.01, 0.0, 0.0])
     inputs = columns(design, errors, scale, centre)
-    free, held = (
-        evidence_of(dataclasses.replace(inputs, bound=np.array([one, np.inf])), [Candidate()], 0) for one in (np.inf, 0.3)
+    free, bounded = (
+        evidence_of(dataclasses.replace(inputs, bound=np.array([bound, np.inf])), [Candidate()], 0)
+        for bound in (np.inf, 0.3)
     )
     assert abs(free.own[0] - centre[0]) > 0.3 * scale[0]
     stacked, towards = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
     reach = np.array([0.3 * scale[0], np.inf, np.inf])
     expected = lsq_linear(stacked, towards, (centre - reach, centre + reach), tol=1e-12).x
-    np.testing.assert_allclose([*held.own, held.numbers["value"]], expected, atol=1e-6)
-    assert held.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
-    assert held.misfit > free.misfit
+    np.testing.assert_allclose([*bounded.own, bounded.numbers["value"]], expected, atol=1e-6)
+    assert bounded.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
+    assert bounded.misfit > free.misfit
     total = np.asarray(inputs.products)
     solution = _least_squares(total, scale**-2.0, centre, reach)
     np.testing.assert_allclose(solution, expected, atol=1e-9)

@@ -23,16 +23,16 @@ def errors_of(folder, log, effects, noise=None):
     with jax.enable_x64(True):
         setup = set_up(task)
         fitted = fit_model(new_search(setup), effects, np.zeros(len(setup.own)))
-        held = setup.holdout
+        holdout = setup.holdout
         if noise is not None:
-            wrong = [
-                {side: each._replace(noise=noise) for side, each in segment.smoothed.items()} for segment in held.segments
-            ]
-            segments = [dataclasses.replace(segment, smoothed=by) for segment, by in zip(held.segments, wrong, strict=True)]
-            held = dataclasses.replace(held, segments=segments)
-        after = held.compare(fitted.experiment)
-        expected = expected_errors(held, fitted, after, setup.input_noise, 0.5)
-        return held.with_slow(after), expected
+            segments = []
+            for segment in holdout.segments:
+                motions = {side: motion._replace(noise=noise) for side, motion in segment.smoothed.items()}
+                segments.append(dataclasses.replace(segment, smoothed=motions))
+            holdout = dataclasses.replace(holdout, segments=segments)
+        after = holdout.compare(fitted.experiment)
+        expected = expected_errors(holdout, fitted, after, setup.input_noise, 0.5)
+        return holdout.with_slow(after), expected
 
 
 @pytest.mark.parametrize("torque_noise", [0.0, 0.02])
@@ -73,12 +73,12 @@ def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
     errors, expected = errors_of(
         tmp_path, dataclasses.replace(log, u=log.u - slow), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     )
-    left = failed(errors, expected)
-    assert "torque_motor" not in left and any(name.startswith("torque_motor below ") for name in left)
+    failures = failed(errors, expected)
+    assert "torque_motor" not in failures and any(name.startswith("torque_motor below ") for name in failures)
 
 
 def test_noise_that_a_smoother_takes_for_motion_is_seen_in_the_errors(tmp_path):
-    """Of a rough motion it finds too little noise; the errors of the model have no motion in them."""
+    """A smoother finds too little noise of a rough motion; the errors of the model have no motion in them."""
     friction = {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     _, expected = errors_of(tmp_path, logged(noise=1e-4), friction, noise=2e-5)
     assert expected["theta_e"].noise == pytest.approx(1e-4, rel=0.15)

@@ -72,7 +72,7 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
 
 @pytest.mark.parametrize("felt", [False, True])
 def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
-    """What the model lacks is a hundred times larger; the error is known where the noise alone is there."""
+    """The torque that the model lacks is a hundred times larger; the error is known where the noise alone is there."""
     rng = np.random.default_rng(6)
     lacking = 1e-2 * np.stack(
         [np.sin(2.0 * np.pi * TIME), np.cos(4.0 * np.pi * TIME)], axis=1

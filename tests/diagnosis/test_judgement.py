@@ -84,16 +84,16 @@ def test_a_verdict_that_held_out_data_support_stays():
     ],
     ids=["errors", "numbers", "shuffled", "search", "before", "share", "logs"],
 )
-def test_one_reason_is_enough_against_it(given, reason):
-    judgement = judge(**given)
+def test_one_reason_is_enough_against_it(changes, reason):
+    judgement = judge(**changes)
     assert judgement.found.verdict == "unknown_effect" and judgement.found.findings == make_search_result().findings
     none = {key: value for key, value in PASSED.items() if key != "level"}
     assert {key: getattr(judgement, key) for key in none} == none | reason
 
 
 def test_a_finding_is_no_surer_than_what_held_out_data_say_for_it():
-    (one,) = judge(z=0.5).found.findings
-    assert one.confidence == pytest.approx(stats.norm.cdf(0.5))
+    (finding,) = judge(z=0.5).found.findings
+    assert finding.confidence == pytest.approx(stats.norm.cdf(0.5))
 
 
 @pytest.mark.parametrize(("error", "sure"), [(0.02, True), (0.2, False)])
@@ -108,40 +108,40 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, 
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
     inputs = dataclasses.replace(make_search_result(), findings=(finding,), wrong=None)
-    (output,) = judged(inputs, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
-    assert output == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
+    (judged_finding,) = judged(inputs, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
+    assert judged_finding == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
 def judge_shared(z, **gains):
-    (one,) = judge(
+    (finding,) = judge(
         controls=[Control("wrong", NOISE, z, gains.get("rival", "motor.viscous_friction"))], **gains
     ).found.findings
-    return one.confidence, dict(one.alternatives)
+    return finding.confidence, dict(finding.alternatives)
 
 
 def test_what_the_fit_says_counts_only_if_held_out_data_agree():
     assert judge_shared(2.0)[0] == pytest.approx(0.98)
-    confidence, others = judge_shared(0.0)
-    assert confidence == pytest.approx(others["motor.viscous_friction"]) == pytest.approx(0.5, abs=0.01)
-    assert confidence + sum(others.values()) == pytest.approx(1.0)
+    confidence, alternatives = judge_shared(0.0)
+    assert confidence == pytest.approx(alternatives["motor.viscous_friction"]) == pytest.approx(0.5, abs=0.01)
+    assert confidence + sum(alternatives.values()) == pytest.approx(1.0)
     assert judge_shared(-3.0)[0] == pytest.approx(1.0 / (1.0 + np.exp(4.5)), abs=2e-3)
 
 
 def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     control = [Control("wrong", NOISE, -3.0, "motor.viscous_friction")]
-    output = make_search_result()
-    assert exchanged(output, []) is None and exchanged(output, [control[0]._replace(z=3.0)]) is None
-    other = exchanged(output, control)
-    assert other is not None and (other.model, other.wrong) == (output.wrong, output.model)
-    (one,) = other.findings
-    assert one.effect == "motor.viscous_friction" and one.numbers == {"torque": 0.2}
-    assert one.confidence == pytest.approx(0.98 / (1.0 + np.exp(-4.5)), rel=1e-3)
-    assert one.alternatives == ((NAME, pytest.approx(0.98 - one.confidence)), ("motor.inertia", 0.02))
+    explanation = make_search_result()
+    assert exchanged(explanation, []) is None and exchanged(explanation, [control[0]._replace(z=3.0)]) is None
+    exchange = exchanged(explanation, control)
+    assert exchange is not None and (exchange.model, exchange.wrong) == (explanation.wrong, explanation.model)
+    (finding,) = exchange.findings
+    assert finding.effect == "motor.viscous_friction" and finding.numbers == {"torque": 0.2}
+    assert finding.confidence == pytest.approx(0.98 / (1.0 + np.exp(-4.5)), rel=1e-3)
+    assert finding.alternatives == ((NAME, pytest.approx(0.98 - finding.confidence)), ("motor.inertia", 0.02))
     # what the log alone said for the other one is no argument any more
     fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
     back = [Control("wrong", NOISE, 1.8, NAME)]
-    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
-    assert after.found.findings == (one,)
+    after = judged(exchange, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
+    assert after.found.findings == (finding,)
     assert (
         exchanged(
             make_search_result(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]
@@ -164,13 +164,13 @@ def test_what_a_log_leaves_open_held_out_data_decide():
     tie = Finding(NAME, 0.51, {"torque": 0.1}, (("motor.viscous_friction", 0.49),))
     fitted = SimpleNamespace(names=(NAME,), theta=np.zeros(1), free=[], errors=dict, experiment=None)
 
-    def said(z):
+    def judge_tie(z):
         inputs = dataclasses.replace(make_search_result(fit_gain=0.0), findings=(tie,))
         controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
         return judged(inputs, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
 
-    assert said(5.0).confidence > 0.99 and said(5.0).alternatives == ()
-    assert said(1.0) == tie
+    assert judge_tie(5.0).confidence > 0.99 and judge_tie(5.0).alternatives == ()
+    assert judge_tie(1.0) == tie
 
 
 def test_what_the_prior_says_stands():
@@ -188,7 +188,8 @@ def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete
 
     def share(before, after):
         pair = (
-            {f"torque_{side}": value for side, value in zip(experiment.sides, one, strict=True)} for one in (before, after)
+            {f"torque_{side}": value for side, value in zip(experiment.sides, torques, strict=True)}
+            for torques in (before, after)
         )
         return explained_share(experiment, *pair, limits)  # type: ignore[arg-type]
 
@@ -200,6 +201,6 @@ def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete
 
 
 def test_no_effect_is_surer_than_that_its_torque_is_not_zero():
-    (one,) = judge(error=0.1).found.findings
+    (finding,) = judge(error=0.1).found.findings
     # one standard error
-    assert one.confidence == pytest.approx(0.683, abs=0.001)
+    assert finding.confidence == pytest.approx(0.683, abs=0.001)

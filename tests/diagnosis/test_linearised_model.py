@@ -6,7 +6,9 @@ import functools
 import equinox as eqx
 import numpy as np
 import pytest
+from hidden_log import simulate_study
 from small_study import rigid, small
+from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
@@ -16,10 +18,7 @@ from jaxbl.diagnosis.whittle import spectrum_of, weighted_products
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.segments import segments_of
 from jaxbl.identification.smoother import Smoothed
-from jaxbl.records import read_record
-from jaxbl.sweeps.trial import run
 
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
 SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
@@ -28,38 +27,40 @@ PATHS = {1: ["drive.motor_inertia", "drive.motor_viscous"], 2: ["drive.load_iner
 
 @functools.cache
 def setting(sides):
+    """Return an experiment, and the segment of a log of it."""
     settings = {"run.duration": 2.0, "run.substeps": 5}
     excitation = {"kind": "multisine", "amplitude": 5.0 if sides == 2 else 1.0, "frequency": 0.7}
     if sides == 2:
         data = small(settings, excitation=excitation, transmission=SHAFT, observer=OBSERVER)
     else:
         data = rigid(settings, excitation=excitation, observer={"motor": OBSERVER["motor"]})
-    experiment = prepare(read_config(data))
-    return experiment, run(data, seed=1).trace
+    return prepare(read_config(data)), segment_of(simulate_study(data, seed=8))
 
 
-def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
-    """The model along a log, and `idle` times along the same without an input."""
-    experiment, trace = setting(sides)
-    log = tmp_path / "log.csv"
-    trace[["t", "u", "theta_e", *(["theta_s"] if sides == 2 else [])]].to_csv(log, index=False)
-    record = read_record(log)
+def linear(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
+    """Linearise the model along a log, and `idle` times along the same without an input."""
+    experiment, segment = setting(sides)
     free = make_free_parameters(experiment, PATHS[sides], 1.0)
-    (segment,) = segments_of(record, experiment.sides)
     rng, smoothed = np.random.default_rng(3), {}
-    for side, one in segment.smoothed.items():
-        wave = disturbed * np.cumsum(rng.standard_normal((len(record.time), 3)), axis=0)
-        smoothed[side] = one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))
+    for side, motion in segment.smoothed.items():
+        wave = disturbed * np.cumsum(rng.standard_normal((len(segment), 3)), axis=0)
+        smoothed[side] = motion._replace(state=motion.state + wave * np.array([1e-7, 1e-6, 1e-5]))
     segment = dataclasses.replace(segment, smoothed=smoothed)
     point = np.full(len(free), theta)
     segments = [segment, *([dataclasses.replace(segment, torque=np.zeros(len(segment)))] * idle)]
     return Linear(change(experiment), free, point, np.full(len(free), 0.02), segments)
 
 
+@pytest.fixture(scope="module")
+def geared():
+    """The model of two sides at its nominal numbers, for tests that change nothing of it."""
+    return linear(2)
+
+
 def errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
-    result = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
-    flat = result.reshape(-1, result.shape[2])
+    predicted = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
+    flat = predicted.reshape(-1, predicted.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     remainder = flat[:, : -model.states]
     return remainder - basis @ (basis.T @ remainder)
@@ -70,16 +71,16 @@ def size(values):
 
 
 @pytest.mark.parametrize("sides", [1, 2])
-def test_errors_of_the_smoothed_motion_cancel(tmp_path, sides):
-    plain, disturbed = (errors(linear(tmp_path, sides, disturbed=x))[:, 0] for x in (0.0, 1.0))
+def test_errors_of_the_smoothed_motion_cancel(sides):
+    plain, disturbed = (errors(linear(sides, disturbed=x))[:, 0] for x in (0.0, 1.0))
     assert size(disturbed - plain) < 1e-3 * size(plain)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
-def test_own_columns_are_derivatives(tmp_path, sides):
+def test_own_columns_are_derivatives(sides):
     step = 1e-4
-    above, below = (errors(linear(tmp_path, sides, theta=x))[:, 0] for x in (step, -step))
-    columns = errors(linear(tmp_path, sides))[:, 1 : 1 + len(PATHS[sides])]
+    above, below = (errors(linear(sides, theta=x))[:, 0] for x in (step, -step))
+    columns = errors(linear(sides))[:, 1 : 1 + len(PATHS[sides])]
     expected = (above - below) / (2.0 * step)
     assert size(columns.sum(axis=1) - expected) < 1e-3 * size(expected)
 
@@ -103,39 +104,37 @@ SMALL = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
+def test_a_candidates_torque_does_what_the_effect_does(geared, name):
     """The effect in the simulated step, against its torque along the measured motion through the linear recursion."""
     effect = as_arrays(make_effect(name, **SMALL[name]), float)
 
     def with_effect(experiment):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
-    base = linear(tmp_path, 2)
-    columns = errors(base, Forces(base.signals[0].of([effect])))
-    expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
+    columns = errors(geared, Forces(geared.signals[0].of([effect])))
+    expected = errors(linear(2, with_effect))[:, 0] - columns[:, 0]
     actual = columns[:, -1]
     assert size(expected) > 0.0
     assert size(actual - expected) < 0.03 * size(expected)
 
 
-def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
-    base = linear(tmp_path, 2)
-    (signals,), lag = base.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
-    steps, torque = base.period / 0.01, signals.torque[: signals.samples]
+def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared):
+    (signals,), lag = geared.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
+    steps, torque = geared.period / 0.01, signals.torque[: signals.samples]
     settled, rested = (signals.of([lag], from_rest)[0][-1] for from_rest in (False, True))
     assert torque[0] != 0.0 and settled[0] == pytest.approx(0.0, abs=1e-12)
     # what the state at the first sample leaves until later
-    left = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
-    np.testing.assert_allclose(settled - rested, left, atol=1e-12)
-    variants = variants_of(base.experiment, ["actuator.lag", "actuator.saturation"], base.scales)
-    assert sorted({(one.name, one.from_rest) for one in variants}) == [
+    decay = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
+    np.testing.assert_allclose(settled - rested, decay, atol=1e-12)
+    variants = variants_of(geared.experiment, ["actuator.lag", "actuator.saturation"], geared.scales)
+    assert sorted({(variant.name, variant.from_rest) for variant in variants}) == [
         ("actuator.lag", False), ("actuator.lag", True), ("actuator.saturation", False)
     ]  # fmt: skip
 
 
-def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
+def test_numbers_of_waves_are_those_of_the_effect(geared):
     """A wave's two columns make up the effect that its numbers describe."""
-    base = linear(tmp_path, 2)
+    signals = geared.signals[0]
     values = (0.3e-3, -0.4e-3)
     waves = (
         "load.gravity",
@@ -144,74 +143,74 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
         "motor.torque_ripple",
         "transmission.eccentricity",
     )
-    calls = set()
-    for one in variants_of(base.experiment, waves, lambda name: LOG):
-        if one.name in waves:
-            (columns,) = columns_of([one], base.signals[0])
-            effect = as_arrays(make_effect(one.name, **one.numbers(values)), float)
-            (expected,) = base.signals[0].of([effect])
+    names = set()
+    for variant in variants_of(geared.experiment, waves, lambda name: LOG):
+        if variant.name in waves:
+            (columns,) = columns_of([variant], signals)
+            effect = as_arrays(make_effect(variant.name, **variant.numbers(values)), float)
+            (expected,) = signals.of([effect])
             assert columns.keys() == expected.keys()
             for point, torque in expected.items():
                 assert size(np.tensordot(values, columns[point], 1) - torque) < 0.02 * size(torque)
-            calls.add(one.name)
-    assert calls == set(waves)
+            names.add(variant.name)
+    assert names == set(waves)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
-def test_products_are_those_of_the_errors(tmp_path, sides):
+def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
-    model = linear(tmp_path, sides)
+    model = linear(sides)
     products = model.columns((), [1e-6] * sides, np.ones(sides)).products
-    stride = errors(model)
-    assert products == pytest.approx(stride.T @ stride, rel=1e-6, abs=1e-9 * np.max(products))
+    columns = errors(model)
+    assert products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(products))
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_products_of_candidates_are_those_of_their_errors(tmp_path, coloured):
+def test_products_of_candidates_are_those_of_their_errors(geared, coloured):
     """Candidates are taken some at a time: those beside one another are the same as all at once."""
-    model = linear(tmp_path, 2)
+    model = geared
     variants = variants_of(model.experiment, list(SMALL), lambda name: LOG)
-    own, smoothness = 1 + len(model.free), [1e-6] * 2
+    model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
     columns = model.columns(variants, smoothness, noise)
-    assert len(columns.products) > own + 2 * module._TOGETHER
-    stride = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
+    assert len(columns.products) > model_columns + 2 * module._TOGETHER
+    predicted = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
     if coloured:
-        gram = weighted_products(stride[model.signals[0].real], noise)
+        gram = weighted_products(predicted[model.signals[0].real], noise)
     else:
-        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, stride, stride)
+        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
     expected = module._eliminated(gram, model.states)
     size = np.sqrt(np.diag(expected))
     for places, offset in zip(columns.places, columns.offsets, strict=True):
-        point = np.array([*range(own), *places, *([offset] if offset >= 0 else [])])
+        point = np.array([*range(model_columns), *places, *([offset] if offset >= 0 else [])])
         grid = np.ix_(point, point)
-        apart = (columns.products[grid] - expected[grid]) / np.outer(size[point], size[point])
-        assert np.max(np.abs(apart), where=np.isfinite(apart), initial=0.0) < 1e-9
+        difference = (columns.products[grid] - expected[grid]) / np.outer(size[point], size[point])
+        assert np.max(np.abs(difference), where=np.isfinite(difference), initial=0.0) < 1e-9
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_torques_that_models_share_are_those_of_each(tmp_path, monkeypatch, held):
+def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
     """A second model along the log, whose numbers are others, with what the first one has left and from scratch."""
     if held:
         monkeypatch.setattr(Smoothed, "held", lambda self, period: np.arange(len(self.state)) % 500 < 100)
-    first = linear(tmp_path, 2)
-    stride = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
-    variants = variants_of(first.experiment, stride, lambda name: LOG)
+    first = linear(2)
+    names = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
+    variants = variants_of(first.experiment, names, lambda name: LOG)
     columns_of(variants, first.signals[0])
-    model = linear(tmp_path, 2, theta=0.1)
+    model = linear(2, theta=0.1)
     (signals,), selected = model.signals, first.signals[0].shared
     assert len(selected) > 100
     shared = MotionTorques(model.experiment, model.parts[0], selected)
-    for variant, with_kept, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
-        assert with_kept.keys() == alone.keys()
+    for variant, together, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
+        assert together.keys() == alone.keys()
         for point, torque in alone.items():
             np.testing.assert_allclose(
-                with_kept[point], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=variant.name
+                together[point], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=variant.name
             )
 
 
-def test_a_candidate_may_act_in_one_part_only(tmp_path):
-    model = linear(tmp_path, 1, idle=1)
+def test_a_candidate_may_act_in_one_part_only():
+    model = linear(1, idle=1)
     variants = variants_of(model.experiment, ["actuator.gain_error"], model.scales)
     acting, idle = model.choose(variants).coefficients
     assert np.isfinite(acting).all()
@@ -231,26 +230,25 @@ def test_what_rounding_takes_is_known(growth):
     columns = np.concatenate([rng.standard_normal((count, 3)) + np.exp(growth * time), mixed], axis=1)
     gram = columns.T @ columns
     basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
-    left = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
-    true = float(left[:, 0] @ left[:, 0])
+    remainder = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
+    true = float(remainder[:, 0] @ remainder[:, 0])
     error, loss_estimate = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
     assert error < max(30.0 * loss_estimate, 1e-9 * true)
     assert loss_estimate < module._LOST or growth > 5.0
     assert loss_estimate > module._LOST or growth < 20.0
 
 
-def test_a_gain_under_which_rounding_would_decide_is_left_out(tmp_path, monkeypatch):
-    model = linear(tmp_path, 1)
+def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
+    model = linear(1)
     smoothness = model.choose(()).smoothness
     assert np.isfinite(model.predictor(smoothness).squares).all()
     monkeypatch.setattr(module, "_LOST", 0.0)
     assert not np.isfinite(model.predictor(smoothness).squares).any()
 
 
-def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
-    model = linear(tmp_path, 2)
-    travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
+def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(geared):
+    travel = float(np.ptp(np.asarray(geared.parts[0].position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
     assert least < 10  # twice a motor turn, with a gear ratio of 5
-    trials = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(model.scales("transmission.eccentricity"))
+    trials = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(geared.scales("transmission.eccentricity"))
     assert tuple(trials) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)

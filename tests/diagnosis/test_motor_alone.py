@@ -47,6 +47,7 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
 
 SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
 EXACT = STUDY | {"drive": GEARED, "transmission": SHAFT}
+ONE_CYCLE = 5.0 * np.sin(2.0 * np.pi * 0.5 * 2e-3 * np.arange(1000))
 
 
 def driven(torque, law, noise):
@@ -55,12 +56,12 @@ def driven(torque, law, noise):
 
 
 def test_nothing_is_named_where_nothing_is_missing(tmp_path):
-    t = 2e-3 * np.arange(2060)
+    t = 2e-3 * np.arange(1310)
     log = driven(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
     # the first part is too short to be fitted, and stays in the trace; the other one gives up its beginning
     path, other = tmp_path / "motor.csv", tmp_path / "other.csv"
-    part(log, np.r_[0:50, 60:1560]).write(path)
-    part(log, np.r_[1560:2060]).write(other)
+    part(log, np.r_[0:50, 60:1060]).write(path)
+    part(log, np.r_[1060:1310]).write(other)
     done = []
     task = read_diagnosis_task(path, EXACT, holdout=other)
     diagnosis = run_diagnosis(task, lambda *counted: done.append(counted))
@@ -74,23 +75,23 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
 def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
     """Numbers 12 to 20 % off: a plain fit ends beside the least error, and leaves a torque of 0.5 N m."""
     log = driven(
-        3.0 * np.sin(2 * np.pi * 0.5 * 2e-3 * np.arange(2000)),
+        3.0 * np.sin(2 * np.pi * 0.5 * 2e-3 * np.arange(1000)),
         {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08},
         1e-5,
     )
     log.write(tmp_path / "motor.csv")
-    own = STUDY | {
+    study = STUDY | {
         "transmission": {"law": "dead_zone", "stiffness": 50.0, "half_gap": 0.07},
         "uncertainty": {"relative": 0.2, "exact": ["drive.gear_ratio"]},
     }
-    summary = diagnose(tmp_path / "motor.csv", own).summary
+    summary = diagnose(tmp_path / "motor.csv", study).summary
     assert summary["verdict"] == "no_discrepancy" and summary["backlash"]["shown"]
     assert summary["parameters"]["transmission.half_gap"]["value"] == pytest.approx(0.08, rel=1e-3)
 
 
 def test_one_crossing_shows_a_gap(tmp_path):
     path = tmp_path / "motor.csv"
-    driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
+    driven(ONE_CYCLE, GAP, 1e-5).write(path)
     summary = diagnose(path, EXACT).summary
     assert summary["backlash"]["crossings"] == 1
     (finding,) = summary["findings"]
@@ -100,7 +101,7 @@ def test_one_crossing_shows_a_gap(tmp_path):
 
 def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
     path = tmp_path / "motor.csv"
-    driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
+    driven(ONE_CYCLE, GAP, 1e-5).write(path)
     monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
     summary = diagnose(path, EXACT).summary
     assert (summary["verdict"], summary["findings"]) == ("unknown_effect", [])

@@ -28,16 +28,16 @@ def model(sides):
 @pytest.mark.parametrize("sides", [1, 2])
 def test_neutral_effects_do_nothing(sides):
     bare = model(sides)
-    stride = complete(bare, candidates(bare))
+    full = complete(bare, candidates(bare))
     torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
     runs = []
-    for one in (bare, stride):
-        start = one.plant.init(one.initial)
-        runs.append(jit(plant_trajectory)(one, start, torque))
+    for experiment in (bare, full):
+        start = experiment.plant.init(experiment.initial)
+        runs.append(jit(plant_trajectory)(experiment, start, torque))
     for side in bare.sides:
         assert np.ptp(runs[0].position[side]) > 0.0
         for name in ("position", "velocity"):
-            actual, expected = (np.asarray(getattr(one, name)[side]) for one in (runs[1], runs[0]))
+            actual, expected = (np.asarray(getattr(experiment, name)[side]) for experiment in (runs[1], runs[0]))
             assert actual == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
@@ -77,8 +77,8 @@ def test_buckets_are_few_and_large_enough():
 def test_given_effects_keep_their_order():
     data = small()
     saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
-    stride = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
-    acting = [effect.name for effect in stride.effects if effect.place == "actuator"]
+    full = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
+    acting = [effect.name for effect in full.effects if effect.place == "actuator"]
     assert acting == ["actuator.saturation", "actuator.gain_error", "actuator.lag"]
     late = complete(complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float)), ["actuator.lag"])
     acting = [effect.name for effect in late.effects if effect.place == "actuator"]

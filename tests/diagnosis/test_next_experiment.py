@@ -38,13 +38,13 @@ def test_a_diagnosis_that_seeks_no_gap_writes_no_experiment(tmp_path):
     assert line.startswith("No gap is sought: the model has one")
 
 
-@pytest.mark.parametrize(("unit", "said"), [("rad", "N m"), ("m", "N")])
-def test_the_amplitude_said_is_about_the_mean_of_the_file_and_in_its_unit(tmp_path, unit, said):
+@pytest.mark.parametrize(("unit", "torque_unit"), [("rad", "N m"), ("m", "N")])
+def test_the_amplitude_said_is_about_the_mean_of_the_file_and_in_its_unit(tmp_path, unit, torque_unit):
     channels = {"theta_e": SimpleNamespace(unit=unit)}
     record = SimpleNamespace(sample_period=1e-2, statistics=SimpleNamespace(channels=channels))
     record.unit_of = partial(Record.unit_of, record)
     torque = 1.5 + 2.0 * np.sin(2.0 * np.pi * 1e-2 * np.arange(100))
     path = tmp_path / "next.csv"
     line = _written(Input("sine", 2.0, 1.0, torque, 20.0, 1.5), record, path)  # type: ignore[arg-type]
-    assert line.startswith(f"sine of 2 {said} about a mean of 1.5 {said}, 1 Hz, 1 s;")
+    assert line.startswith(f"sine of 2 {torque_unit} about a mean of 1.5 {torque_unit}, 1 Hz, 1 s;")
     assert np.ptp(pd.read_csv(path)["u"]) == pytest.approx(4.0, rel=1e-6)

@@ -73,16 +73,21 @@ def compare_logs(
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_an_inertia_that_two_logs_show_to_differ(separate):
-    (one,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate)
-    assert one.path == "drive.motor_inertia" and (one.least.log, one.most.log) == ("a.csv", "b.csv")
-    assert one.least.value == pytest.approx(INERTIA, abs=4.0 * one.least.error)
-    assert one.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
+    (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate)
+    assert contradiction.path == "drive.motor_inertia" and (contradiction.least.log, contradiction.most.log) == (
+        "a.csv",
+        "b.csv",
+    )
+    assert contradiction.least.value == pytest.approx(INERTIA, abs=4.0 * contradiction.least.error)
+    assert contradiction.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
 
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_logs_of_one_name_are_two(separate):
-    (one,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv"))
-    assert (one.least.log, one.most.log) == ("run1/log.csv", "run2/log.csv")
+    (contradiction,) = compare_logs(
+        INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv")
+    )
+    assert (contradiction.least.log, contradiction.most.log) == ("run1/log.csv", "run2/log.csv")
 
 
 def test_logs_of_one_machine_agree():

@@ -43,15 +43,15 @@ def logs(tmp_path_factory):
     return folder, speeds
 
 
-def read_residuals(logs, which, study, gains=None):
+def read_residuals(logs, name, study, gains=None):
     """The experiment with gains, the smoother's residuals of its log, and the observers'."""
-    task = read_diagnosis_task(logs[0] / f"{which}.csv", study)
+    task = read_diagnosis_task(logs[0] / f"{name}.csv", study)
     nominal = on_record(task.config, task.record)
     segments = segments_of(task.record, nominal.sides)
     values = {
-        f"observer.{side}.{name}": jnp.asarray(value)
-        for side, pair in (gains or GAINS[which]).items()
-        for name, value in zip(("lambda", "alpha"), pair, strict=True)
+        f"observer.{side}.{gain}": jnp.asarray(value)
+        for side, pair in (gains or GAINS[name]).items()
+        for gain, value in zip(("lambda", "alpha"), pair, strict=True)
     }
     nominal = set_leaves(nominal, values)
     return nominal, residual_torques(nominal, segments), observed_torques(nominal, segments)
@@ -68,12 +68,12 @@ def late(torque, period):
 
 
 def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
-    experiment, residuals, result = read_residuals(logs, "geared", model(drive=GEARED, transmission=GAP))
+    experiment, residuals, observed = read_residuals(logs, "geared", model(drive=GEARED, transmission=GAP))
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
-        (one,) = result[side]
-        assert one.converged and one.stuck < 0.02
-        assert len(one.residual.time) + one.skipped == 1500 - DELAY_SAMPLES and 50 <= one.skipped < 60
-        description = compared(experiment, result[side], residuals[side], 30.0)
+        (witness,) = observed[side]
+        assert witness.converged and witness.stuck < 0.02
+        assert len(witness.residual.time) + witness.skipped == 1500 - DELAY_SAMPLES and 50 <= witness.skipped < 60
+        description = compared(experiment, observed[side], residuals[side], 30.0)
         assert description["correlation"] > 0.99
         assert (
             description["rms"] == pytest.approx(description["smoother_rms"], rel=0.03)
@@ -81,21 +81,20 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
         )
         assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
-        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + one.skipped : 1500]
-        low, _ = narrowed(one.residual, 10.0)
-        true, _ = narrowed(replace(one.residual, torque=missing), 10.0)
+        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + witness.skipped : 1500]
+        low, _ = narrowed(witness.residual, 10.0)
+        true, _ = narrowed(replace(witness.residual, torque=missing), 10.0)
         assert np.corrcoef(low.torque, true.torque)[0, 1] > 0.99
         assert rms(low.torque) == pytest.approx(rms(true.torque), rel=0.05)
 
 
-@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
-@pytest.mark.parametrize("which", ["direct", "geared"])
-def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretisation):
+@pytest.mark.parametrize(("drive", "discretisation"), [("geared", "implicit"), ("direct", "explicit")])
+def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretisation):
     tables = {"drive": DRIVE, "effects": [FRICTION]}
-    if which == "geared":
+    if drive == "geared":
         tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
-    _, _, result = read_residuals(logs, which, model(observer={"discretisation": discretisation}, **tables))
-    for side, (name,) in result.items():
+    _, _, observed = read_residuals(logs, drive, model(observer={"discretisation": discretisation}, **tables))
+    for side, (name,) in observed.items():
         scores = [rms(name.residual.torque / name.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
             low, _ = narrowed(name.residual, cutoff)
@@ -108,19 +107,19 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretis
 
 
 def test_a_rigid_drive_has_one_witness(logs):
-    experiment, residuals, result = read_residuals(logs, "direct", model())
-    assert list(result) == ["motor"]
-    description = compared(experiment, result["motor"], residuals["motor"], 30.0)
+    experiment, residuals, observed = read_residuals(logs, "direct", model())
+    assert list(observed) == ["motor"]
+    description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
     assert description["correlation"] > 0.98 and description["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.5])
 def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
-    """What is missing is 3 rad/s^2."""
-    experiment, residuals, result = read_residuals(logs, "direct", model(), {"motor": (2.0, alpha)})
-    (one,) = result["motor"]
-    assert one.stuck > 0.5 and not one.converged
-    description = compared(experiment, result["motor"], residuals["motor"], 30.0)
+    """The torque that is missing makes 3 rad/s^2."""
+    experiment, residuals, observed = read_residuals(logs, "direct", model(), {"motor": (2.0, alpha)})
+    (witness,) = observed["motor"]
+    assert witness.stuck > 0.5 and not witness.converged
+    description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
     assert description["converged"] is False and {description[name] for name in ("rms", "noise", "correlation")} == {None}
 
 
@@ -131,5 +130,5 @@ def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
         return {side: values.at[0, -1].set(np.inf) for side, values in real(*inputs).items()}
 
     monkeypatch.setattr(under_test, "_controls", controls)
-    _, _, result = read_residuals(logs, "direct", model())
-    assert not result["motor"][0].converged and np.isnan(result["motor"][0].residual.deviation).all()
+    _, _, observed = read_residuals(logs, "direct", model())
+    assert not observed["motor"][0].converged and np.isnan(observed["motor"][0].residual.deviation).all()

@@ -34,5 +34,5 @@ def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins
         again = fit_to_torque(search, away, setup.fitted)
     # the prior weighs more where more torque is missing at first
     np.testing.assert_allclose(again.theta, by_torque.theta, atol=3.0 * np.max(deviation))
-    missing = [np.std(setup.fitted.missing(one.experiment)["motor"]) for one in (away, again)]
+    missing = [np.std(setup.fitted.missing(fitted.experiment)["motor"]) for fitted in (away, again)]
     assert missing[1] < 0.5 * missing[0]

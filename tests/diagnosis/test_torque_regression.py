@@ -24,12 +24,12 @@ def proposals(folder, *effects):
 
 def test_the_effect_that_takes_most_of_the_missing_torque_is_proposed_with_its_number(tmp_path):
     first, *further = proposals(tmp_path, "friction")
-    names = [first.name, *(one.name for one in further)]
+    names = [first.name, *(proposal.name for proposal in further)]
     # friction that falls with speed, or bends, contains it
     assert "motor.coulomb_friction" in names[:3] and first.gain > 0.7
-    coulomb = next(one for one in (first, *further) if one.name == "motor.coulomb_friction")
+    coulomb = next(proposal for proposal in (first, *further) if proposal.name == "motor.coulomb_friction")
     assert coulomb.numbers["torque"] == pytest.approx(FRICTION["torque"], rel=0.1)
-    assert all(one.gain > 0.03 for one in further)
+    assert all(proposal.gain > 0.03 for proposal in further)
 
 
 def test_nothing_is_proposed_where_nothing_is_missing(tmp_path):
