@@ -40,20 +40,20 @@ def logs(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(logs):
+def diagnosis(logs):
     return diagnose(logs / "axis.csv", model())
 
 
-def test_the_missing_effect_is_named_with_its_number(found):
-    summary = found.summary
+def test_the_missing_effect_is_named_with_its_number(diagnosis):
+    summary = diagnosis.summary
     assert summary["verdict"] == "explained"
-    (one,) = summary["findings"]
-    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.5
-    torque = one["parameters"]["torque"]
+    (finding,) = summary["findings"]
+    assert finding["effect"] == "motor.coulomb_friction" and finding["confidence"] > 0.5
+    torque = finding["parameters"]["torque"]
     assert torque["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
     assert abs(torque["value"] - FRICTION["torque"]) < 5.0 * torque["standard_error"]
     assert torque["unit"] == "N m"
-    assert one["where"]["place"] == "motor" and "motor side" in one["where"]["sentences"]["motor"]
+    assert finding["where"]["place"] == "motor" and "motor side" in finding["where"]["sentences"]["motor"]
     for path, true in (("drive.motor_inertia", 0.02), ("drive.motor_viscous", 0.03)):
         assert summary["parameters"][path]["value"] == pytest.approx(true, rel=0.02)
 
@@ -62,9 +62,9 @@ def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path)
     log = logged(torque_noise=0.02)
     log.write(tmp_path / "axis.csv")
     diagnosis = diagnose(tmp_path / "axis.csv", model())
-    (one,) = diagnosis.summary["findings"]
-    assert one["effect"] == "motor.coulomb_friction"
-    assert one["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
+    (finding,) = diagnosis.summary["findings"]
+    assert finding["effect"] == "motor.coulomb_friction"
+    assert finding["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
     (note,) = (note for note in diagnosis.summary["notes"] if "does not feel" in note)
     assert note.startswith("The channel u carries noise of 0.02")
     np.testing.assert_allclose(diagnosis.trace["u"], log.u, rtol=1e-9)
@@ -85,8 +85,8 @@ def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
         assert np.array_equal(segment.torque, record.torque[rows]) is felt
 
 
-def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
-    gap = found.summary["gap"]
+def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(diagnosis):
+    gap = diagnosis.summary["gap"]
     assert gap["holdout"]["separate"] is False and gap["holdout"]["from"] == pytest.approx(3.0)
     before, after, floor = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
     assert set(before) == set(after) == set(floor) == {"theta_e", "velocity_motor", "torque_motor"}
@@ -97,7 +97,7 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
     assert gap["free_run"]["after"]["theta_e"] < 0.1 * gap["free_run"]["before"]["theta_e"]
 
 
-def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
+def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, diagnosis):
     full_record = read_record(logs / "axis.csv")
     task = read_diagnosis_task(logs / "axis.csv", model())
     assert len(task.record.time) == 1500 and task.record.segments == (slice(DELAY_SAMPLES, 1500),)
@@ -107,13 +107,13 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     first, last = split_off_last_quarter(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
-    trace = found.trace
+    trace = diagnosis.trace
     assert trace["held_out"].sum() == 500 and trace["motor.missing_before"][DELAY_SAMPLES:].notna().all()
     assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
 
 
-def test_what_an_effect_takes_off_is_its_torque(found):
-    trace = found.trace[DELAY_SAMPLES:]
+def test_what_an_effect_takes_off_is_its_torque(diagnosis):
+    trace = diagnosis.trace[DELAY_SAMPLES:]
     taken = trace["motor.missing_without.motor.coulomb_friction"] - trace["motor.missing_after"]
     # away from reversals, where the smoother rounds the jump
     fast = trace["motor.velocity"].abs() > 0.5 * trace["motor.velocity"].abs().max()
@@ -122,8 +122,8 @@ def test_what_an_effect_takes_off_is_its_torque(found):
     assert np.corrcoef(taken[fast], friction[fast])[0, 1] > 0.98
 
 
-def test_the_observers_are_a_second_witness(found):
-    description = found.summary["where"]["motor"]["observed"]
+def test_the_observers_are_a_second_witness(diagnosis):
+    description = diagnosis.summary["where"]["motor"]["observed"]
     assert description["converged"] is True and description["correlation"] > 0.95
     assert (
         description["rms"] == pytest.approx(description["smoother_rms"], rel=0.05)
@@ -134,16 +134,16 @@ def test_the_observers_are_a_second_witness(found):
         and description["time_constant"] == 0.01
         and description["bandwidth"] < 16.0
     )
-    trace, (one,) = found.trace, found.observed["motor"]
+    trace, (observed,) = diagnosis.trace, diagnosis.observed["motor"]
     is_observed = trace["motor.observed_before"].notna()
     # the beginnings of both parts are left out
-    first = DELAY_SAMPLES + one.skipped
+    first = DELAY_SAMPLES + observed.skipped
     assert not is_observed[:first].any() and is_observed[first:1500].all()
-    assert not is_observed[1500 : 1500 + one.skipped].any() and is_observed[1500 + one.skipped :].all()
+    assert not is_observed[1500 : 1500 + observed.skipped].any() and is_observed[1500 + observed.skipped :].all()
     assert (trace["motor.observed_noise"].notna() == is_observed).all()
-    np.testing.assert_array_equal(trace["motor.observed_before"][first:1500], one.residual.torque)
+    np.testing.assert_array_equal(trace["motor.observed_before"][first:1500], observed.residual.torque)
     assert trace["motor.observed_before"][is_observed].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
-    assert not any("observer" in note for note in found.summary["notes"])
+    assert not any("observer" in note for note in diagnosis.summary["notes"])
 
 
 def test_an_observer_that_does_not_converge_is_noted(logs):
@@ -157,8 +157,8 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
     assert note.startswith("The motor's observer does not converge on this log (lambda = 2, alpha = 1)")
 
 
-def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_path):
-    lines = write_diagnosis_report(found, tmp_path)
+def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, tmp_path):
+    lines = write_diagnosis_report(diagnosis, tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
     assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
@@ -166,21 +166,21 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     again = read_config(tmp_path / "model.toml")
     assert [effect.kind for effect in again.effects] == ["motor.coulomb_friction"]
     summary = read_json(tmp_path / "diagnosis.json")
-    assert summary == found.summary and diagnosis_lines(summary) == lines
+    assert summary == diagnosis.summary and diagnosis_lines(summary) == lines
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 
 
 @needs_chromium
-def test_the_page_in_a_browser(found, tmp_path):
-    write_diagnosis_report(found, tmp_path)
+def test_the_page_in_a_browser(diagnosis, tmp_path):
+    write_diagnosis_report(diagnosis, tmp_path)
     with opened(tmp_path / "report.html") as (page,):
         check(page, len(list((tmp_path / "figures").iterdir())))
         assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
 
 
-def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_path):
-    """As written, with the record of the first log for its excitation."""
-    write_diagnosis_report(found, tmp_path)
+def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, diagnosis, tmp_path):
+    """The model is read as written, with the record of the first log for its excitation."""
+    write_diagnosis_report(diagnosis, tmp_path)
     again = diagnose(logs / "other.csv", tmp_path / "model.toml")
     assert again.config.excitation.kind == "recorded"
     assert again.summary["verdict"] == "no_discrepancy" and again.summary["findings"] == []
@@ -189,8 +189,8 @@ def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_
 
 
 def test_what_is_known_exactly_is_no_candidate(logs):
-    known = {"relative": 0.02, "exact": ["drive.motor_inertia", "actuator.gain_error"]}
-    task = read_diagnosis_task(logs / "axis.csv", model(uncertainty=known))
+    uncertainty = {"relative": 0.02, "exact": ["drive.motor_inertia", "actuator.gain_error"]}
+    task = read_diagnosis_task(logs / "axis.csv", model(uncertainty=uncertainty))
     with jax.enable_x64(True):
         lacking = new_search(set_up(task)).lacking
     assert not {"motor.inertia", "actuator.gain_error"} & set(lacking)
@@ -221,16 +221,16 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
     real = explain.refined
 
-    def spoilt(experiment, free, *remainder):
-        diagnosis = real(experiment, free, *remainder)
-        sizes = [one.path for one in free if one.path.startswith("effects.") and one.role == "size"]
-        wrong = set_leaves(diagnosis.experiment, {path: 4.0 * get_leaf(diagnosis.experiment, path) for path in sizes})
-        return diagnosis._replace(experiment=wrong)
+    def spoilt(experiment, free, *inputs):
+        fit = real(experiment, free, *inputs)
+        sizes = [number.path for number in free if number.path.startswith("effects.") and number.role == "size"]
+        wrong = set_leaves(fit.experiment, {path: 4.0 * get_leaf(fit.experiment, path) for path in sizes})
+        return fit._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
     task = read_diagnosis_task(logs / "first.csv", model(), holdout=logs / "last.csv")
     stages = []
-    diagnosis = run_diagnosis(task, lambda *index: stages.append(index))
+    diagnosis = run_diagnosis(task, lambda *counts: stages.append(counts))
     assert stages == [(i, 6) for i in range(1, 7)]
     summary = diagnosis.summary
     assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
@@ -246,7 +246,7 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     assert diagnosis.model.effects == []
 
 
-def test_a_tie_has_an_experiment(logs, found, tmp_path):
+def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     record = read_record(logs / "axis.csv")
     assert tied({"findings": []}) is None
     messages = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
@@ -256,13 +256,13 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
     summary = {"findings": [finding], "rival": rival}
     largest = np.max(np.abs(record.torque))
-    best = next_experiment(summary, found.model, record)
+    best = next_experiment(summary, diagnosis.model, record)
     assert best is not None and best.apart > 10.0
     assert np.max(np.abs(best.torque)) <= largest + 1e-12
-    less = next_experiment(summary, found.model, record, torque=0.1 * largest, travel=0.5)
+    less = next_experiment(summary, diagnosis.model, record, torque=0.1 * largest, travel=0.5)
     assert less is not None and less.apart < best.apart and np.max(np.abs(less.torque)) <= 0.1 * largest + 1e-12
-    assert next_experiment(summary, found.model, record, travel=1e-9) is None
-    write_diagnosis_report(found, tmp_path)
+    assert next_experiment(summary, diagnosis.model, record, travel=1e-9) is None
+    write_diagnosis_report(diagnosis, tmp_path)
     (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
     assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
     columns = np.genfromtxt(tmp_path / "new" / "next.csv", delimiter=",", names=True)
@@ -270,7 +270,7 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
 
 
 def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
-    """At 5 Hz and under that noise dry friction of 1 % of the torque looks viscous; a slower motion tells them apart."""
+    """Dry friction of 1 % of the torque looks viscous at 5 Hz and under that noise; a slower motion tells them apart."""
     friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
     fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
     log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
@@ -283,9 +283,9 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     best = next_experiment(diagnosis.summary, diagnosis.model, task.record, travel=6.0)
     assert best is not None and best.apart > 100.0
     driven(best.torque, [friction], 1e-3, 3).write(other)
-    (one,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
-    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.99
-    assert one["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
+    (finding,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
+    assert finding["effect"] == "motor.coulomb_friction" and finding["confidence"] > 0.99
+    assert finding["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
 
 
 def expect_refusal(logs, *arguments, **keywords):

@@ -45,12 +45,12 @@ def test_where_the_fit_is_quadratic_both_intervals_agree():
     experiment, free, result = fitted(["drive.motor_inertia", "drive.motor_viscous"], windows)
     width = spread(result)
     profiles = profile(experiment, free, windows, result, width)
-    for i, one in enumerate(free):
+    for i, number in enumerate(free):
         theta, deviation = float(result.theta[i]), float(jnp.sqrt(width.covariance[i, i]))
-        low, high = interval(one, theta, deviation)
-        np.testing.assert_allclose(profiles[one.path].interval, (low, high), atol=0.05 * (high - low), rtol=0.0)
-        assert np.all(np.diff(profiles[one.path].values) >= 0.0)
-        assert profiles[one.path].deviance.min() == 0.0
+        low, high = interval(number, theta, deviation)
+        np.testing.assert_allclose(profiles[number.path].interval, (low, high), atol=0.05 * (high - low), rtol=0.0)
+        assert np.all(np.diff(profiles[number.path].values) >= 0.0)
+        assert profiles[number.path].deviance.min() == 0.0
 
 
 def test_where_it_is_not_the_profile_follows_the_likelihood():

@@ -67,9 +67,9 @@ def test_a_model_along_a_log_has_no_excitation(paths: list[Path]):
     """Programs that are compiled for it are those of any other excitation."""
     sweeping = {"kind": "chirp", "amplitude": 0.1, "start_frequency": 1.0, "stop_frequency": 2.0, "sweep_time": 1.0}
     configs = [read_model(MODEL | more)[0] for more in ({}, {"excitation": sweeping})]
-    one, other = (on_record(config, read_logs(config, paths[0])) for config in configs)
-    assert eqx.tree_equal(one, other)
-    assert one.excitation(np.linspace(0.0, 1.0, 9)).tolist() == [0.0] * 9
+    first, second = (on_record(config, read_logs(config, paths[0])) for config in configs)
+    assert eqx.tree_equal(first, second)
+    assert first.excitation(np.linspace(0.0, 1.0, 9)).tolist() == [0.0] * 9
 
 
 GEARED = {
@@ -84,14 +84,14 @@ GEARED = {
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_clock_that_one_log_is_sure_of_holds_for_all_and_for_the_held_out_log(tmp_path: Path, order: tuple[int, int]):
-    """Of a machine whose load's clock is late one log has too much noise to show it."""
+    """A machine's load has a late clock; one log has too much noise to show it."""
     frames = [axis(skew=3e-3, seed=seed) for seed in range(3)]
     frames[1]["theta_s"] += 0.1 * np.random.default_rng(0).standard_normal(len(frames[1]))
     for i, frame in enumerate(frames):
         frame.to_parquet(tmp_path / f"{i}.parquet")
     config, _ = read_model(GEARED)
     alone = [read_logs(config, tmp_path / f"{i}.parquet") for i in range(3)]
-    assert [list(one.corrections) for one in alone] == [["skew"], [], ["skew"]]
+    assert [list(record.corrections) for record in alone] == [["skew"], [], ["skew"]]
     record, held = read_with_holdout(config, [tmp_path / f"{i}.parquet" for i in order], tmp_path / "2.parquet")
     assert held is not None
     moved = f"theta_s: shifted by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
@@ -106,10 +106,10 @@ def test_a_record_is_checked_as_a_file_is(tmp_path: Path):
     config, _ = read_model(GEARED)
     with pytest.raises(InputError, match=r"free\.parquet: without u a motion shows torques only as multiples"):
         read_logs(config, free)
-    known, _ = read_model(GEARED | {"uncertainty": {"exact": ["drive.motor_inertia"]}})
-    record = read_logs(known, free)
+    config, _ = read_model(GEARED | {"uncertainty": {"exact": ["drive.motor_inertia"]}})
+    record = read_logs(config, free)
     assert record.torque is not None and not record.torque.any()
-    assert read_logs(known, record).notes == record.notes
+    assert read_logs(config, record).notes == record.notes
 
 
 def test_a_held_out_log_has_the_positions_of_the_log(tmp_path: Path):

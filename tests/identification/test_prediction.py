@@ -73,8 +73,8 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
         windows = windows_of(torque, readings, 500)
         predicted, smoothness = predictor(experiment, windows)
         np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
-        for name, one in (("free", windows), ("predicted", predicted)):
-            result = fitted(experiment, free, one)
+        for name, cut_windows in (("free", windows), ("predicted", predicted)):
+            result = fitted(experiment, free, cut_windows)
             errors[name].append(result.theta)
             widths[name].append(np.sqrt(np.diag(spread(result).covariance)))
     size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}

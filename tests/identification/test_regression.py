@@ -150,7 +150,7 @@ def test_emps_by_the_published_method_and_measure():
     records = [read_record(real(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
     parts = [differentiate(r.time, r.torque, r.positions, 100.0) for r in records]
     result = regress(experiment, free, parts[:1], 10)
-    values = [float(one.value(result.theta[i])) for i, one in enumerate(free)]
+    values = [float(number.value(result.theta[i])) for i, number in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
     fitted = set_free_parameters(experiment, free, result.theta)
     assert errors(fitted, parts[:1], 10)["motor"]["relative"] < 0.042

@@ -37,10 +37,10 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
     record, experiment, segments = setting
     windows, firsts = windows_of(segments, experiment, 250)
     keep = np.exp(-2e-3 / LAG["time_constant"])
-    made = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
-    made[0] = record.torque[0]
+    actuator_torque = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
+    actuator_torque[0] = record.torque[0]
     ((result,),) = windows.start.effects
-    np.testing.assert_allclose(result, made[firsts], atol=1e-3 * np.max(np.abs(made)))
+    np.testing.assert_allclose(result, actuator_torque[firsts], atol=1e-3 * np.max(np.abs(actuator_torque)))
     np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[jnp.asarray(firsts)])
 
 
@@ -81,7 +81,7 @@ def test_effects_begin_with_what_the_inputs_before_left(setting):
 
 
 def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):
-    """From an actuator without torque the search for the windows' initial states ends a thousand times as far off."""
+    """The search for the windows' initial states from an actuator without torque ends a thousand times as far off."""
     torque = 5.0 * np.sin(2.0 * np.pi * 0.9 * 2e-3 * np.arange(2000))
     (trace,) = simulate([Run(Machine(GEARED, GAP, [LAG]), 2e-3, torque, motor_noise=1e-5, load_noise=2e-6, seed=1)])
     Log(trace.t, trace.u, trace.theta_e, trace.theta_s).write(tmp_path / "axis.csv")

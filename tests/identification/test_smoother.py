@@ -113,6 +113,6 @@ def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monke
         monkeypatch.setattr(signal_scan, "_compile_loop", lambda *_: None)
     readings = np.stack([(1.0 + seed) * motion(seed, 300)[1] for seed in range(columns)], axis=1)
     result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
-    for one, position in zip(result.T, readings.T, strict=True):
+    for channel, position in zip(result.T, readings.T, strict=True):
         alone = smooth(position, PERIOD, known=(NOISE, JERK)).acceleration
-        np.testing.assert_allclose(one, alone, rtol=1e-9, atol=1e-9 * np.max(np.abs(alone)))
+        np.testing.assert_allclose(channel, alone, rtol=1e-9, atol=1e-9 * np.max(np.abs(alone)))

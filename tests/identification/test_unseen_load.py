@@ -73,7 +73,7 @@ def test_a_log_without_torque_says_what_is_missing(tmp_path, log):
 
 
 def test_inspect_says_what_needs_the_load(log):
-    answers = {one.quantity: one for one in inspect(log).identifiability}
+    answers = {judgement.quantity: judgement for judgement in inspect(log).identifiability}
     assert answers["lost motion"].answer == "weak"
     assert "jaxbl identify" in answers["lost motion"].reason
 
