@@ -1,5 +1,5 @@
 """Commands in processes that begin with everything loaded: forks of one process that has imported the package, and has
-computed nothing.
+computed nothing. They draw one figure of each kind, as the tests do.
 
 A new interpreter takes seconds to import JAX and the package. What a test says of that start itself needs one all the same:
 times of imports, modules that are not loaded, an interrupt while they are.
@@ -196,6 +196,7 @@ def _load():
         getattr(package, name)
     for name in LATE:
         importlib.import_module(name)
+    importlib.import_module("figure_kinds").draw_figures_by_kind()
     assert not importlib.import_module("jax._src.xla_bridge").backends_are_initialized()
     gc.collect()
     gc.freeze()

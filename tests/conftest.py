@@ -18,7 +18,7 @@ os.environ |= {
 
 import jax
 import pytest
-from figure_kinds import every_figure, figures_by_kind
+from figure_kinds import draw_figures_by_kind, every_figure
 from hypothesis import settings
 from progress_lines import without_progress
 
@@ -27,6 +27,8 @@ from jaxbl.workers import clear_programs_if_needed, collect_garbage_rarely
 pytest_plugins = ["shared_results", "suite"]
 
 collect_garbage_rarely()
+# to draw figures takes longer than most of what they show
+draw_figures_by_kind()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -43,13 +45,6 @@ def _few_programs():
     """Over many files, compiled programs would use up what the system lets a process map into memory."""
     yield
     clear_programs_if_needed()
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _figures_by_kind():
-    """To draw figures takes longer than most of what they show."""
-    with figures_by_kind():
-        yield
 
 
 @pytest.fixture

@@ -49,14 +49,9 @@ def _save_kind(figure: Figure, file: Any, *, format: str, **how: Any) -> None:
         Path(file).write_bytes(_pictures[kind])
 
 
-@contextmanager
-def figures_by_kind() -> Iterator[None]:
-    """Draw one figure of each kind inside."""
+def draw_figures_by_kind() -> None:
+    """Draw one figure of each kind from here on."""
     Figure.savefig = _save_kind
-    try:
-        yield
-    finally:
-        Figure.savefig = _draw
 
 
 @contextmanager
