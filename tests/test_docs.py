@@ -186,12 +186,14 @@ INSTEAD = {
 }
 
 
-SHORTER = {
-    # the demo runs the study of the tree
-    ("gain_map.toml", 20.0, 4.0): ("README.md",),
-    ("geared_axis.toml", 10.0, 4.0): ("fmu.md", "watch.md"),
+SMALLER = {
+    "gain_map.toml": (
+        {"duration = 20.0": "duration = 4.0", "num = 64": "num = 16", "seeds = 4": "seeds = 4\nchunk = 1536"},
+        (),
+    ),
+    "geared_axis.toml": ({"duration = 10.0": "duration = 4.0"}, ("fmu.md", "watch.md")),
 }
-"""Studies that pages run, their duration and a shorter one (s), and the pages that need all of it."""
+"""Studies that pages run, lines of them with smaller numbers, and the pages that need the larger ones."""
 
 EXTRAS = {"cluster.md": "distributed", "fmu.md": "fmu", "mujoco.md": "mujoco"}
 """What pages say that it has to be installed."""
@@ -223,8 +225,8 @@ for name in [name for name in sys.modules if name.partition(".")[0] in hidden]:
 """
 
 
-def environment(folder, extra=None):
-    """That of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
+def make_environment(folder, clone, extra=None):
+    """Return that of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
     shown = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
@@ -239,7 +241,7 @@ def environment(folder, extra=None):
     programs = str(ROOT / ".cache" / "programs")
     pip = {"TARGET": str(site), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1", "DISABLE_PIP_VERSION_CHECK": "1"}
     return {
-        "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "JAXBL_PROGRAMS": programs,
+        "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(clone)]), "JAXBL_PROGRAMS": programs,
         **{f"PIP_{key}": value for key, value in pip.items()},
     }  # fmt: skip
 
@@ -253,17 +255,19 @@ def test_demo_is_this_command():
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that
     file."""
-    env = environment(tmp_path, EXTRAS.get(page.name))
     clone = tmp_path / "clone"
+    env = make_environment(tmp_path, clone, EXTRAS.get(page.name))
     clone.mkdir()
     shutil.copytree(ROOT / "sweeps", clone / "sweeps")
     shutil.copytree(ROOT / "docs" / "cluster", clone / "docs" / "cluster")
-    for (study, duration, shorter), pages in SHORTER.items():
-        file = clone / "sweeps" / study
-        parts = file.read_text(encoding="utf-8").split(f"\nduration = {duration}\n")
-        assert len(parts) == 2
+    # the demo runs the study beside the package
+    (clone / "jaxbl").symlink_to(ROOT / "jaxbl")
+    for study, (lines, pages) in SMALLER.items():
+        text = (clone / "sweeps" / study).read_text(encoding="utf-8")
+        assert all(f"\n{line}\n" in text for line in lines)
         if page.name not in pages:
-            file.write_text(f"\nduration = {shorter}\n".join(parts), encoding="utf-8")
+            smaller = re.sub(r"^.*$", lambda line: lines.get(line[0], line[0]), text, flags=re.M)
+            (clone / "sweeps" / study).write_text(smaller, encoding="utf-8")
     blocks = []
     for language, text in blocks_of(page):
         file = re.match(r"# (\w+\.(?:toml|py))\n", text)
