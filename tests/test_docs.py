@@ -263,10 +263,10 @@ def test_page_runs_as_written(page, tmp_path):
     # the demo runs the study beside the package
     (clone / "jaxbl").symlink_to(ROOT / "jaxbl")
     for study, (lines, pages) in SMALLER.items():
-        text = (clone / "sweeps" / study).read_text(encoding="utf-8")
-        assert all(f"\n{line}\n" in text for line in lines)
+        text = (clone / "sweeps" / study).read_text(encoding="utf-8").split("\n")
+        assert lines.keys() <= set(text)
         if page.name not in pages:
-            smaller = re.sub(r"^.*$", lambda line: lines.get(line[0], line[0]), text, flags=re.M)
+            smaller = "\n".join(lines.get(line, line) for line in text)
             (clone / "sweeps" / study).write_text(smaller, encoding="utf-8")
     blocks = []
     for language, text in blocks_of(page):
