@@ -248,6 +248,7 @@ _GRID_RAYS, _GRID_ROUNDS = 17, 5
 the slowest ray."""
 
 
+@jax.jit
 def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """The ray p <= 0 (rad^0.5/s) at which the slowest disturbance switches; zero if rho >= 1.
 

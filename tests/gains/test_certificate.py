@@ -15,8 +15,8 @@ from small_study import rigid
 import jaxbl
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
-from jaxbl.gains import certificate
-from jaxbl.gains.certificate import certify
+from jaxbl.gains import adversary, certificate
+from jaxbl.gains.certificate import Assumptions, _prove, certify
 from jaxbl.gains.tune import tune
 from jaxbl.report.certificate import certificate_lines, certificate_tables
 from jaxbl.report.tune import write_tune_report
@@ -27,9 +27,20 @@ BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "
 
 @pytest.fixture(autouse=True, scope="module")
 def _proofs_once(compiled_once):
-    """Searches of this file prove the same gains again and again."""
+    """Searches of this file prove and explore the same gains again and again; few runs show what a certificate says of them."""
+    results = {}
+
+    def explore_once(observer, system):
+        key = system, jax.config.jax_enable_x64
+        if key not in results:
+            results[key] = explore_errors(observer, system)
+        return results[key]
+
+    explore_errors = adversary.explore_errors
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(certificate, "prove", functools.cache(certificate.prove))
+        patch.setattr(adversary, "explore_errors", explore_once)
+        patch.setattr(adversary, "_LANES", 1 << 10)
         yield
 
 
@@ -88,7 +99,7 @@ def test_limits_are_met_or_not(proven):
     assert not any(limit["met"] for limit in narrow["limits"].values())
 
 
-@pytest.mark.parametrize(("f_plus", "period"), [(14.08, 1e-4), (6.89, 1e-4), (7.8, 1e-4), (2.6, 5e-4)])
+@pytest.mark.parametrize(("f_plus", "period"), [(14.08, 1e-4), (2.6, 5e-4)])
 def test_the_final_accuracy_itself_can_be_asked_for(f_plus, period):
     """In units of f⁺ T it may come out below the last bound by rounding; no bound is then as small."""
     gains = 2.5 * math.sqrt(f_plus), 3.0 * f_plus
@@ -179,12 +190,12 @@ def test_single_precision_of_the_caller_does_not_matter(proven):
         assert certify(*GAINS, **BOUNDS) == proven
 
 
-TABLE = {"num": 4, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 10.0}, "lambda_ratio": {"start": 0.8, "stop": 6.0}}
+TABLE = {"num": 3, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 10.0}, "lambda_ratio": {"start": 0.8, "stop": 6.0}}
 
 
 def study(**asked):
     changes = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
-               "encoders.noise": 1e-5, "encoders.motor_resolution": 2e-5, "run.duration": 0.4}  # fmt: skip
+               "encoders.noise": 1e-5, "encoders.motor_resolution": 2e-5, "run.duration": 0.2}  # fmt: skip
     torque = [{"kind": "motor.constant_torque", "torque": 0.05}]
     return rigid(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": asked}})
 
@@ -217,17 +228,17 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     assert 0.0 < error[late].max() <= certificate_data["accuracy"]
 
 
-def test_a_finished_certificate_is_read_again(tmp_path, monkeypatch):
-    first = tune(study(), tmp_path)
+def test_a_finished_certificate_is_read_again(tmp_path, free, monkeypatch):
+    tune(study(), tmp_path)
     monkeypatch.setattr(certificate, "certify", None)
-    assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
+    assert tune(study(), tmp_path).summary["certificates"] == free.summary["certificates"]
     limited = tmp_path / "tune" / "certificate.json"
     limited.write_text(limited.read_text()[:-20])
     monkeypatch.undo()
-    assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
+    assert tune(study(), tmp_path).summary["certificates"] == free.summary["certificates"]
 
 
-def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
+def test_gains_are_chosen_that_keep_the_limits(free):
     limit = 0.9 * free.summary["certificates"]["motor"]["final_accuracy"]
     limited = tune(study(accuracy=limit))
     certificate_data = limited.summary["certificates"]["motor"]
@@ -237,21 +248,19 @@ def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
     better = limited.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
     better = better[better["error"] < limited.summary["achieved"]["motor"]["velocity_rmse"]]
     assert len(better) == limited.summary["passed_over"]["motor"]
-    bounds = {
-        name: certificate_data["assumptions"][name] for name in ("noise", "velocity_error", "position_error", "period")
-    }
     for row in better.to_dict("records"):
         f_plus = max(limited.summary["f_plus"]["motor"], row["f_plus"])
-        assert certify(row["lambda"], row["alpha"], **bounds, f_plus=f_plus, runs=1)["final_accuracy"] > limit
-    lines = write_tune_report(limited, tmp_path)
+        assumptions = Assumptions(**certificate_data["assumptions"] | {"f_plus": f_plus})
+        assert _prove(row["lambda"], row["alpha"], assumptions, None).bounds[-1] > limit
+    lines = certificate_lines(limited.summary)
     assert any(f"the gains keep what was asked for; {len(better)} gains with less error" in line for line in lines)
 
 
-def test_limits_that_no_gains_keep_are_said_to_be_missed(tmp_path, free):
+def test_limits_that_no_gains_keep_are_said_to_be_missed(free):
     tuned = tune(study(accuracy=1e-6))
     assert tuned.summary["gains"] == free.summary["gains"]
     assert tuned.summary["passed_over"] == {"motor": 0}
-    lines = write_tune_report(tuned, tmp_path)
+    lines = certificate_lines(tuned.summary)
     assert "motor, certificate: what was asked for is not proven: accuracy 1e-06 rad/s." in lines
 
 
