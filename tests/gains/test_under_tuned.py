@@ -41,10 +41,10 @@ def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=
             state,
             method="DOP853",
             events=passes,
-            rtol=1e-9,
+            rtol=1e-7,
             atol=1e-13,
             first_step=min(1e-4 * size, end - time),
-            max_step=0.1 * max(size, 1e-3),
+            max_step=0.5 * max(size, 1e-3),
         )
         if solution.status != 1:
             break
@@ -134,7 +134,7 @@ def test_excursions_where_the_error_settles_between_pulses(lambda_, damping):
     assert simulated.largest == pytest.approx(excursion(1.3, times, disturbance, damping), rel=1e-4)
 
 
-CYCLES = [(1.15, 0.3, 0.0), (2.0, 0.2, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3), (2.0, 0.0, 0.25)]
+CYCLES = [(1.15, 0.3, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3)]
 
 
 @pytest.mark.parametrize(("alpha", "lambda_", "damping"), CYCLES)
@@ -150,7 +150,7 @@ def test_limit_cycle_under_a_sine(alpha, lambda_, damping):
     np.testing.assert_allclose(np.abs(x2[-4:]), simulated.stable, rtol=1e-3)
 
 
-@pytest.mark.parametrize("alpha", [1.15, 2.0, 10.0])
+@pytest.mark.parametrize("alpha", [1.15, 10.0])
 def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
     limit = SINE_LIMIT / np.sqrt(alpha)
     assert round(SINE_LIMIT, 3) == 0.73
@@ -162,13 +162,16 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
     # without approximation the limit is at most 5 % larger: beyond that errors of any phase go to zero
     phase = np.pi - np.arcsin(0.9)
     start = 0.0, sine_cycle(0.9 * limit, alpha, 1.0, frequency).stable
-    _, lasting = peaks(0.9 * limit, alpha, lambda t: np.sin(t + phase), 500.0, 0.0, start, most=100)
-    assert len(lasting) == 100
+    _, lasting = peaks(0.9 * limit, alpha, lambda t: np.sin(t + phase), 500.0, 0.0, start, most=60)
+    assert len(lasting) == 60
     assert np.abs(lasting[-4:]).min() > 0.9 * start[1]
-    for phase in np.arange(0.0, 2.0 * np.pi, 0.5 * np.pi):
-        start = 0.0, 0.5 * np.pi * alpha
-        _, x2 = peaks(1.08 * limit, alpha, lambda t, p=phase: np.sin(t + p), 500.0, 0.0, start, most=200, least_peak=1e-3)
-        assert np.abs(x2[-1]) < 1e-3
+    # cycles have peaks of about pi / 2 alpha: far below that nothing upholds an error
+    largest, small = 0.5 * np.pi * alpha, 0.05 * alpha
+    for phase in np.arange(3) * 2.0 * np.pi / 3.0:
+        _, x2 = peaks(
+            1.08 * limit, alpha, lambda t, p=phase: np.sin(t + p), 500.0, 0.0, (0.0, largest), most=200, least_peak=small
+        )
+        assert np.abs(x2[-1]) < small
 
 
 def test_least_frequency_of_a_cycle():
@@ -188,15 +191,18 @@ def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
     monkeypatch.setattr("jaxbl.gains.under_tuned._ZERO_RATIO", 0.01)
     least = least_cycle_frequency_simulated(0.005, alpha, 1.0, 3.0)
     assert least / least_cycle_frequency(0.005, alpha, 1.0, 3.0) == pytest.approx(ratio, rel=0.01)
-    ends = []
-    for frequency in (0.95 * least, 1.1 * least):
-        times = np.linspace(0.0, 15.0 / frequency, 901)
-        for phase in (0.0, 0.7 * np.pi, 1.4 * np.pi):
-            sine = np.sin(2.0 * np.pi * frequency * times + phase)
-            path = simulate_error(0.005, alpha, times, sine, damping=3.0, velocity_error=0.4 * alpha / frequency)
-            ends.append(path.peaks[-1] / path.peaks[0])
-    assert max(ends[:3]) < 0.02
-    assert max(ends[3:]) > 0.2
+    # ends differ by a factor of ten: no digits are needed
+    monkeypatch.setattr("jaxbl.gains.under_tuned._TOLERANCE", 1e-6)
+
+    def last_peak(frequency, phase, periods):
+        """The last peak over the first one."""
+        times = np.linspace(0.0, periods / frequency, round(60 * periods) + 1)
+        sine = np.sin(2.0 * np.pi * frequency * times + phase)
+        path = simulate_error(0.005, alpha, times, sine, damping=3.0, velocity_error=0.4 * alpha / frequency)
+        return path.peaks[-1] / path.peaks[0]
+
+    assert max(last_peak(0.95 * least, phase, 15.0) for phase in (0.0, 0.7 * np.pi, 1.4 * np.pi)) < 0.02
+    assert last_peak(1.1 * least, 0.0, 8.0) > 0.2
 
 
 TABLE_1 = {"motor": {"lambda": 0.005, "alpha": 1.8}, "load": {"lambda": 0.5, "alpha": 0.4}}
@@ -205,10 +211,10 @@ TABLE_1 = {"motor": {"lambda": 0.005, "alpha": 1.8}, "load": {"lambda": 0.5, "al
 @pytest.mark.parametrize(("amplitude", "frequency"), [(0.9, 2.0), (0.6, 1.43)])
 def test_gains_of_table_1_end_in_the_cycle_on_the_papers_drive_at_a_higher_frequency(amplitude, frequency):
     excitation = {"kind": "sine", "amplitude": amplitude, "frequency": frequency}
-    timed = {"duration": 16.0, "sample_period": 1e-4}
+    timed = {"duration": 10.0, "sample_period": 1e-4}
     study = read_config(small(encoders={}, observer=TABLE_1, excitation=excitation, run=timed))
     trace = run(study).trace
-    part = trace[trace["t"] >= 16.0 - 8.0 / frequency]
+    part = trace[trace["t"] >= 10.0 - 8.0 / frequency]
     velocity, acceleration, torque = (part[name].to_numpy() for name in ("motor.velocity", "motor.acceleration", "u"))
     missing = acceleration - (torque - 0.15 * velocity) / 0.05
     # alpha covers all of it
