@@ -145,10 +145,11 @@ def _march(
     begin = state, jnp.asarray(starts_moving) & (zero == 0.0), zero > 0.0, jnp.asarray(0)
     state, _, has_event, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[1]) & (carry[3] < _MOST_STEPS), advance, begin)
     # the last step ends at the event
-    h = 0.5 * step_size(state)
-    for _ in range(6):
+    def newton_step(_: int, h: Values) -> Values:
         event_value, rate = jax.jvp(lambda h: event(_runge_kutta(slope, state, h)), (h,), (jnp.ones_like(h),))
-        h = jnp.clip(h - event_value / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
+        return jnp.clip(h - event_value / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
+
+    h = jax.lax.fori_loop(0, 6, newton_step, 0.5 * step_size(state))
     last = _runge_kutta(slope, state, h)
     return jax.tree.map(partial(jnp.where, has_event), last, state), has_event
 

@@ -248,12 +248,28 @@ def test_another_studys_folder_is_left_as_it_is(verified):
     assert contents(folder) == before
 
 
-def test_another_q_and_other_marks_go_on_with_what_is_there(verified, monkeypatch, tmp_path):
-    verdict, folder = verified
+AT_REST = rigid(
+    {"encoders.noise": 0.0, "observer.motor.velocity_error": 0.0},
+    excitation={"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
+    effects=[{"kind": "motor.coulomb_friction", "torque": 0.2}],
+    axes=[listed(LAMBDA, 0.1, 6.0), listed(ALPHA, 0.5, 9.0)],
+    verify=ATLAS,
+)
+
+
+@pytest.fixture(scope="module")
+def verified_at_rest(tmp_path_factory):
+    """The verdict on `AT_REST`, and its folder."""
+    folder = tmp_path_factory.mktemp("at_rest")
+    return verify(AT_REST, folder), folder
+
+
+def test_another_q_and_other_marks_go_on_with_what_is_there(verified_at_rest, monkeypatch, tmp_path):
+    verdict, folder = verified_at_rest
     shutil.copytree(folder, tmp_path / "copy")
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
     twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
-    again = verify(VERIFIED | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
+    again = verify(AT_REST | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
     titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
     assert titles == ["Davila-Fridman (32), q = 0.6"] * 3
     least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (again, verdict))
@@ -353,16 +369,9 @@ def test_runs_repeated_for_their_cause_keep_their_noise():
     assert set(rows["seed"]) <= {5, 6}
 
 
-def test_claimed_bound_that_misses_friction_at_rest(tmp_path):
+def test_claimed_bound_that_misses_friction_at_rest(verified_at_rest):
     """A torque below break-away moves nothing: no acceleration, but friction acts all the same."""
-    study = rigid(
-        {"encoders.noise": 0.0, "observer.motor.velocity_error": 0.0},
-        excitation={"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
-        effects=[{"kind": "motor.coulomb_friction", "torque": 0.2}],
-        axes=[listed(LAMBDA, 0.1, 6.0), listed(ALPHA, 0.5, 9.0)],
-        verify=ATLAS,
-    )
-    verdict = verify(study)
+    verdict, _ = verified_at_rest
     frame = verdict.levels["drive"]
     np.testing.assert_allclose(frame["motor.f_plus_acceleration"], 0.0, atol=1e-12)
     np.testing.assert_allclose(frame["motor.f_plus"][frame[ALPHA] == 9.0], 0.1 / 0.05, rtol=0.01)
