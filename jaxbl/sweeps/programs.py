@@ -53,9 +53,10 @@ _shared_results: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared",
 def share_programs() -> Iterator[None]:
     """Let studies that run inside share programs: studies that differ only in the values of their lanes compile once.
 
-    The stages of a search for gains are such studies.
+    The stages of a search for gains are such studies. Inside another such context they share its programs.
     """
-    before = _shared_results.set(OrderedDict())
+    shared = _shared_results.get()
+    before = _shared_results.set(OrderedDict() if shared is None else shared)
     try:
         yield
     finally:
