@@ -144,6 +144,7 @@ def _march(
 
     begin = state, jnp.asarray(starts_moving) & (zero == 0.0), zero > 0.0, jnp.asarray(0)
     state, _, has_event, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[1]) & (carry[3] < _MOST_STEPS), advance, begin)
+
     # the last step ends at the event
     def newton_step(_: int, h: Values) -> Values:
         event_value, rate = jax.jvp(lambda h: event(_runge_kutta(slope, state, h)), (h,), (jnp.ones_like(h),))

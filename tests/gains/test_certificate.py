@@ -27,7 +27,7 @@ BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "
 
 @pytest.fixture(autouse=True, scope="module")
 def _proofs_once(compiled_once):
-    """Searches of this file prove and explore the same gains again and again; few runs show what a certificate says of them."""
+    """Searches of this file prove and explore the same gains again and again. A thousand runs show what is said of them."""
     results = {}
 
     def explore_once(observer, system):

@@ -22,6 +22,8 @@ from jaxbl.sweeps.programs import Layout
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import submit, sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 _submit = Cluster._submit
 
 
