@@ -112,10 +112,12 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     study = rigid(axes=[listed(path, 0.04, 0.06, 0.09)], sweep={"metrics": ["velocity_rmse"]}) | {"excitation": excitation}
     config = read_config(study)
     assert Engine(config).backend == "fused"
-    result, scanned = sweep(config), sweep(config, backend="scan").frame
+    result = sweep(config)
     assert result.fallback_reasons == why
-    frame = result.frame
-    np.testing.assert_allclose(frame["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
+    assert result.frame["motor.velocity_rmse"].nunique() == 3
+    if not why:
+        scanned = sweep(config, backend="scan").frame
+        np.testing.assert_allclose(result.frame["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
 
 
 def test_the_faster_backend_is_chosen():
@@ -230,7 +232,7 @@ def test_dry_run_counts_without_running_the_study():
     study = rigid(
         {"run.duration": 1e4},
         axes=[spaced(ALPHA, 1.0, 2.0, 50), listed("run.substeps", 1, 2)],
-        sweep={"seeds": 7, "chunk": 100},
+        sweep={"seeds": 7, "chunk": 100, "metrics": ["velocity_rmse"]},
     )
     cost = dry_run(study)
     assert (cost.points, cost.rows) == (100, 700)
@@ -339,10 +341,12 @@ def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
         return engine, engine.run(engine.chunk(0))
 
     _, full = run()
-    _, result = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
+    _, requested = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
     columns = [f"motor.{name}" for name in ("converged", "velocity_rmse", "margin_alpha")]
-    assert list(result) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
-    assert_equal(result, full[list(result)])
+    assert list(requested) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
+    assert_equal(requested, full[list(requested)])
+    if backend == "scan":
+        return
     # none of these follows from gains
     engine, alone = run(metrics=["converged"])
     assert list(alone)[4:] == ["finite", "motor.converged"]

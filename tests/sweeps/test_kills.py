@@ -2,15 +2,15 @@
 is computed twice once its part was whole, and nothing else is left in the folder."""
 
 import multiprocessing
-import os
 import random
 import signal
 import socket
-import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from importlib import import_module
 
+import dask
 import pytest
 from small_study import parts, spaced, thirty
 
@@ -21,7 +21,7 @@ from jaxbl.sweeps.sweep import share, sweep
 
 # a process that has loaded everything and started nothing: its children begin at once
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed"])
+CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed.cli.dask_worker", "distributed.cli.dask_scheduler"])
 
 
 def study(points=120):
@@ -87,7 +87,7 @@ def test_killed_at_random_moments(tmp_path, alone, repeats):
     expected, seconds = alone
     rng = random.Random(0)
     kills = rounds = 0
-    while kills < repeats(6, 200) or rounds < 2:
+    while kills < repeats(4, 200):
         folder, rounds, before = tmp_path / f"{rounds}", rounds + 1, {}
         while True:
             process = start_process(_sweep, folder)
@@ -118,26 +118,30 @@ def test_shares_of_which_one_is_killed(tmp_path, alone):
     assert before.items() <= expected_frame(tmp_path / "study", expected).items()
 
 
+def _run_dask(module, words):
+    """The command of Dask in this module; a process that is killed is not the fault of the work that it had."""
+    dask.config.set({"distributed.scheduler.allowed-failures": 10})
+    import_module(module).main(words)
+
+
 @contextmanager
-def dask(*words):
+def run_dask(module, *words):
     """A process of a cluster."""
-    # none is restarted by another one
-    environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "10"}
-    process = subprocess.Popen([sys.executable, "-m", *words], env=environment, stderr=subprocess.DEVNULL)
+    process = start_process(_run_dask, module, words)
     try:
         yield process
     finally:
         process.kill()
-        process.wait()
+        process.join()
 
 
 def worker(address, folder):
     words = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), "--death-timeout", "60")
-    return dask("distributed.cli.dask_worker", address, *words)
+    return run_dask("distributed.cli.dask_worker", address, *words)
 
 
 def scheduler(port):
-    return dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+    return run_dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
 
 
 def until(true, seconds=120.0):
