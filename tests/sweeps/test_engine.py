@@ -114,7 +114,7 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     assert Engine(config).backend == "fused"
     result = sweep(config)
     assert result.fallback_reasons == why
-    assert result.frame["motor.velocity_rmse"].nunique() == 3
+    assert (result.frame["motor.velocity_rmse"] > 0.0).sum() == 3
     if not why:
         scanned = sweep(config, backend="scan").frame
         np.testing.assert_allclose(result.frame["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
