@@ -3,6 +3,7 @@
 import ast
 import builtins
 import dis
+import functools
 import graphlib
 import importlib
 import inspect
@@ -63,15 +64,17 @@ def test_public_names_resolve_and_are_documented():
     assert declared - {None} == set(dir(jaxbl))
 
 
+@functools.cache
 def list_imports(file, root=ROOT):
-    """Dotted names that a file imports: at its head, inside functions, and for type checkers only."""
-    package = file.relative_to(root).parent.parts
+    """Return dotted names that a file imports: at its head, inside functions, and for type checkers only."""
+    package, names = file.relative_to(root).parent.parts, []
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) + 1 - node.level] if node.level else ()
-            yield from (".".join([*base, *filter(None, [node.module]), alias.name]) for alias in node.names)
+            names += [".".join([*base, *filter(None, [node.module]), alias.name]) for alias in node.names]
+    return names
 
 
 def find_import_circle(root, *folders):
@@ -113,8 +116,8 @@ def test_imports_run_downward():
 
 
 def test_the_import_check_sees_imports():
-    assert "jaxbl.errors.InputError" in set(list_imports(ROOT / "jaxbl" / "sweeps" / "store.py"))
-    assert "jaxbl.sweeps.sweep.StudyResult" in set(list_imports(ROOT / "jaxbl" / "report" / "sweep.py"))
+    assert "jaxbl.errors.InputError" in list_imports(ROOT / "jaxbl" / "sweeps" / "store.py")
+    assert "jaxbl.sweeps.sweep.StudyResult" in list_imports(ROOT / "jaxbl" / "report" / "sweep.py")
 
 
 def globals_of(code):

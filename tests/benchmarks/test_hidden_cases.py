@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from blind_diagnosis import fail_to_reach, see_nothing
 from hidden.cases import _PLANTS, ALONE, KINDS, _add_known_effect, _targets, cases, save
 from hidden.effects import APART, EFFECTS, LEVELS, NEW, PINION, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
@@ -63,9 +64,9 @@ def test_clutter_is_there_and_small_and_its_name_is_not_spurious(hidden_cases):
         assert not set(case.truth["clutter"]) & set(case.truth["effects"])
     case = hidden_cases[-1]
     output = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
-    one = outcome(case, {"verdict": "unknown_effect", "findings": output})
-    assert one.is_right and one.spurious_effects == ["motor.inertia"]
-    assert sum(row["right"] * row["count"] for row in calibration([one])) == 2
+    judged = outcome(case, {"verdict": "unknown_effect", "findings": output})
+    assert judged.is_right and judged.spurious_effects == ["motor.inertia"]
+    assert sum(row["right"] * row["count"] for row in calibration([judged])) == 2
 
 
 def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
@@ -231,20 +232,11 @@ def test_the_error_of_a_nominal_number_is_the_effect_and_nothing_else():
         assert abs(added) > 0.99 * APART * case.conditions["uncertainty"] * case.model["drive"][key]
 
 
-def _sees_nothing(logs, model, holdout):
-    gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.0}, "noise_floor": {"theta_e": 0.1}}
-    return {"verdict": "no_discrepancy", "findings": [], "gap": gap}
-
-
-def _no_oracle(case):
-    raise RuntimeError("not this one")
-
-
 def test_processes_share_the_cases_and_an_oracle_may_fail(hidden_cases, capsys):
     selection = [case for case in hidden_cases if case.hidden][:3]
-    outcomes = run(selection, _sees_nothing, _no_oracle, jobs=2)
-    assert [one.name for one in outcomes] == [case.name for case in selection]
-    assert all(one.ratio is None and one.reduction == 0.0 for one in outcomes)
+    outcomes = run(selection, see_nothing, fail_to_reach, jobs=2)
+    assert [judged.name for judged in outcomes] == [case.name for case in selection]
+    assert all(judged.ratio is None and judged.reduction == 0.0 for judged in outcomes)
     messages = [line for line in capsys.readouterr().err.splitlines() if " of 3: " in line]
     assert len(messages) == 3 and all("WRONG" in line for line in messages)
 
@@ -283,7 +275,7 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(hidden_cases, ora
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
     assert set(truth) == {case.name for case in selection}
     outcomes = read_outcomes(hidden_cases[:4], tmp_path / "found")
-    assert [one.is_right for one in outcomes] == [True, True, True, False]
+    assert [judged.is_right for judged in outcomes] == [True, True, True, False]
     result = write(outcomes, tmp_path / "out", "A seed")
     assert {path.name for path in result} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
     assert (tmp_path / "out" / "scores.md").read_text().startswith("## A seed")
