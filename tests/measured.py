@@ -1,5 +1,6 @@
 """Measured logs for tests: made ones whose truth is known, and where the real ones lie."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxbl.records import NominalDrive
+from jaxbl.records import NominalDrive, Record, read_record
 
 GEAR_RATIO, INERTIA, VISCOUS, COULOMB = 20.0, 0.01, 0.05, 0.1
 
@@ -96,6 +97,17 @@ def real(name: str) -> Path:
     if not (folder / name).exists():
         pytest.skip(f"no recording {name} (the folder with them is named by JAXBL_DATA)")
     return folder / name
+
+
+def read_stretch(name: str, table: dict[str, Any], seconds: float) -> Record:
+    """Read the first seconds of a real recording."""
+    record = read_record(real(name), table)
+    count = round(seconds / record.sample_period)
+    positions = {side: values[:count] for side, values in record.positions.items()}
+    torque = None if record.torque is None else record.torque[:count]
+    return dataclasses.replace(
+        record, time=record.time[:count], torque=torque, positions=positions, segments=(slice(0, count),)
+    )
 
 
 EMPS: dict[str, Any] = {

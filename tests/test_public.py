@@ -110,7 +110,7 @@ def test_imports_run_downward():
     for file in FILES:
         part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
         if part not in ("__init__", "__main__"):
-            targets = [name.split(".")[1] for name in list_imports(file) if name.startswith("jaxbl.")]
+            targets = [name.split(".")[1] for name in list_imports(file, ROOT) if name.startswith("jaxbl.")]
             faults += [f"{file}: {part} imports {name}" for name in targets if name != part and name not in BELOW[part]]
     assert not faults, "\n".join(faults)
 

@@ -8,10 +8,9 @@ from small_study import rigid
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
-from jaxbl.identification.compilation import jit
 from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.intervals import interval, profile, spread
-from jaxbl.identification.trajectory import _fit, cut, fit
+from jaxbl.identification.trajectory import cut, fits
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 
@@ -33,16 +32,16 @@ def record(seed=0, size=0.2, drag=0.15):
     return cut(torque, readings, PERIOD, plant_state, {"motor": NOISE}, SAMPLES)
 
 
-def fitted(paths, windows):
+def fit_numbers(paths, windows):
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
     free = make_free_parameters(experiment, paths, 1.0)
-    result = _fit(experiment, free, windows, jnp.zeros(len(free)))
+    (result,) = fits(experiment, free, windows, np.zeros((1, len(free))))
     return experiment, free, result
 
 
 def test_where_the_fit_is_quadratic_both_intervals_agree():
     windows = record(size=2.0)
-    experiment, free, result = fitted(["drive.motor_inertia", "drive.motor_viscous"], windows)
+    experiment, free, result = fit_numbers(["drive.motor_inertia", "drive.motor_viscous"], windows)
     width = spread(result)
     profiles = profile(experiment, free, windows, result, width)
     for i, number in enumerate(free):
@@ -57,15 +56,15 @@ def test_where_it_is_not_the_profile_follows_the_likelihood():
     """Weak excitation: the friction is hardly seen. The reference is a root of the cost with all else fitted anew."""
     windows = record(size=0.003, seed=3)
     paths = ["drive.motor_inertia", "drive.motor_viscous"]
-    experiment, free, result = fitted(paths, windows)
+    experiment, free, result = fit_numbers(paths, windows)
     width = spread(result)
     ends = profile(experiment, free, windows, result, width)["drive.motor_viscous"].interval
     scale = float(width.variance) * float(width.inflation[1]) ** 2
-    again = jit(lambda theta: fit(experiment, free, windows, theta, 60, jnp.array([False, True])).cost)
 
     def excess(value):
-        theta = jnp.array([float(result.theta[0]), np.log(value / 0.15)])
-        return 2.0 * (float(again(theta)) - float(result.cost)) / scale - 3.841
+        theta = np.array([[result.theta[0], np.log(value / 0.15)]])
+        (again,) = fits(experiment, free, windows, theta, 60, np.array([[False, True]]))
+        return 2.0 * (float(again.cost) - float(result.cost)) / scale - 3.841
 
     best = 0.15 * np.exp(float(result.theta[1]))
     assert ends[1] == pytest.approx(brentq(excess, best, 20.0 * best, xtol=1e-6), rel=0.03)
