@@ -13,7 +13,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
 from jaxbl.simulate import Experiment, move_plant
 
-from .block import Outputs, Program, Quantity, Values, lower_block, trace_block
+from .block import Block, Outputs, Program, Quantity, Values, lower_block, trace_block
 from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
 from .lowering import default_precision, find_read_variables
 
@@ -63,16 +63,17 @@ def build_plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProg
         experiment = as_arrays(config.build(), dtype)
     candidates = {path: parameter for path, parameter in leaf_paths(experiment).items() if path.startswith(_PARTS)}
     # a number that the motion does not read is no parameter: those of encoders
-    full_program = _lower_plant(experiment, name, dtype, candidates, candidates)
+    program = lower_block(_trace_plant(experiment, name, dtype, candidates, candidates))
     start_parameters, step_parameters = (
         {
             path: parameter
             for path, parameter in candidates.items()
             if _make_identifier(path) in {variable.name for variable in find_read_variables(routine)}
         }
-        for routine in (full_program.start, full_program.step)
+        for routine in (program.start, program.step)
     )
-    program = _lower_plant(experiment, name, dtype, start_parameters, step_parameters)
+    # the same operations: none of them reads the others
+    program = program._replace(block=_trace_plant(experiment, name, dtype, start_parameters, step_parameters))
     source = config.build()
     parameters_read = {
         path: parameter for path, parameter in candidates.items() if path in start_parameters or path in step_parameters
@@ -94,14 +95,14 @@ def _make_identifier(path: str) -> str:
     return re.sub(r"\W", "_", path, flags=re.ASCII)
 
 
-def _lower_plant(
+def _trace_plant(
     experiment: Experiment,
     name: str,
     dtype: np.dtype,
     start_parameters: dict[str, Parameter],
     step_parameters: dict[str, Parameter],
-) -> Program:
-    """Lower the drive to a program whose `start` and `step` take the numbers at these config paths as arguments."""
+) -> Block:
+    """Trace the drive as a block whose `start` and `step` take the numbers at these config paths as arguments."""
     numbers = {path: _make_identifier(path) for path in (start_parameters | step_parameters)}
     if len(set(numbers.values())) < len(numbers):
         raise Unsupported("two numbers that have one name in code")
@@ -133,9 +134,7 @@ def _lower_plant(
         return MovingDrive(moved, samples), _read_outputs(placed, state.plant, moved, arguments[_INPUT])
 
     study_numbers = {PERIOD: read_study_numbers(experiment)[PERIOD]}
-    return lower_block(
-        trace_block(name, dtype, study_numbers, start_inputs, [torque, *step_inputs], start, step, first_outputs)
-    )
+    return trace_block(name, dtype, study_numbers, start_inputs, [torque, *step_inputs], start, step, first_outputs)
 
 
 def _read_outputs(experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any) -> Outputs:
