@@ -90,20 +90,29 @@ def parts(half, precision):
     [
         (HALF, DeadZone(60.0, 0.05), {}),
         (OTHERS, LinearShaft(60.0), {"observer": "explicit", "substeps": 1}),
-        (["motor.coulomb_friction", "load.gravity"], None, {"rigid": True, "substeps": 3}),
     ],
-    ids=["half", "others", "rigid"],
+    ids=["half", "others"],
 )
 def test_figures_are_those_of_the_scan(names, law, options):
-    """By threads that get different numbers of lanes, and in the kernel of accelerators, interpreted: two programs of the
-    grid, the last lanes filled up, blocks of samples with a rest."""
+    """By threads that get different numbers of lanes."""
     full_experiment = experiment(names, law, **options)
     effects = [path for path in leaf_paths(full_experiment) if path.startswith("effects.")]
     values = spread(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
-    fused, expected = (
-        HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3),
-        scan_lanes(full_experiment, values, ALL_METRICS, 3),
+    fused = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3)
+    expected = scan_lanes(full_experiment, values, ALL_METRICS, 3)
+    assert set(fused) == set(expected)
+    for name, figure in fused.items():
+        np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
+
+
+def test_figures_of_one_inertia_are_those_of_the_scan_and_of_the_kernel_of_accelerators():
+    """The kernel, interpreted: two programs of the grid, the last lanes filled up, blocks of samples with a rest."""
+    full_experiment = experiment(["motor.coulomb_friction", "load.gravity"], rigid=True, substeps=3)
+    values = spread(
+        full_experiment, ["effects.motor.coulomb_friction.torque", "observer.motor.alpha", "encoders.noise"], 150
     )
+    fused = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3)
+    expected = scan_lanes(full_experiment, values, ALL_METRICS, 3)
     device = DeviceSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
@@ -170,8 +179,9 @@ def test_the_kernel_of_accelerators_in_single_precision():
             assert np.median(np.abs(figure / host[name] - 1.0)) < 1e-3, name
 
 
-@pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("half", "precision"), [(True, "float64"), (False, "float32")], ids=["half, float64", "others, float32"]
+)
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
@@ -193,9 +203,8 @@ def test_a_processor_has_no_kernel_of_accelerators():
         DeviceSimulator(experiment([], LinearShaft(60.0)), (ALL_METRICS,), ("transmission.stiffness",), 5)
 
 
-@pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
-def test_what_is_joined_for_a_gpu_computes_the_same(half):
-    result, joined = parts(half, "float64"), []
+def test_what_is_joined_for_a_gpu_computes_the_same():
+    result, joined = parts(True, "float64"), []
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
         joined.append(a)

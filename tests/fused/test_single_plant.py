@@ -178,7 +178,7 @@ def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
     assert module._trajectory_loop.cache_info().misses == before
     assert np.ptp(runs[0] - runs[1]) > 0.0
     # made, used and dropped many times in one process
-    for _ in range(5):
+    for _ in range(2):
         module._trajectory_loop.cache_clear()
         gc.collect()
         assert np.array_equal(simulate_plant(one, start, torque).position["motor"], runs[0])
