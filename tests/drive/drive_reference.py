@@ -193,6 +193,18 @@ def trajectory(plant, substeps, start=START, torques=TORQUES, hold=HOLD, dtype=j
     return np.asarray(states)
 
 
+_trajectories = eqx.filter_jit(eqx.filter_vmap(_trajectory, in_axes=(eqx.if_array(0), None, None, None, None)))
+
+
+def trajectories(plants, substeps, dtype=jnp.float64):
+    """The same for several plants of one structure, shape (plants, holds, 4)."""
+    stacked = jax.tree.map(lambda *numbers: np.stack(numbers), *plants)
+    initial, torques, hold = as_arrays((Initial(**START), jnp.asarray(TORQUES, dtype), float(HOLD)), dtype)
+    states = _trajectories(stacked, initial, torques, jnp.asarray(substeps), hold)
+    assert states.dtype == dtype
+    return np.asarray(states)
+
+
 LAWS = {
     "sigmoid_backlash": (SigmoidBacklash(**SIGMOID), sigmoid),
     "linear_shaft": (LinearShaft(stiffness=3.0), lambda z: 3.0 * z),

@@ -1,6 +1,7 @@
 """Every effect against equations written out independently; dry friction against closed forms; other packages' effects."""
 
 import ast
+import functools
 import inspect
 import re
 import types
@@ -9,7 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drive_reference import START, block, plant, reference, trajectory
+from drive_reference import START, block, plant, reference, trajectories, trajectory
 from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
@@ -24,11 +25,29 @@ def make_effects(values):
     return [make_effect(name, **numbers) for name, numbers in values.items()]
 
 
+def make_neutral(name):
+    """An effect at numbers with which it does nothing."""
+    numbers = VALUES[name] | EFFECTS[name].neutral()
+    zeros = {key: (0.0,) * len(torques) for key, torques in numbers.items() if key.endswith("_torques")}
+    # its gain is a quotient
+    tiny = dict.fromkeys(numbers, 1e-30) if name == "actuator.back_emf" else {}
+    return make_effect(name, **numbers | zeros | tiny)
+
+
+@functools.cache
+def single_effect_trajectories(substeps, dtype=jnp.float64):
+    """The trajectory of the drive with each effect by its name, the others neutral: all by one program."""
+    neutral = {name: make_neutral(name) for name in VALUES}
+    effects = [neutral | {name: make_effect(name, **VALUES[name])} for name in VALUES]
+    plants = [plant(*by_name.values(), dtype=dtype) for by_name in effects]
+    return dict(zip(VALUES, trajectories(plants, substeps, dtype), strict=True))
+
+
 def errors(values, *substeps):
-    """How far the drive is from the reference, by so many substeps; and the reference."""
+    """How far the drive is from the reference, by so many substeps."""
     expected = reference(effects=values)
     assert expected[:, 2:].min() > 0.1  # sliding forwards
-    return *(np.abs(trajectory(plant(*make_effects(values)), n) - expected).max() for n in substeps), expected
+    return [np.abs(trajectory(plant(*make_effects(values)), n) - expected).max() for n in substeps]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +66,9 @@ def test_the_names_are_the_contract():
 
 @pytest.mark.parametrize("name", VALUES)
 def test_each_effect_is_what_its_equation_says_to_second_order(name, motion_without_effects):
-    coarse, fine, expected = errors({name: VALUES[name]}, 128, 1024)
+    expected = reference(effects={name: VALUES[name]})
+    assert expected[:, 2:].min() > 0.1  # sliding forwards
+    coarse, fine = (np.abs(single_effect_trajectories(n)[name] - expected).max() for n in (128, 1024))
     assert np.abs(expected - motion_without_effects).max() > 0.1  # it matters
     # a hard gap is only piecewise smooth: of second order in the mean
     tolerance = 0.2 if name == "transmission.backlash" else 0.01
@@ -71,7 +92,7 @@ def test_effects_add_up_in_any_order():
     # two have kinks where the transmitted torque turns: of second order in the mean
     kinked = ("transmission.backlash", "transmission.load_friction")
     values = {name: numbers for name, numbers in VALUES.items() if name not in kinked}
-    coarse, fine, _ = errors(values, 256, 4096)
+    coarse, fine = errors(values, 256, 4096)
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
     shuffled = sorted(make_effects(values), key=lambda effect: (effect.place == "actuator", effect.place))
@@ -82,14 +103,13 @@ def test_effects_add_up_in_any_order():
 def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
     values = {name: VALUES[f"transmission.{name.split('.')[1]}"] for name in VALUES if name.startswith("transmission.")}
     # damping sets in with a jump at the edges of the gap: of first order there
-    coarse, fine, _ = errors(values, 1024, 16384)
+    coarse, fine = errors(values, 1024, 16384)
     assert fine < 1e-4 and fine < coarse / 8.0
 
 
 @pytest.mark.parametrize("name", VALUES)
 def test_float32_stays_float32_and_close(name):
-    effect = make_effects({name: VALUES[name]})
-    double, single = (trajectory(plant(*effect, dtype=dtype), 32, dtype=dtype) for dtype in (jnp.float64, jnp.float32))
+    double, single = (single_effect_trajectories(32, dtype)[name] for dtype in (jnp.float64, jnp.float32))
     np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-3)
 
 
