@@ -15,8 +15,13 @@ DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 PERIODS = pytest.mark.parametrize("period", [1e-3, 7e-4, 1.0 / 3000.0])
 
 
+@jax.jit
+def _sample(excitation, times):
+    return jax.vmap(excitation)(times)
+
+
 def sample(excitation, times, dtype=jnp.float64):
-    values = jax.jit(jax.vmap(as_arrays(excitation, dtype)))(jnp.asarray(times, dtype))
+    values = _sample(as_arrays(excitation, dtype), jnp.asarray(times, dtype))
     assert values.dtype == dtype and values.shape == np.shape(times)
     return np.asarray(values)
 
@@ -118,12 +123,12 @@ def test_every_signal_scales_with_its_amplitude_as_a_grid_axis(dtype):
         "prbs": {"hold": 0.1},
     }
     assert set(numbers) | {"recorded"} == set(EXCITATIONS)
-    for name, other_numbers in numbers.items():
-        values = jax.vmap(
-            lambda amplitude, name=name, other_numbers=other_numbers: as_arrays(
-                EXCITATIONS[name](amplitude=amplitude, **other_numbers), dtype
-            )(jnp.asarray(0.37, dtype))
-        )(jnp.asarray([0.0, 1.0, -3.0], dtype))
+
+    def scale(amplitude):
+        signals = (EXCITATIONS[name](amplitude=amplitude, **others) for name, others in numbers.items())
+        return [as_arrays(signal, dtype)(jnp.asarray(0.37, dtype)) for signal in signals]
+
+    for values in jax.jit(jax.vmap(scale))(jnp.asarray([0.0, 1.0, -3.0], dtype)):
         assert values.dtype == dtype
         assert values[0] == 0.0 and values[1] != 0.0
         assert values[2] == pytest.approx(float(-3.0 * values[1]), rel=1e-6)
@@ -136,5 +141,6 @@ def test_steps_are_independent_of_encoder_noise():
 
     steps = Steps(1.0, 1.0, seed=3)
     levels = sample(steps, np.arange(40) + 0.5)
-    for noise in unit_noise(jnp.asarray(3), jnp.arange(40), ("motor", "load")).values():
+    noises = jax.jit(unit_noise, static_argnums=2)(jnp.asarray(3), jnp.arange(40), ("motor", "load"))
+    for noise in noises.values():
         assert abs(np.corrcoef(levels, 2.0 * norm.cdf(np.asarray(noise)) - 1.0)[0, 1]) < 0.5

@@ -26,13 +26,13 @@ def floats(values):
     return {key: float(value) for key, value in values.items()}
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(LAWS, TWIST)
 def test_laws_are_odd(law, z):
     assert transmitted_torque(law, -z) == -transmitted_torque(law, z)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(LAWS, TWIST)
 def test_torque_is_the_regression_with_the_true_parameters(law, z):
     truth = law.truth()
@@ -47,7 +47,7 @@ def test_torque_is_the_regression_with_the_true_parameters(law, z):
     assert floats(law.from_theta(theta)) == pytest.approx(floats(truth), rel=1e-12)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(LAWS, TWIST)
 def test_far_from_zero_the_law_is_the_shaft_less_the_half_gap(law, z):
     z = z + jnp.copysign(6.0 + 80.0 / getattr(law, "slope", 80.0), z)

@@ -60,7 +60,7 @@ class Native:
         self._library = ctypes.CDLL(str(build / "code.so"))
         self._library.size_of_state.restype = ctypes.c_size_t
         self.dtype = np.dtype(np.float32 if self.summary["precision"] == "float" else np.float64)
-        fields = [(one["name"], _CTYPES[one["type"]]) for one in self.summary["state"]]
+        fields = [(quantity["name"], _CTYPES[quantity["type"]]) for quantity in self.summary["state"]]
         self.state = type("State", (ctypes.Structure,), {"_fields_": fields})()
         self.size = self._library.size_of_state()
 
@@ -73,7 +73,7 @@ class Native:
         """Outputs (samples, outputs) of inputs (samples, inputs)."""
         inputs = np.ascontiguousarray(inputs, self.dtype)
         out = np.empty((len(inputs), len(self.summary["outputs"])), self.dtype)
-        places = (one.ctypes.data_as(ctypes.c_void_p) for one in (inputs, out))
+        places = (array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, out))
         self._library.go(ctypes.byref(self.state), ctypes.c_long(len(inputs)), *places)
         return out
 

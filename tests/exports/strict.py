@@ -35,10 +35,9 @@ class Strict:
     def __init__(self, block):
         self.single = block.dtype == np.float32
         numbers = [self.real(number.value) for number in block.study_numbers.values()]
-        count, known = len(block.state), len(numbers)
-        self._start = self._made(block.start, known, [])(*numbers)
-        self._step = self._made(block.step, known, [])(*numbers)
-        self._count = count
+        self._start = self._compile(block.start, len(numbers))(*numbers)
+        self._step = self._compile(block.step, len(numbers))(*numbers)
+        self._count = len(block.state)
 
     def real(self, value):
         return np.float32(value) if self.single else float(value)
@@ -47,21 +46,21 @@ class Strict:
         return list(self._start(*map(self.real, first)))
 
     def step(self, state, inputs):
-        result = self._step(*state, *inputs)
-        return list(result[: self._count]), list(result[self._count :])
+        leaves = self._step(*state, *inputs)
+        return list(leaves[: self._count]), list(leaves[self._count :])
 
-    def _made(self, closed, known, _):
-        """A function of known numbers, which gives that of the others."""
+    def _compile(self, closed, fixed):
+        """Return a function of the first `fixed` numbers, which gives that of the rest."""
         names = [f"a{i}" for i in range(len(closed.jaxpr.invars))]
         self._within = False
         self._lines, self._number, self._constants = ([], []), 0, {}
-        results = self._write(closed, [(one, i >= known) for i, one in enumerate(names)], "    ")
+        results = self._write(closed, [(name, i >= fixed) for i, name in enumerate(names)], "    ")
         outer, inner = self._lines
         text = "\n".join(
             [
-                f"def make({', '.join(names[:known])}):",
+                f"def make({', '.join(names[:fixed])}):",
                 *outer,
-                f"    def run({', '.join(names[known:])}):",
+                f"    def run({', '.join(names[fixed:])}):",
                 *(f"    {line}" for line in inner),
                 f"        return ({', '.join(name for name, _ in results)},)",
                 "    return run",
@@ -79,10 +78,10 @@ class Strict:
             return name
         return repr(np.asarray(value).item())
 
-    def _write(self, closed, given, indent):
-        """Lines for a jaxpr. Values are names, and whether they depend on more than known numbers."""
+    def _write(self, closed, operands, indent):
+        """Write lines for a jaxpr. Values are names, and True if they depend on more than fixed numbers."""
         jaxpr = closed.jaxpr
-        env = dict(zip(jaxpr.invars, given, strict=True))
+        env = dict(zip(jaxpr.invars, operands, strict=True))
         for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
             env[v] = self._constant(np.asarray(value)[()], np.dtype(v.aval.dtype)), False
 
@@ -100,42 +99,42 @@ class Strict:
     def _put(self, varies, line, indent):
         self._lines[varies or self._within].append(f"{indent}{line}")
 
-    def _equation(self, eqn, given, indent):
+    def _equation(self, eqn, operands, indent):
         name, dtype = eqn.primitive.name, np.dtype(eqn.invars[0].aval.dtype)
-        varies = any(one for _, one in given)
-        texts = [text for text, _ in given]
+        varies = any(operand_varies for _, operand_varies in operands)
+        texts = [text for text, _ in operands]
         if (called := callee(eqn)) is not None:
-            return self._write(called, given, indent)
+            return self._write(called, operands, indent)
         if name in FUNCTIONS and dtype.kind == "f":
-            return self._write(trace_scalar_function(FUNCTIONS[name], dtype), given, indent)
+            return self._write(trace_scalar_function(FUNCTIONS[name], dtype), operands, indent)
         if name == "scan":
             times, body, fixed = scan_parameters(eqn)
             state = [self._new() for _ in texts[fixed:]]
             self._put(varies, f"{', '.join(state)}, = {', '.join(texts[fixed:])},", indent)
             self._put(varies, f"for _ in range({times}):", indent)
-            inside = [*((one, varies) for one in texts[:fixed]), *((one, varies) for one in state)]
-            result = self._body(body, inside, varies, indent)
-            self._put(varies, f"{', '.join(state)}, = {', '.join(one for one, _ in result)},", f"{indent}    ")
-            return [(one, varies) for one in state]
+            inside = [(text, varies) for text in (*texts[:fixed], *state)]
+            results = self._body(body, inside, varies, indent)
+            self._put(varies, f"{', '.join(state)}, = {', '.join(text for text, _ in results)},", f"{indent}    ")
+            return [(name, varies) for name in state]
         if name == "cond" and not eqn.outvars:
             return []
         if name == "cond":
             outs = [self._new() for _ in eqn.outvars]
             for i, branch in enumerate(cond_branches(eqn)):
                 self._put(varies, f"if {texts[0]} == {i}:", indent)
-                result = self._body(branch, [(one, varies) for one in texts[1:]], varies, indent)
-                self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in result)},", f"{indent}    ")
-            return [(one, varies) for one in outs]
+                results = self._body(branch, [(text, varies) for text in texts[1:]], varies, indent)
+                self._put(varies, f"{', '.join(outs)}, = {', '.join(text for text, _ in results)},", f"{indent}    ")
+            return [(name, varies) for name in outs]
         out = self._new()
         self._put(varies, f"{out} = {self._expression(eqn, name, dtype, texts)}", indent)
         return [(out, varies)]
 
-    def _body(self, closed, given, varies, indent):
-        """Lines of a loop or a choice: what stands in one that varies stays there."""
+    def _body(self, closed, operands, varies, indent):
+        """Write the lines of a loop or a choice: if it varies, all of them stay in it."""
         before, self._within = self._within, self._within or varies
-        write_statement = self._write(closed, given, f"{indent}    ")
+        results = self._write(closed, operands, f"{indent}    ")
         self._within = before
-        return write_statement
+        return results
 
     def _expression(self, eqn, name, dtype, x):
         constant = self._constant(1.0, dtype) if dtype.kind == "f" else "1"
@@ -160,12 +159,12 @@ class Strict:
             cast = f"cast({x[0]}, {str(dtype)!r}, {str(eqn.outvars[0].aval.dtype)!r})"
             return f"f32({cast})" if eqn.outvars[0].aval.dtype == np.float32 else cast
         if name == "round":
-            result = (
+            rounded = (
                 "nearest({})"
                 if int(equation_parameter(eqn, "rounding_method"))
                 else "math.copysign(math.floor(abs({0}) + 0.5), {0})"
             )
-            return f"f32({result.format(x[0])})" if self.single else result.format(x[0])
+            return f"f32({rounded.format(x[0])})" if self.single else rounded.format(x[0])
         if name == "clamp":
             return f"min(max({x[1]}, {x[0]}), {x[2]})"
         if name == "sign":

@@ -40,11 +40,11 @@ def code(tmp_path_factory):
     """Folder of the code of a kind of observer in a precision, and the code compiled without optimisation."""
 
     @functools.cache
-    def made(precision, kind="super_twisting"):
+    def export_once(precision, kind="super_twisting"):
         folder = tmp_path_factory.mktemp("code")
         return folder, export_native(folder, study(kind), precision, flags=("-O0", *UNCONTRACTED))
 
-    return made
+    return export_once
 
 
 def outputs(native, inputs):
@@ -121,8 +121,8 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
     for name, values in expected.items():
         # a switching term takes the other side where rounding decides
         tolerance = 1e-9 if not explicit else 2e-2
-        own, other = actual[:, names.index(name)], np.asarray(values)
-        assert np.sqrt(np.mean((own - other) ** 2)) <= tolerance * np.sqrt(np.mean(other**2)), name
+        computed, replayed = actual[:, names.index(name)], np.asarray(values)
+        assert np.sqrt(np.mean((computed - replayed) ** 2)) <= tolerance * np.sqrt(np.mean(replayed**2)), name
 
 
 @pytest.mark.program("gcc")
@@ -150,7 +150,7 @@ def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"target": "rust"}, r"--target rust: should be one of c, st, mjcf"),
         ({"precision": "half"}, r"--precision half: should be one of double, float"),
@@ -158,9 +158,9 @@ def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path)
         ({"name": "math"}, r"--name math: should be .* no header of C"),
     ],
 )
-def test_wrong_requests_get_one_line_and_leave_nothing(tmp_path, given, message):
+def test_wrong_requests_get_one_line_and_leave_nothing(tmp_path, options, message):
     with pytest.raises(InputError, match=message):
-        jaxbl.export(study(), tmp_path / "new", **given)
+        jaxbl.export(study(), tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
 
 

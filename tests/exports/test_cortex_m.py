@@ -67,12 +67,18 @@ def test_a_cortex_m4s_compiler_has_nothing_to_say(tmp_path):
     ran("arm-none-eabi-gcc", *STRICT, *_CORE[:-1], "-c", "drive.c", "-o", "drive.o", cwd=tmp_path)
 
 
+CHECK = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")
+
+
 @pytest.mark.program("cppcheck")
 @pytest.mark.parametrize(("kind", "precision"), [("super_twisting", "double"), ("differentiator_1", "float")])
 def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
-    (tmp_path / "wrong.c").write_text("int f(int a) { if (a) return 1; else return 2; }\n")
-    check = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")
-    assert "misra-c2012" in ran(*check, "wrong.c", cwd=tmp_path).stderr
-    jaxbl.export(study(kind), tmp_path / kind, precision=precision, name="drive")
-    output = ran(*check, "drive.c", "drive.h", cwd=tmp_path / kind)
+    jaxbl.export(study(kind), tmp_path, precision=precision, name="drive")
+    output = ran(*CHECK, "drive.c", "drive.h", cwd=tmp_path)
     assert output.stdout + output.stderr == ""
+
+
+@pytest.mark.program("cppcheck")
+def test_cppchecks_misra_rules_find_a_fault(tmp_path):
+    (tmp_path / "wrong.c").write_text("int f(int a) { if (a) return 1; else return 2; }\n")
+    assert "misra-c2012" in ran(*CHECK, "wrong.c", cwd=tmp_path).stderr

@@ -49,8 +49,8 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     code = tmp_path / "code"
     command("export", tuned, "--target", "c", "--precision", "double", "--name", "axis", "--out", code, "--quiet")
     ran("gcc", *STRICT, *UNCONTRACTED, "-O2", "axis.c", "axis_filter.c", "-lm", "-o", "axis_filter", cwd=code)
-    ran("./axis_filter", log, "found.csv", cwd=code)
-    frame = pd.read_csv(code / "found.csv")
+    ran("./axis_filter", log, "filtered.csv", cwd=code)
+    frame = pd.read_csv(code / "filtered.csv")
 
     with jax.enable_x64(True):
         record = read_logs(config, log)
