@@ -34,9 +34,9 @@ def test_accurate_to_some_units_in_the_last_place(name, dtype):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_edges(dtype):
     x = jnp.asarray([np.inf, -np.inf, np.nan, 0.0, 1e4, -1e4], dtype)
-    y = jax.jit(lambda x: {name: FUNCTIONS[name](x) for name in ("exp", "tanh", "expm1", "sin")})(x)
+    y = jax.jit(lambda x: {name: FUNCTIONS[name](x) for name in ("exp", "expm1", "sin")})(x)
     np.testing.assert_array_equal(y["exp"], np.array([np.inf, 0, np.nan, 1, np.inf, 0], dtype))
-    np.testing.assert_array_equal(y["tanh"][:4], np.array([1, -1, np.nan, 0], dtype))
+    np.testing.assert_array_equal(FUNCTIONS["tanh"](x)[:4], np.array([1, -1, np.nan, 0], dtype))
     np.testing.assert_array_equal(y["expm1"], np.array([np.inf, -1, np.nan, 0, np.inf, -1], dtype))
     assert np.isnan(y["sin"][:3]).all()
 

@@ -16,7 +16,7 @@ from jaxbl.fused import single_plant as module
 from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
 from jaxbl.simulate import Experiment, Run, move_plant, plant_trajectory
 
-STEPS = 500
+STEPS = 250
 OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
 
 
