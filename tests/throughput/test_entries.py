@@ -29,6 +29,7 @@ ONE_PRECISION = {
     "jaxbl fused, one core": "float32",
     run.SCAN_NAME: "float32",
     "jaxbl scan, one device": "float64",
+    "numba, blocks of lanes": "float64",
     "numba, prange": "float32",
     "diffrax, Euler, one device": "float64",
 }
