@@ -30,8 +30,8 @@ def search(log, study):
 
 @pytest.mark.parametrize("i", [1, 2, 3])
 def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
-    """An actuator's lag, drag on a rigid drive, and an inertia."""
-    case = cases(SEED, 4, "single", 4.0)[i]
+    """An actuator's lag, drag on a rigid drive, and an inertia, on 1000 samples: one shape for the programs of the file."""
+    case = cases(SEED, 4, "single", 2.0)[i]
     explanation = run_search(case, tmp_path)
     (name,) = case.hidden
     assert explanation.verdict == "explained"
@@ -46,7 +46,7 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
 
 
 def test_nothing_is_named_on_a_clean_machine(tmp_path):
-    explanation = run_search(cases(SEED, 1, "none", 4.0)[0], tmp_path)
+    explanation = run_search(cases(SEED, 1, "none", 2.0)[0], tmp_path)
     assert explanation.verdict == "no_discrepancy"
     assert explanation.findings == ()
 
@@ -82,7 +82,7 @@ HIDDEN = {
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
-    driven(logged().u, [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")
+    driven(logged().u[:1000], [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")
     explanation = search(tmp_path / "log.csv", model()).run()
     assert explanation.verdict == "explained"
     assert [finding.effect for finding in explanation.findings] == [name]

@@ -60,7 +60,7 @@ def test_nothing_is_tabulated_where_nothing_is_missing():
 
 def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     """The torque is that of the bench's own simulator, which shares nothing with the package."""
-    t = 2e-3 * np.arange(4000)
+    t = 2e-3 * np.arange(2000)
     torque = 0.3 * sum(np.sin(2.0 * np.pi * 0.5 * k * t + k**2) for k in range(1, 7))
     driven(torque, [WAVE], 3e-5, 1).write(tmp_path / "axis.csv")
     task = read_diagnosis_task(tmp_path / "axis.csv", model())

@@ -25,9 +25,10 @@ def test_a_drive_without_either_is_left_as_it_is(read, gap):
     np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.1])
-@pytest.mark.parametrize(("skew", "offset"), [(3.04e-3, 0.379), (-2e-3, -0.05), (0.0, 37.0), (3.04e-3, 0.0)])
-def test_both_are_found_and_corrected(read, gap, skew, offset):
+@pytest.mark.parametrize(
+    ("skew", "offset", "gap"), [(3.04e-3, 0.379, 0.1), (-2e-3, -0.05, 0.0), (0.0, 37.0, 0.1), (3.04e-3, 0.0, 0.0)]
+)
+def test_both_are_found_and_corrected(read, skew, offset, gap):
     record = read(axis(skew, offset, gap))
     assert record.corrections.keys() == {name for name, size in (("skew", skew), ("offset", offset)) if size}
     assert len(record.warnings) == len(record.corrections)
