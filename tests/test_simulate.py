@@ -193,13 +193,13 @@ def test_noise_is_the_same_in_runs_of_any_length_precision_and_level():
             for s, gain in (("motor", 1.0), ("load", 5.0))
         ]
 
-    reference = noise_of(130, jnp.float64, 1e-4)
-    drawn = draw_noise(SEED, jnp.arange(130), ("motor", "load"))
+    # a prime number of samples: two kinds of blocks
+    reference = noise_of(523, jnp.float64, 1e-4)
+    drawn = draw_noise(SEED, jnp.arange(523), ("motor", "load"))
     np.testing.assert_allclose(reference, [drawn["motor"], drawn["load"]], atol=1e-10)
-    # a prime number of samples (two kinds of blocks), and a level at which float32 positions do not round it away
-    longer = noise_of(523, jnp.float64, 1e-4)
-    np.testing.assert_allclose([side[:130] for side in longer], reference, atol=1e-10)
-    np.testing.assert_allclose(noise_of(130, jnp.float32, 10.0), reference, rtol=1e-5, atol=1e-5)
+    # a level at which float32 positions do not round it away
+    shorter = noise_of(130, jnp.float32, 10.0)
+    np.testing.assert_allclose(shorter, [side[:130] for side in reference], rtol=1e-5, atol=1e-5)
 
 
 def lane_values(count):
@@ -279,7 +279,7 @@ def test_reducers_see_every_sample_whatever_is_recorded():
         lambda experiment, carry, state: {"sum": carry},
     )
     experiment = paper(steps=523, substeps=1)
-    for record, stride in ((None, 1), (everything, 1), (everything, 10)):
+    for record, stride in ((None, 1), (everything, 10)):
         out, _ = jit(lambda e, record=record, stride=stride: scan(e, SEED, (count,), record, stride))(experiment)
         assert out == {"sum": 523 * 522 // 2}
 

@@ -73,7 +73,11 @@ CHECK = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")
 @pytest.mark.program("cppcheck")
 @pytest.mark.parametrize(("kind", "precision"), [("super_twisting", "double"), ("differentiator_1", "float")])
 def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
-    jaxbl.export(study(kind), tmp_path, precision=precision, name="drive")
+    data = study(kind)
+    if precision == "float":
+        # whose code differs from that in double precision by its literals
+        del data["identifier"]
+    jaxbl.export(data, tmp_path, precision=precision, name="drive")
     output = ran(*CHECK, "drive.c", "drive.h", cwd=tmp_path)
     assert output.stdout + output.stderr == ""
 
