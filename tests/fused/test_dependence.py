@@ -12,9 +12,9 @@ def begin(values):
     return {"shared": jnp.asarray(0.0), "own": values[0], "kept": jnp.asarray(2.0), "led": jnp.asarray(1.0)}
 
 
-def step(values, carry, given):
+def step(values, carry, sample_input):
     # `led` becomes a lane's only by way of `own`
-    shared = carry["shared"] + jnp.tanh(given) * carry["kept"]
+    shared = carry["shared"] + jnp.tanh(sample_input) * carry["kept"]
     own_state = jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + shared * values[1], carry["own"])
     return {"shared": shared, "own": own_state, "kept": carry["kept"], "led": carry["led"] + carry["own"]}
 
@@ -71,8 +71,8 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
     direct, read = jax.vmap(parts.compute_stateless)(inputs)
     last, handed = jax.lax.scan(sample, state, inputs)
     for i in range(9):
-        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(one[i] for one in read))
-        state, ways = new[:2], {True: iter(one[i] for one in direct), False: iter(new[2:])}
+        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(column[i] for column in read))
+        state, ways = new[:2], {True: iter(column[i] for column in direct), False: iter(new[2:])}
         for alone, full in zip(parts.is_stateless, handed, strict=True):
             np.testing.assert_allclose(next(ways[alone]), full[i], rtol=1e-6)
     np.testing.assert_allclose(state, last, rtol=1e-6)

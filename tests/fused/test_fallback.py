@@ -16,7 +16,7 @@ from jaxbl.fused import jaxprs, llvm, single_plant
 NAME = "motor.velocity_rmse"
 
 
-def renamed(monkeypatch):
+def rename_parameters(monkeypatch):
     def parameter(eqn, *names):
         return parameters(eqn, *(f"new_{name}" for name in names))
 
@@ -24,22 +24,22 @@ def renamed(monkeypatch):
     monkeypatch.setattr(jaxprs, "equation_parameter", parameter)
 
 
-def unread(monkeypatch):
+def refuse_assembly(monkeypatch):
     def parse_assembly(text):
         raise RuntimeError("LLVM IR parsing error\n<string>:3:26: error: expected type")
 
     monkeypatch.setattr(llvm.binding, "parse_assembly", parse_assembly)
 
 
-def moved(monkeypatch):
+def hide_modules(monkeypatch):
     for name in ("lane_simulator", "single_run", "llvm"):
         monkeypatch.setitem(sys.modules, f"jaxbl.fused.{name}", None)
 
 
 UNKNOWN = {
-    renamed: r"compilation with JAX [\d.]+ \(UnknownForm: \w+ without new_\w+( or new_call_jaxpr)?\)",
-    unread: r"compilation with JAX [\d.]+ \(RuntimeError: LLVM IR parsing error\)",
-    moved: r"compilation with JAX [\d.]+ \(ModuleNotFoundError: import of jaxbl\.fused\.\w+ halted.*\)",
+    rename_parameters: r"compilation with JAX [\d.]+ \(UnknownForm: \w+ without new_\w+( or new_call_jaxpr)?\)",
+    refuse_assembly: r"compilation with JAX [\d.]+ \(RuntimeError: LLVM IR parsing error\)",
+    hide_modules: r"compilation with JAX [\d.]+ \(ModuleNotFoundError: import of jaxbl\.fused\.\w+ halted.*\)",
 }
 
 
@@ -63,21 +63,21 @@ SWEPT = small({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)])
 
 
 @pytest.fixture(scope="module")
-def swept():
+def scanned_sweep():
     return jaxbl.sweep(SWEPT, backend="scan").frame
 
 
 @pytest.fixture(scope="module")
-def looped():
+def looped_run():
     return jaxbl.run(STUDY, every=7)
 
 
-@only(renamed, moved)
-def test_a_sweep_is_scanned(swept, unknown, caplog):
+@only(rename_parameters, hide_modules)
+def test_a_sweep_is_scanned(scanned_sweep, unknown, caplog):
     output = unknown()
     result = jaxbl.sweep(SWEPT)
     (reason,) = result.fallback_reasons
-    np.testing.assert_array_equal(result.frame[NAME], swept[NAME])
+    np.testing.assert_array_equal(result.frame[NAME], scanned_sweep[NAME])
     assert re.fullmatch(output, reason)
     with pytest.raises(
         jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {output}; use --backend scan"
@@ -86,13 +86,13 @@ def test_a_sweep_is_scanned(swept, unknown, caplog):
     assert not caplog.messages
 
 
-@only(unread, moved)
-def test_a_run_is_scanned(looped, unknown, caplog):
+@only(refuse_assembly, hide_modules)
+def test_a_run_is_scanned(looped_run, unknown, caplog):
     output = unknown()
     trials = [jaxbl.run(STUDY, every=7) for _ in range(2)]
     for trial in trials:
-        assert trial.summary["metrics"][NAME] == pytest.approx(looped.summary["metrics"][NAME], rel=1e-6)
-        np.testing.assert_allclose(trial.trace["theta_e"], looped.trace["theta_e"], rtol=1e-6, atol=1e-9)
+        assert trial.summary["metrics"][NAME] == pytest.approx(looped_run.summary["metrics"][NAME], rel=1e-6)
+        np.testing.assert_allclose(trial.trace["theta_e"], looped_run.trace["theta_e"], rtol=1e-6, atol=1e-9)
     (line,) = caplog.messages
     assert re.fullmatch(fused.SCAN_MESSAGE % output, line)
 

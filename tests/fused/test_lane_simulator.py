@@ -125,7 +125,7 @@ def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
     full_experiment = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
     values = spread(full_experiment, [path for path in leaf_paths(full_experiment) if path.startswith("effects.")], 37)
     asked = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
-    stride, selection = (HostSimulator(full_experiment, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
+    stride, selection = (HostSimulator(full_experiment, (reducer,), tuple(values), 37, 2)(values, 3) for reducer in asked)
     assert len(selection) < len(stride)
     for name, figure in selection.items():
         np.testing.assert_array_equal(figure, stride[name], err_msg=name)
@@ -214,7 +214,7 @@ def test_what_is_joined_for_a_gpu_computes_the_same():
     for part in (result._step, *result._hooks):
         dtypes = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
         other = join_multiply_add(replace_primitives(part, {}), multiply_add)
-        pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*dtypes)
+        pairs = jax.jit(lambda *x, jaxprs=(other, part): [jaxpr_as_fun(jaxpr)(*x) for jaxpr in jaxprs])(*dtypes)
         for pair, expected in zip(*pairs, strict=True):
             np.testing.assert_allclose(pair, expected, rtol=1e-12)
     assert len(joined) > 50
@@ -265,12 +265,12 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         assert len(simulator._pools) == threads
         loop = simulator._loop
 
-        def counted(arrays, upto, first, last, loop=loop, **options):
+        def count_samples(arrays, upto, first, last, loop=loop, **options):
             samples.append((upto - options.get("start", 0)) * last)
             loop(arrays, upto, first, last, **options)
 
-        counted.signature, counted.lanes = loop.signature, loop.lanes
-        monkeypatch.setattr(simulator, "_loop", counted)
+        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(simulator, "_loop", count_samples)
         for order in orders:
             samples.clear()
             actual = simulator({"transmission.stiffness": stiffness[order]}, 3)
@@ -298,8 +298,8 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
         asked = metrics_reducer(("converged", "convergence_time"))
         stride, staying = (
-            HostSimulator(full_experiment, (one,), tuple(values), lanes, 1)
-            for one in (ALL_METRICS, asked._replace(done=None))
+            HostSimulator(full_experiment, (reducer,), tuple(values), lanes, 1)
+            for reducer in (ALL_METRICS, asked._replace(done=None))
         )
         assert staying.carry_count < stride.carry_count
         expected, stayed = stride(values, 3), staying(values, 3)
@@ -311,13 +311,13 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         simulator = HostSimulator(full_experiment, (asked,), tuple(values), lanes, threads)
         loop = simulator._loop
 
-        def counted(arrays, upto, first, last, loop=loop, **options):
+        def count_samples(arrays, upto, first, last, loop=loop, **options):
             if upto > options.get("start", 0):
                 samples.append(last)
             loop(arrays, upto, first, last, **options)
 
-        counted.signature, counted.lanes = loop.signature, loop.lanes
-        monkeypatch.setattr(simulator, "_loop", counted)
+        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(simulator, "_loop", count_samples)
         samples.clear()
         actual = simulator(values, 3)
         # in the last block, those are left that keep the tolerance

@@ -21,7 +21,7 @@ from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.diagnosis import candidates
 
 traced = []
-candidates.effect_path, found = lambda *given: traced.append(1) or found(*given), candidates.effect_path
+candidates.effect_path, effect_path = lambda *arguments: traced.append(1) or effect_path(*arguments), candidates.effect_path
 time = np.arange(200) * 1e-3
 study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.1},
          "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 2.0}, 
@@ -60,7 +60,7 @@ def test_names_tell_structures_apart(tmp_path, monkeypatch):
         1,
         1.0,
     ]
-    keys = [program_cache.program_key("program", one) for one in inputs]
+    keys = [program_cache.program_key("program", number) for number in inputs]
     assert None not in keys and len(set(keys)) == len(keys)
     # of arrays what they are, not what they hold
     assert program_cache.program_key("program", jnp.ones(3)) == program_cache.program_key("program", jnp.zeros(3))

@@ -59,15 +59,15 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
             ours, last, handed = looped(ours, 3, first, length)
             theirs, *further = scanned(theirs, 3, first, length)
             for actual, expected in zip((ours, last, handed), (theirs, *further), strict=True):
-                for one, other in zip(actual, expected, strict=True):
-                    assert np.asarray(one).dtype == other.dtype
+                for array, reference in zip(actual, expected, strict=True):
+                    assert np.asarray(array).dtype == reference.dtype
                     # rounding, which a stiff shaft amplifies
                     tolerance = 1e-9 if precision == "float64" else 1e-2
-                    size = np.max(np.abs(np.asarray(other, float))) + 1e-30
-                    np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * size)
+                    size = np.max(np.abs(np.asarray(reference, float))) + 1e-30
+                    np.testing.assert_allclose(array, reference, rtol=tolerance, atol=tolerance * size)
         # both blocks in one stretch: the loop settles its state between them
         full, twice, _ = looped([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
         np.testing.assert_array_equal(full, ours)
-        assert [one[-1] for one in twice] == [one[0] for one in last]
+        assert [ends[-1] for ends in twice] == [ends[0] for ends in last]
         assert len(handed) > 0
-        assert any(np.ptp(np.asarray(one, float)) > 0.0 for one in handed)
+        assert any(np.ptp(np.asarray(column, float)) > 0.0 for column in handed)

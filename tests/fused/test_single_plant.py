@@ -37,10 +37,10 @@ MODELS = {
 }
 
 
-def record(one):
+def draw_inputs(model):
     rng = np.random.default_rng(1)
     torque = 2.0 + np.cumsum(rng.normal(0.0, 0.1, STEPS))
-    start = eqx.tree_at(lambda s: s.velocity, one.plant.init(one.initial), dict.fromkeys(one.sides, jnp.asarray(0.3)))
+    start = eqx.tree_at(lambda s: s.velocity, model.plant.init(model.initial), dict.fromkeys(model.sides, jnp.asarray(0.3)))
     return start, torque, rng
 
 
@@ -52,64 +52,64 @@ def _double():
 
 @pytest.mark.parametrize(("name", "observed"), [("most", True), ("others", False), ("rigid", True)])
 def test_the_path_is_that_of_the_scan(name, observed):
-    one = MODELS[name]()
-    start, torque, rng = record(one)
+    model = MODELS[name]()
+    start, torque, rng = draw_inputs(model)
     more = {}
     if observed:
-        measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in one.sides}
-        more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
-    expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
-    assert module._trajectory_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
-    plant = simulate_plant(one, start, torque, 0.7, **more)
+        measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in model.sides}
+        more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(model.sides)}}
+    expected = eqx.filter_jit(plant_trajectory)(model, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
+    assert module._trajectory_loop(module._PlantStructure.of(model, start), tuple(sorted(more.get("gain", ())))) is not None
+    plant = simulate_plant(model, start, torque, 0.7, **more)
     assert jax.tree.structure(plant) == jax.tree.structure(expected)
-    for have, want in zip(jax.tree.leaves(plant), jax.tree.leaves(expected), strict=True):
-        assert have.shape == (STEPS,)
-        assert np.ptp(want) > 0.0
-        assert have == pytest.approx(np.asarray(want), rel=1e-9, abs=1e-10)
+    for computed, reference in zip(jax.tree.leaves(plant), jax.tree.leaves(expected), strict=True):
+        assert computed.shape == (STEPS,)
+        assert np.ptp(reference) > 0.0
+        assert computed == pytest.approx(np.asarray(reference), rel=1e-9, abs=1e-10)
 
 
-def directions(one, start):
+def directions(model, start):
     """Each state, the input, each number of the plant."""
     result = [Direction(state=row) for row in np.eye(len(jax.tree.leaves(start))).tolist()]
     result.append(Direction(torque=1.0))
-    numbers = [path for path in leaf_paths(one) if path.split(".")[0] in ("drive", "transmission", "effects")]
+    numbers = [path for path in leaf_paths(model) if path.split(".")[0] in ("drive", "transmission", "effects")]
     return result + [Direction({path: 1.0}) for path in numbers]
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_slopes_are_those_of_differences(name):
     """Central ones of the step itself; where a step has a kink between the two, they differ."""
-    one = MODELS[name]()
-    start, torque, _ = record(one)
+    model = MODELS[name]()
+    start, torque, _ = draw_inputs(model)
     time = 1e-3 * np.arange(STEPS)
-    states = simulate_plant(one, start, torque)
-    ways = directions(one, start)
-    assert module._derivatives_loop(module._PlantStructure.of(one, start)) is not None
-    changes, new = step_derivatives(one, states, torque, time, ways)
-    assert changes.shape == (len(ways), len(jax.tree.leaves(start)), STEPS)
+    states = simulate_plant(model, start, torque)
+    tangents = directions(model, start)
+    assert module._derivatives_loop(module._PlantStructure.of(model, start)) is not None
+    changes, new = step_derivatives(model, states, torque, time, tangents)
+    assert changes.shape == (len(tangents), len(jax.tree.leaves(start)), STEPS)
 
-    def whole(way):
+    def complete(tangent):
         """A direction as changes of all numbers."""
-        zeros, shape = jax.tree.map(lambda _: 0.0, one), jax.tree.structure(start)
-        return set_leaves(zeros, way.numbers), shape.unflatten(way.state or [0.0] * shape.num_leaves), way.torque
+        zeros, shape = jax.tree.map(lambda _: 0.0, model), jax.tree.structure(start)
+        return set_leaves(zeros, tangent.numbers), shape.unflatten(tangent.state or [0.0] * shape.num_leaves), tangent.torque
 
     @jax.jit
     @jax.vmap
-    def moved(way, by):
-        own, *arguments = jax.tree.map(lambda x, c: x + by * c, (one, states, torque), way)
-        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(own.plant, own.run, *x))(*arguments, time)))
+    def move_samples(tangent, steps):
+        changed, *arguments = jax.tree.map(lambda x, c: x + steps * c, (model, states, torque), tangent)
+        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(changed.plant, changed.run, *x))(*arguments, time)))
 
-    numbers, tree = jax.tree.leaves((one, states, torque)), [whole(way) for way in ways]
-    # of the number's own size
-    sizes = [np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3 for way in tree]
-    by, tree = 3e-5 * np.array(sizes), jax.tree.map(lambda *x: np.array(x, float), *tree)
-    expected = (moved(tree, by) - moved(tree, -by)) / (2.0 * by[:, None, None])
+    numbers, tree = jax.tree.leaves((model, states, torque)), [complete(tangent) for tangent in tangents]
+    # of the size of the number itself
+    sizes = [np.max(np.abs(numbers[jax.tree.leaves(tangent).index(1.0)])) + 1e-3 for tangent in tree]
+    steps, tree = 3e-5 * np.array(sizes), jax.tree.map(lambda *x: np.array(x, float), *tree)
+    expected = (move_samples(tree, steps) - move_samples(tree, -steps)) / (2.0 * steps[:, None, None])
     error = np.abs(changes - expected) / (np.max(np.abs(expected), axis=(1, 2), keepdims=True) + 1e-9)
     assert (np.median(error, axis=(1, 2)) < 1e-6).all()
     assert (np.mean(error > 1e-3, axis=(1, 2)) < 0.02).all()
     # the saturation is not reached everywhere
-    assert np.count_nonzero(np.any(expected, axis=(1, 2))) >= len(ways) - 1
-    assert new == pytest.approx(np.asarray(moved(tree, 0.0 * by)[0]), rel=1e-10, abs=1e-12)
+    assert np.count_nonzero(np.any(expected, axis=(1, 2))) >= len(tangents) - 1
+    assert new == pytest.approx(np.asarray(move_samples(tree, 0.0 * steps)[0]), rel=1e-10, abs=1e-12)
 
 
 class _Tabled(SideEffect):
@@ -121,58 +121,58 @@ class _Tabled(SideEffect):
 
 
 def test_what_a_loop_cannot_do_is_left_to_the_scan():
-    one = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
-    start, torque, _ = record(one)
-    plant = module._PlantStructure.of(one, start)
+    model = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
+    start, torque, _ = draw_inputs(model)
+    plant = module._PlantStructure.of(model, start)
     assert module._trajectory_loop(plant, ()) is None
     assert module._derivatives_loop(plant) is None
-    expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque))
-    actual = simulate_plant(one, start, torque)
-    for side in one.sides:
+    expected = eqx.filter_jit(plant_trajectory)(model, start, jnp.asarray(torque))
+    actual = simulate_plant(model, start, torque)
+    for side in model.sides:
         assert actual.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
-    changes, new = step_derivatives(one, actual, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
+    changes, new = step_derivatives(model, actual, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
     assert changes.shape == (1, 4, STEPS)
-    inertia = float(one.drive.motor_inertia)
-    motor = sorted(one.sides).index("motor") + 2
+    inertia = float(model.drive.motor_inertia)
+    motor = sorted(model.sides).index("motor") + 2
     assert changes[0, motor] == pytest.approx(1e-3 / inertia, rel=0.05)
     assert new[motor, :-1] == pytest.approx(actual.velocity["motor"][1:], rel=1e-10)
 
 
 def test_tables_that_no_step_reads_are_no_obstacle():
     """A recorded excitation is part of the experiment, and the input is given."""
-    one = experiment(["motor.viscous_friction"])
-    start, torque, _ = record(one)
+    model = experiment(["motor.viscous_friction"])
+    start, torque, _ = draw_inputs(model)
     recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
-    other = eqx.tree_at(lambda e: e.excitation, one, recorded)
+    other = eqx.tree_at(lambda e: e.excitation, model, recorded)
     assert module._trajectory_loop(module._PlantStructure.of(other, start), ()) is not None
     assert module._derivatives_loop(module._PlantStructure.of(other, start)) is not None
-    expected, plant = simulate_plant(one, start, torque), simulate_plant(other, start, torque)
+    expected, plant = simulate_plant(model, start, torque), simulate_plant(other, start, torque)
     assert np.array_equal(plant.position["motor"], expected.position["motor"])
-    ways = [directions(e, start)[:6] for e in (one, other)]
+    tangents = [directions(e, start)[:6] for e in (model, other)]
     pair = [
-        step_derivatives(e, expected, torque, 1e-3 * np.arange(STEPS), way)[0]
-        for e, way in zip((one, other), ways, strict=True)
+        step_derivatives(e, expected, torque, 1e-3 * np.arange(STEPS), tangent)[0]
+        for e, tangent in zip((model, other), tangents, strict=True)
     ]
     assert np.array_equal(*pair)
 
 
 def test_columns_of_other_lengths_are_refused():
-    one = experiment([])
-    start, torque, _ = record(one)
-    states = simulate_plant(one, start, torque)
+    model = experiment([])
+    start, torque, _ = draw_inputs(model)
+    states = simulate_plant(model, start, torque)
     with pytest.raises(ValueError, match="of a loop needs"):
-        step_derivatives(one, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(one, start))
-    gain = dict.fromkeys(one.sides, np.array([0.3, 20.0]))
+        step_derivatives(model, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(model, start))
+    gain = dict.fromkeys(model.sides, np.array([0.3, 20.0]))
     with pytest.raises(ValueError, match="of a loop needs"):
-        simulate_plant(one, start, torque, 0.0, dict.fromkeys(one.sides, torque[:-5]), gain)
+        simulate_plant(model, start, torque, 0.0, dict.fromkeys(model.sides, torque[:-5]), gain)
 
 
 def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
-    one = experiment(["motor.viscous_friction"], rigid=True)
-    start, torque, _ = record(one)
+    model = experiment(["motor.viscous_friction"], rigid=True)
+    start, torque, _ = draw_inputs(model)
     runs = []
     for inertia in (0.02, 0.04):
-        other = set_leaves(one, {"drive.motor_inertia": jnp.asarray(inertia)})
+        other = set_leaves(model, {"drive.motor_inertia": jnp.asarray(inertia)})
         before = module._trajectory_loop.cache_info().misses
         runs.append(simulate_plant(other, start, torque).position["motor"])
     assert module._trajectory_loop.cache_info().misses == before
@@ -181,4 +181,4 @@ def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
     for _ in range(2):
         module._trajectory_loop.cache_clear()
         gc.collect()
-        assert np.array_equal(simulate_plant(one, start, torque).position["motor"], runs[0])
+        assert np.array_equal(simulate_plant(model, start, torque).position["motor"], runs[0])
