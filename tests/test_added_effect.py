@@ -45,9 +45,11 @@ def study_block():
     return block
 
 
-def logs(folder):
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
     """Two logs of a machine that has such friction, by the bench's simulator, which shares nothing with the package."""
-    t = 2e-3 * np.arange(3000)
+    folder = tmp_path_factory.mktemp("logs")
+    t = 2e-3 * np.arange(1500)
     hidden = [{"kind": "unknown.hysteresis", "side": "motor", "torque": TORQUE, "length": LENGTH}]
     for seed, name in enumerate(("log.csv", "other.csv")):
         random = np.random.default_rng(seed)
@@ -66,18 +68,17 @@ def test_it_is_simulated_and_swept_over(installed, tmp_path):
     assert f"effects.{NAME}.torque" in (tmp_path / "sweep" / "report.html").read_text(encoding="utf-8")
 
 
-def test_its_numbers_are_identified(installed, tmp_path):
-    log, _ = logs(tmp_path)
+def test_its_numbers_are_identified(installed, logs, tmp_path):
     known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
     (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
-    jaxbl(installed, "identify", log, "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
+    jaxbl(installed, "identify", logs[0], "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
     parameters = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
     assert parameters[f"effects.{NAME}.torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
     assert parameters[f"effects.{NAME}.length"]["value"] == pytest.approx(LENGTH, rel=0.05)
 
 
-def test_it_is_named_where_it_is_missing(installed, tmp_path):
-    log, other = logs(tmp_path)
+def test_it_is_named_where_it_is_missing(installed, logs, tmp_path):
+    log, other = logs
     (tmp_path / "model.toml").write_text(tomli_w.dumps(model()), encoding="utf-8")
     out = tmp_path / "found"
     jaxbl(installed, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
