@@ -54,9 +54,9 @@ def test_tutorial_configs_are_valid():
 
 def test_gallery_studies_are_valid():
     text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
-    found = re.findall(r"^```\{study\} \w+\n((?::[^\n]*\n)+)(.*?)^```", text, re.S | re.M)
-    assert len(found) == text.count("```{study}") >= 5
-    for options, study in found:
+    studies = re.findall(r"^```\{study\} \w+\n((?::[^\n]*\n)+)(.*?)^```", text, re.S | re.M)
+    assert len(studies) == text.count("```{study}") >= 5
+    for options, study in studies:
         config = read_config(tomllib.loads(study))
         assert bool(config.axes) == (":command: sweep\n" in options)
 
@@ -108,12 +108,12 @@ def resolve(dotted):
     parts = dotted.split(".")
     for i in range(len(parts), 0, -1):
         try:
-            found = importlib.import_module(".".join(parts[:i]))
+            target = importlib.import_module(".".join(parts[:i]))
         except ModuleNotFoundError:
             continue
         for part in parts[i:]:
-            found = getattr(found, part)
-        return found
+            target = getattr(target, part)
+        return target
     raise AssertionError(dotted)
 
 
@@ -142,8 +142,8 @@ def test_commands_in_text_exist_with_their_options(page):
     commands = get_command(app).commands
     for line in re.findall(r"`jaxbl ([a-z]+[^`]*)`", text):
         command, *words = line.replace("\n", " ").split()
-        known = set(chain.from_iterable(option.opts for option in commands[command].params))
-        assert {word.strip("[]") for word in words if word.strip("[").startswith("--")} <= known, line
+        options = set(chain.from_iterable(option.opts for option in commands[command].params))
+        assert {word.strip("[]") for word in words if word.strip("[").startswith("--")} <= options, line
     for script, rest in re.findall(r"`python (\S+\.py)([^`]*)`", text):
         source = (ROOT / script).read_text(encoding="utf-8")
         assert all(f'"{word}"' in source for word in rest.split() if word.startswith("--")), f"{script}{rest}"
@@ -151,21 +151,21 @@ def test_commands_in_text_exist_with_their_options(page):
 
 def test_readme_lists_every_command_and_study():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert [one for one in get_command(app).commands if f"`jaxbl {one} " not in text] == []
+    assert [command for command in get_command(app).commands if f"`jaxbl {command} " not in text] == []
     assert [file.name for file in ROOT.glob("sweeps/*.toml") if f"`{file.name}`" not in text] == []
 
 
 def test_which_command_has_every_command():
     text = (ROOT / "docs" / "which_command.md").read_text(encoding="utf-8")
-    assert [one for one in get_command(app).commands if not re.search(rf"`jaxbl {one}\b", text)] == []
+    assert [command for command in get_command(app).commands if not re.search(rf"`jaxbl {command}\b", text)] == []
 
 
 def test_architecture_shows_the_floors():
     """The diagram names the parts of each floor, top floor first."""
     diagram = re.search(r"```text\n(cli.*?)```", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.S)[1]
     parts = set().union(*FLOORS)
-    shown = [set(line[:29].split()) & parts for line in diagram.splitlines()]
-    assert shown == FLOORS[::-1]
+    floors = [set(line[:29].split()) & parts for line in diagram.splitlines()]
+    assert floors == FLOORS[::-1]
 
 
 # pages, run as written
@@ -209,7 +209,7 @@ PAGES = [
 
 def imports_of(requirement):
     """A requirement's import name: of those that only development needs."""
-    return {"pytest-xdist": "xdist"}.get(found := re.match(r"[\w-]+", requirement)[0], found)
+    return {"pytest-xdist": "xdist"}.get(package := re.match(r"[\w-]+", requirement)[0], package)
 
 
 HIDING = """import sys
@@ -229,9 +229,9 @@ def make_environment(folder, clone, extra=None):
     """Return that of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
-    shown = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
+    importable = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
     # pages install packages of their own
-    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - shown - {"hatchling"})
+    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - importable - {"hatchling"})
     site = folder / "site"
     site.mkdir()
     # a module of None would do for most, but SciPy looks whether sphinx is among those that are loaded

@@ -47,14 +47,14 @@ class Links(HTMLParser):
 
 
 def test_every_link_leads_somewhere(pages):
-    known = {page: Links(page.read_text(encoding="utf-8")) for page in pages}
-    assert sum(len(page.targets) for page in known.values()) > 1000
-    for page, links in known.items():
+    links_of = {page: Links(page.read_text(encoding="utf-8")) for page in pages}
+    assert sum(len(page.targets) for page in links_of.values()) > 1000
+    for page, links in links_of.items():
         for target in links.targets:
             place, anchor = map(unquote, urldefrag(target.partition("?")[0]))
             file = (page.parent / place).resolve() if place else page
             assert file.is_file(), (page, target)
-            assert not anchor or anchor in known[file].places, (page, target)
+            assert not anchor or anchor in links_of[file].places, (page, target)
 
 
 @pytest.mark.parametrize("name", ["tutorial", "log_tutorial"])

@@ -77,7 +77,7 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
     result, heard = grown
     values = result.values
     assert list(values.columns) == watch_columns(result.task)
-    assert [one["t"] for one in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
+    assert [row["t"] for row in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
     before, after = values[values["t"] <= 5.0], values[values["t"] >= 13.5]
     for part, size in ((before, HALF_GAP), (after, 2.0 * HALF_GAP)):
         assert np.abs(part["half_gap"] / size - 1.0).max() < 0.01
@@ -123,7 +123,7 @@ def test_a_law_without_a_gap_has_its_stiffness_watched(tmp_path):
     watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
     assert watch.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
     assert "half_gap" not in watch.values
-    assert [one.name for one in jaxbl.draw(watch)] == ["watch"]
+    assert [drawing.name for drawing in jaxbl.draw(watch)] == ["watch"]
     with pytest.raises(InputError, match="law linear_shaft has no gap for --alarm-gap"):
         jaxbl.watch(tmp_path / "log.csv", data, alarm_gap=0.1, **WINDOW)
 
@@ -237,12 +237,12 @@ def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
 def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path, capsys):
     words = ("watch", logs / "grown.csv", "--model", logs / "axis.toml", "--alarm-gap", LIMIT, *OPTIONS)
     assert command(*words, "--out", tmp_path / "out") == 3
-    shown = capsys.readouterr().out.splitlines()
-    lines = [line for line in shown if line.lstrip()[:1].isdigit()]
+    output = capsys.readouterr().out.splitlines()
+    lines = [line for line in output if line.lstrip()[:1].isdigit()]
     assert len(lines) == 24
     assert all(len(line) <= 100 for line in lines)
     assert sum(line.endswith("ALARM") for line in lines) > 5
-    assert any(line.startswith("ALARM from ") for line in shown)
+    assert any(line.startswith("ALARM from ") for line in output)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "figures",
         "report.html",
@@ -269,7 +269,7 @@ def test_json_is_a_line_for_each_row_of_values_and_one_for_the_end(logs, tmp_pat
     assert len(values) == 24
     assert values[-1]["alarm"]
     assert values[-1]["half_gap"] == pytest.approx(2.0 * HALF_GAP, rel=0.02)
-    assert (end["command"], end["exit"], end["summary"]["alarms"]) == ("watch", 3, sum(one["alarm"] for one in values))
+    assert (end["command"], end["exit"], end["summary"]["alarms"]) == ("watch", 3, sum(row["alarm"] for row in values))
 
 
 @pytest.mark.parametrize(("number", "alarm"), [(signal.SIGINT, False), (signal.SIGTERM, True)], ids=["Ctrl+C", "kill"])
@@ -338,8 +338,8 @@ def test_bad_logs_are_one_line(logs, tmp_path):
         "data row 301 is empty or not a number": rows.assign(theta_e=rows["theta_e"].where(rows.index != 300)),
         "has no load position": rows.drop(columns="theta_s"),
     }
-    for message, one in broken.items():
-        one.to_csv(tmp_path / "log.csv", index=False)
+    for message, log in broken.items():
+        log.to_csv(tmp_path / "log.csv", index=False)
         with pytest.raises(InputError, match=message):
             jaxbl.watch(tmp_path / "log.csv", logs / "axis.toml", **WINDOW)
 
@@ -370,8 +370,10 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
 
     task = read_watch_task(f"udp://127.0.0.1:{port}", logs / "axis.toml", **WINDOW)
     run_watch(task, on_remark=heard.append, ended=ended)
-    assert any("nothing that can be read has come for" in one for one in heard)
-    assert any("1 malformed datagrams or lines; the last: 3 cells in '1,2,3'; there should be 4" in one for one in heard)
+    assert any("nothing that can be read has come for" in remark for remark in heard)
+    assert any(
+        "1 malformed datagrams or lines; the last: 3 cells in '1,2,3'; there should be 4" in remark for remark in heard
+    )
 
 
 def test_a_drive_by_another_simulator(tmp_path):

@@ -48,8 +48,8 @@ def rows_of(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
     speeds = {"motor": np.gradient(motor, time, edge_order=2), "load": np.gradient(load, time, edge_order=2)}
     draws = np.random.default_rng(seed)
     rows = {"twist": twist, "motor.position": motor, "load.position": load}
-    for side, own, nominal, gain in (("motor", MOTOR, 0.15, 1.0), ("load", LOAD, 16.0, -1.0 / RATIO)):
-        extra = own["coulomb"] * np.sign(speeds[side]) + (own["viscous"] - nominal) * speeds[side]
+    for side, friction, nominal, gain in (("motor", MOTOR, 0.15, 1.0), ("load", LOAD, 16.0, -1.0 / RATIO)):
+        extra = friction["coulomb"] * np.sign(speeds[side]) + (friction["viscous"] - nominal) * speeds[side]
         torque = hinge(twist, STIFFNESS, half_gap, ZERO) + gain * extra + (PUSH if side == "motor" else 0.0)
         rows[f"{side}.torque"] = late(torque) + noise * draws.standard_normal(count)
     return rows
@@ -65,12 +65,12 @@ def window_of(rows, data=None, seconds=10.0):
 def test_the_numbers_that_rows_were_made_of(half_gap):
     """Also where the model's half gap is another one, with an offset of the twist, friction and a constant torque."""
     estimate = window_of(rows_of(half_gap=half_gap)).estimate()
-    for side, own in (("motor", MOTOR), ("load", LOAD)):
+    for side, friction in (("motor", MOTOR), ("load", LOAD)):
         numbers = estimate[side].numbers
         assert numbers["half_gap"].value == pytest.approx(half_gap, rel=1e-4)
         assert numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-4)
-        assert numbers["coulomb"].value == pytest.approx(own["coulomb"], rel=5e-3)
-        assert numbers["viscous"].value == pytest.approx(own["viscous"], rel=5e-3)
+        assert numbers["coulomb"].value == pytest.approx(friction["coulomb"], rel=5e-3)
+        assert numbers["viscous"].value == pytest.approx(friction["viscous"], rel=5e-3)
         assert estimate[side].zero == pytest.approx(ZERO, abs=1e-5)
         assert set(numbers) == {"half_gap", "stiffness", "coulomb", "viscous"}
 
@@ -101,8 +101,8 @@ def test_the_same_as_a_fit_by_scipy():
 def test_standard_errors_are_the_scatter():
     values = [window_of(rows_of(noise=0.5, seed=seed)).estimate()["motor"].numbers for seed in range(60)]
     for name in ("half_gap", "stiffness", "coulomb", "viscous"):
-        scatter = np.std([one[name].value for one in values], ddof=1)
-        stated_error = np.sqrt(np.mean([one[name].error ** 2 for one in values]))
+        scatter = np.std([numbers[name].value for numbers in values], ddof=1)
+        stated_error = np.sqrt(np.mean([numbers[name].error ** 2 for numbers in values]))
         # both have errors of a tenth with 60 windows of ten blocks
         assert stated_error == pytest.approx(scatter, rel=0.35), name
 
@@ -155,7 +155,7 @@ def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
         part = slice(first, end)
         result.append(chain.take(torque[part], {side: x[part] for side, x in inputs.items()}, restarts=first == 0))
     for name, values in full_replay.items():
-        pieces = np.concatenate([one[name] for one in result])
+        pieces = np.concatenate([piece[name] for piece in result])
         rms = float(np.sqrt(np.mean(np.asarray(values) ** 2)))
         np.testing.assert_allclose(pieces, values, rtol=0.0, atol=1e-9 * rms, err_msg=name)
-    np.testing.assert_array_equal(np.concatenate([one["load.position"] for one in result]), inputs["load"])
+    np.testing.assert_array_equal(np.concatenate([piece["load.position"] for piece in result]), inputs["load"])

@@ -27,7 +27,7 @@ def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
     assert text in line
     drawn = draw_gain_plane("motor", result)
     ax = drawn.figure.axes[0]
-    star = next(one for one in ax.lines if one.get_marker() == "*")
+    star = next(line for line in ax.lines if line.get_marker() == "*")
     (x,), (y,) = star.get_data()
     low, high = ax.get_ylim()
     assert (x, y) == (max(alpha, ax.get_xlim()[0]), max(lambda_, low))
@@ -61,7 +61,7 @@ def test_factors_lead_to_where_the_exact_condition_fails():
         assert judge_gains(1.24, 2.84, 1.97 * grown * share)["holds"]["exact"] == held
     # the dashed curve for that f⁺ goes through the gains
     ax = draw_gain_plane("motor", result).figure.axes[0]
-    edge = next(one for one in ax.lines if one.get_color() == "black" and one.get_linestyle() == "--")
+    edge = next(line for line in ax.lines if line.get_color() == "black" and line.get_linestyle() == "--")
     x, y = edge.get_data()
     # the first point is that of the vertical part
     assert np.interp(2.84, x[1:], y[1:]) == pytest.approx(1.24, rel=1e-3)

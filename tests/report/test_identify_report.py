@@ -33,8 +33,8 @@ def geared(changes=None, **tables):
     return small(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
 
 
-def drawn_of(found):
-    return {one.name: one for one in draw_identification(found)}
+def drawn_of(result):
+    return {drawing.name: drawing for drawing in draw_identification(result)}
 
 
 @functools.cache
@@ -127,27 +127,29 @@ def test_all_figures_are_drawn_with_units(case, tmp_path):
     data, how, names = CASES[case]
     result = make_identification(data, tmp_path, **how)
     drawn = draw_identification(result)
-    assert [one.name for one in drawn] == names
-    for one in drawn:
-        assert one.caption.endswith(".")
-        assert save(one.figure, tmp_path / f"{one.name}.png").stat().st_size > 5000
-        if one.name != "intervals":
-            assert "(" in one.figure.axes[0].get_ylabel(), one.name
-            assert "(" in one.figure.axes[-1].get_xlabel(), one.name
-    shown = {one.name: one.figure for one in drawn}
+    assert [drawing.name for drawing in drawn] == names
+    for drawing in drawn:
+        assert drawing.caption.endswith(".")
+        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
+        if drawing.name != "intervals":
+            assert "(" in drawing.figure.axes[0].get_ylabel(), drawing.name
+            assert "(" in drawing.figure.axes[-1].get_xlabel(), drawing.name
+    figures = {drawing.name: drawing.figure for drawing in drawn}
     if case == "measured":
-        assert [ax.get_title(loc="left") for ax in shown["hysteresis"].axes] == [
+        assert [ax.get_title(loc="left") for ax in figures["hysteresis"].axes] == [
             "by the motor side",
             "by the load side",
             "measured",
         ]
-        assert "measured" in labels(shown["torque"])
+        assert "measured" in labels(figures["torque"])
     if case == "shaft":
-        assert not any("gap" in text for text in labels(shown["limit_cycle"]))
+        assert not any("gap" in text for text in labels(figures["limit_cycle"]))
     if case == "effects":
-        assert any("half width 0.09" in text for text in labels(shown["hysteresis"]))
+        assert any("half width 0.09" in text for text in labels(figures["hysteresis"]))
     if case == "gap":
-        assert [text.get_text() for text in shown["intervals"].axes[0].texts][-1] == "held at nominal: not seen in this log"
+        assert [text.get_text() for text in figures["intervals"].axes[0].texts][
+            -1
+        ] == "held at nominal: not seen in this log"
 
 
 def labels(figure: Figure) -> list[str]:
@@ -177,7 +179,7 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     assert "drive.motor_inertia = 0.05 ± 0.001 kg," in words
     assert "drive.motor_viscous = 0.15 ± 0.001 N s/m," in words
     assert "position residual 0.0001 m rms" in words
-    figures = {one.name: one.figure for one in draw_identification(result)}
+    figures = {drawing.name: drawing.figure for drawing in draw_identification(result)}
     assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
     assert figures["resistance"].axes[0].get_ylabel() == "resisting force (N)"
     assert "kg m²" not in (tmp_path / "report.html").read_text()
@@ -215,9 +217,9 @@ def test_observers_that_diverged_leave_figures(tmp_path):
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
     drawn = draw_identification(dataclasses.replace(result, trace=trace))
-    assert [one.name for one in drawn] == GEARED
-    for one in drawn:
-        save(one.figure, tmp_path / f"{one.name}.png")
+    assert [drawing.name for drawing in drawn] == GEARED
+    for drawing in drawn:
+        save(drawing.figure, tmp_path / f"{drawing.name}.png")
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])

@@ -33,8 +33,8 @@ def test_lines_bars_names_and_a_description(tmp_path):
         ax.axhline(0.5)
         ax.set(xlabel="time (s)", yscale="log")
 
-    shown = draw_picture(tmp_path, draw)
-    left, right = shown.panels
+    picture = draw_picture(tmp_path, draw)
+    left, right = picture.panels
     # the line that only marks a place is none of values
     (line,) = left["lines"]
     assert line["name"] == "price in $" and line["sorted"]
@@ -44,8 +44,8 @@ def test_lines_bars_names_and_a_description(tmp_path):
     assert left["y"]["log"] and not left["x"]["log"]
     assert right["bars"] == [[0.0, -0.4, 3.0, 0.8], [0.0, 0.6, 4.0, 0.8]]
     assert right["y"]["names"] == [[0.0, "first"], [1.0, "second"]]
-    assert shown.described.startswith("What it shows. x time (s) from ") and "Lines: price in $." in shown.described
-    assert shown.size == (576, 288) and shown.svg.startswith(b"<?xml")
+    assert picture.described.startswith("What it shows. x time (s) from ") and "Lines: price in $." in picture.described
+    assert picture.size == (576, 288) and picture.svg.startswith(b"<?xml")
 
 
 @pytest.mark.parametrize("bar", [True, False])
@@ -67,8 +67,8 @@ def test_cells_have_values_where_a_colour_bar_says_of_what(tmp_path, bar):
 @pytest.mark.parametrize("count", [100, 50_000])
 def test_clouds_and_long_lines_stay_small(tmp_path, count):
     values = np.random.default_rng(0).standard_normal((2, count))
-    shown = draw_picture(tmp_path, lambda ax: ax.plot(*values, "."))
-    assert len(shown.svg) < 200_000
-    (line,) = shown.panels[0]["lines"]
+    picture = draw_picture(tmp_path, lambda ax: ax.plot(*values, "."))
+    assert len(picture.svg) < 200_000
+    (line,) = picture.panels[0]["lines"]
     assert 1 < len(unpack(line["x"])) <= 30_000
-    assert draw_picture(tmp_path, lambda ax: ax.plot(*values, ".")) == shown
+    assert draw_picture(tmp_path, lambda ax: ax.plot(*values, ".")) == picture

@@ -28,7 +28,7 @@ def make_residual(name, torque, time):
 def test_observers_that_converge_are_drawn_thin(tmp_path):
     time = 5e-3 * np.arange(4000)
     torque = {name: -0.1 * np.sign(np.cos(time)) for name in ("motor", "load")}
-    pairs = {name: make_residual(name, one, time) for name, one in torque.items()}
+    pairs = {name: make_residual(name, side_torque, time) for name, side_torque in torque.items()}
     residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
@@ -44,11 +44,11 @@ def test_observers_that_converge_are_drawn_thin(tmp_path):
 def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     time = 5e-3 * np.arange(8000)
     torque = {"motor": -0.1 * np.sign(np.cos(time)) + 0.1 * np.sin(2.0 * np.pi * 11.0 * time), "load": np.zeros(8000)}
-    pairs = {name: make_residual(name, one, time) for name, one in torque.items()}
+    pairs = {name: make_residual(name, side_torque, time) for name, side_torque in torque.items()}
     residuals = {name: [residual] for name, (residual, _) in pairs.items()}
     coordinates = {name: [values] for name, (_, values) in pairs.items()}
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
-    drawn = {one.name: one for one in draw_residuals(residuals, coordinates, result, unit)}
+    drawn = {drawing.name: drawing for drawing in draw_residuals(residuals, coordinates, result, unit)}
     assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
     above, below = drawn["residual_torque"].figure.axes
     assert sentence_of(result["motor"], unit) == " ".join(above.get_title("left").split())
@@ -57,6 +57,6 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"
     marks = [text.get_text() for text in drawn["residual_spectrum"].figure.axes[0].texts]
     assert any(text.startswith("11 Hz") for text in marks)
-    for one in drawn.values():
-        assert save(one.figure, tmp_path / f"{one.name}.png").stat().st_size > 10_000
-        assert one.caption.endswith(".")
+    for drawing in drawn.values():
+        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 10_000
+        assert drawing.caption.endswith(".")
