@@ -14,6 +14,8 @@ from jaxbl.report.figures import save
 from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names, write_choice_report
 from jaxbl.report.results import draw
 
+# points differ in values of lanes alone
+pytestmark = pytest.mark.usefixtures("compiled_once")
 KINDS = ["super_twisting", "luenberger", "kalman"]
 
 
@@ -60,8 +62,8 @@ def test_sentences_have_the_numbers_of_the_summary(point):
     motor = point.summary["points"][0]["sides"]["motor"]
     line, chosen_line = choice_headline(point.summary)
     assert line.startswith(f"motor: {motor['best']} ")
-    for kind, one in list(motor["kinds"].items())[1:]:
-        assert f"{kind} {one['ratio']:.3g} ({one['low']:.3g} to {one['high']:.3g})" in line
+    for kind, errors in list(motor["kinds"].items())[1:]:
+        assert f"{kind} {errors['ratio']:.3g} ({errors['low']:.3g} to {errors['high']:.3g})" in line
     assert point.summary["for_both_sides"] in chosen_line
 
 
@@ -71,7 +73,7 @@ def test_kinds_that_are_alike_are_said_first(point):
     best, second = list(side["kinds"])[:2]
     side["not_told_apart"] = [second]
     assert f"motor: {best} and {second} are the best and cannot be told apart" in choice_headline(summary)[0]
-    side["kinds"] = {kind: one | {"ratio": None} for kind, one in side["kinds"].items()}
+    side["kinds"] = {kind: errors | {"ratio": None} for kind, errors in side["kinds"].items()}
     summary["for_both_sides"] = None
     assert choice_headline(summary)[0] == "motor: all kinds diverged or were too slow."
 
@@ -92,9 +94,9 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped, tmp_path):
     short = short_names(KINDS)
     cells = {text.get_position(): text.get_text() for text in ax.texts}
     assert len(cells) == 6
-    for one in mapped.summary["points"]:
-        noise, resolution = one["values"].values()
-        side = one["sides"]["motor"]
+    for point in mapped.summary["points"]:
+        noise, resolution = point["values"].values()
+        side = point["sides"]["motor"]
         # x is the last axis; a resolution of zero has no place on a logarithmic scale
         text = cells[float(resolution > 0.0), noise]
         first, _, second = text.partition("\n")
@@ -108,21 +110,21 @@ def test_one_axis_is_drawn_as_lines(mapped):
     line = chosen(listed("encoders.noise", 1e-6, 1e-5, 1e-4))
     (drawn,) = draw_choice(line)
     (ax,) = drawn.figure.axes
-    assert [one.get_label() for one in ax.lines] == KINDS
-    errors = [one["sides"]["motor"]["kinds"]["kalman"]["error"] for one in line.summary["points"]]
+    assert [point.get_label() for point in ax.lines] == KINDS
+    errors = [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in line.summary["points"]]
     np.testing.assert_allclose(ax.lines[2].get_ydata(), errors)
     # the same points are in the map
     np.testing.assert_allclose(
-        errors, [one["sides"]["motor"]["kinds"]["kalman"]["error"] for one in mapped.summary["points"]][::2]
+        errors, [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in mapped.summary["points"]][::2]
     )
 
 
 def test_points_won_are_counted(mapped):
     first, second = choice_headline(mapped.summary)
-    won = [one["sides"]["motor"]["best"] for one in mapped.summary["points"]]
+    won = [point["sides"]["motor"]["best"] for point in mapped.summary["points"]]
     for kind in set(won):
         assert f"{kind} at {won.count(kind)}" in first
-    ratios = [one["sides"]["motor"]["kinds"]["kalman"]["ratio"] for one in mapped.summary["points"]]
+    ratios = [point["sides"]["motor"]["kinds"]["kalman"]["ratio"] for point in mapped.summary["points"]]
     assert f"kalman {min(ratios):.3g} to {max(ratios):.3g}" in second
 
 
