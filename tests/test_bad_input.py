@@ -102,7 +102,7 @@ def test_what_is_said_of_it(said, case):
 @pytest.mark.parametrize("what", ["toml", "logs"])
 def test_generated_ones(what, tmp_path, repeats):
     """Read, or refused in one line; the process itself ends at an exception, at ten seconds, and at two gigabytes."""
-    count = repeats(120, 1000)
+    count = repeats(70, 1000)
     lines = read(what, tmp_path, count).values()
     assert len(lines) >= count
     # neither all refused nor all read
