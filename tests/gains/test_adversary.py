@@ -1,5 +1,6 @@
 """The adversary: what it finds is real, at least what short brute force finds, and above a bound that is too small."""
 
+import functools
 import itertools
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from error_steps import stepped
 
+from jaxbl.gains import adversary
 from jaxbl.gains.adversary import explore_errors, search_violations
 from jaxbl.gains.invariant_set import ErrorSystem, prove
 from jaxbl.observer.super_twisting import DISCRETISATIONS
@@ -20,6 +22,20 @@ SYSTEMS = [
 ]
 RATIOS = dict(zip(SYSTEMS, (1.17, 1.06, 1.12, 1.2), strict=True))
 """Largest ratio of the proven bound to the worst error that was found."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_lanes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adversary, "_LANES", 1 << 12)
+        yield
+
+
+@functools.cache
+def search(system):
+    """A proof from the largest noise, and the result of a search for errors above it."""
+    proof = prove(system, system.noise, 0.0)
+    return proof, search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
@@ -39,7 +55,6 @@ def test_the_way_that_is_found_leads_there(system):
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system):
-    proof = prove(system, system.noise, 0.0)
     choices = np.array(list(itertools.product((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)[: 1 + (system.push > 0)])))
     noise, mean, nominal = choices.T
     moment = 0.5 * mean
@@ -51,7 +66,7 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
             *(np.tile(x, len(e)) for x in (system.noise * noise, mean, moment, system.push * nominal)),
         )  # fmt: skip
         largest = max(largest, error.max())
-    result = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
+    proof, result = search(system)
     assert result.worst >= largest
     assert result.violations == 0
     assert proof.bounds[-1] <= RATIOS[system] * result.worst
@@ -59,8 +74,7 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_a_bound_that_is_too_small_is_found_out(system):
-    proof = prove(system, system.noise, 0.0)
-    result = search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
+    proof, result = search(system)
     wrong = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / result.worst))
     refuted = search_violations(system, system.noise, 0.0, wrong, wrong.bounds[-1], 1)
     assert refuted.violations > 0
@@ -80,7 +94,7 @@ def test_runs_from_the_start_are_held_against_the_bound_of_each_sample():
 
 def test_the_same_seed_finds_the_same():
     system = SYSTEMS[1]
-    proof = prove(system, system.noise, 0.0)
-    first, other = (search_violations(system, system.noise, 0.0, proof, 1.0, 40_000, seed=3) for _ in range(2))
-    assert first.worst == other.worst and first.runs == other.runs >= 40_000
+    proof, _ = search(system)
+    first, other = (search_violations(system, system.noise, 0.0, proof, 1.0, 10_000, seed=3) for _ in range(2))
+    assert first.worst == other.worst and first.runs == other.runs >= 10_000
     np.testing.assert_array_equal(first.sequence.noise, other.sequence.noise)

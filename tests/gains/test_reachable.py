@@ -1,5 +1,6 @@
 """The search over reachable errors: against a linear worst case, all sequences of a short horizon, and simulation."""
 
+import functools
 import itertools
 
 import jax
@@ -29,7 +30,9 @@ def noises(states):
     ])  # fmt: skip
 
 
+@functools.cache
 def explore_kind(kind, gains, most=50_000):
+    """The observer, its state at rest, and the result of the search."""
     observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
     rest_state = observer.start(zero, zero, lambda v: v, jnp.ones(()))
     return (

@@ -169,7 +169,7 @@ def test_known_accelerations_leave_it_exact(order):
 @pytest.mark.parametrize("order", ORDERS)
 def test_any_start_leads_into_the_sliding_set(order):
     """Errors up to 40^(n+1-i) times those of a period, while the highest derivative jumps between its bounds."""
-    n, h, lanes, count = order, 1.0, 64, 20_000
+    n, h, lanes, count = order, 1.0, 64, 10_000
     rng = np.random.default_rng(3)
     observer = DIFFERENTIATORS[n](1.0)
     size = 10.0 ** rng.uniform(-1.0, np.log10(40.0), lanes)
@@ -214,8 +214,9 @@ def test_polynomials_are_differentiated_exactly_and_without_chatter(order):
         np.testing.assert_allclose(estimate.control[late], expected, atol=4**order * 40.0 * rounding / h**2)
 
 
-@pytest.mark.parametrize(("dtype", "h"), [(np.float64, 5e-3), (np.float32, 0.2)])
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("order", "dtype", "h"), [*((order, np.float64, 5e-3) for order in ORDERS), (2, np.float32, 0.2), (5, np.float32, 0.2)]
+)
 def test_a_smooth_signal_never_leaves_the_sliding_set_again(order, dtype, h):
     """|y^(n+1)| <= L: the position has no error at all, and the velocity that of interpolation, h^n L / (n + 1)."""
     t = h * np.arange(8000)
@@ -239,7 +240,7 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     sizes = 10.0 ** np.linspace(-8.0, -3.0, 6)
     pace = sizes ** (1.0 / (n + 1))
     h = pace / 400.0
-    t = h[:, None] * np.arange(40_000)
+    t = h[:, None] * np.arange(24_000)
     # square waves about the differentiator's own time
     waves = np.sign(np.sin(2.0 * np.pi * t / (pace[:, None] * 6.0) + np.random.default_rng(5).uniform(0.0, 6.0)))
     true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
@@ -252,7 +253,7 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
         estimates.append(estimate.control)
     # further states are predicted for the coming sample, a period that is short beside their own time
     estimates += [np.roll(x, 1, axis=1) for x in state.further[1:]]
-    late = slice(-20_000, None)
+    late = slice(-12_000, None)
     errors = [np.abs(x - y)[:, late].max(axis=1) for x, y in zip(estimates, true, strict=False)]
     slopes = [np.polyfit(np.log(sizes), np.log(column), 1)[0] for column in errors]
     expected = [(n + 1 - i) / (n + 1) for i in range(len(slopes))]
