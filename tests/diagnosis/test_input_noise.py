@@ -59,11 +59,11 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
     noisy = true + noise * np.random.default_rng(4).standard_normal(count)
     third = np.diff(np.eye(count), n=3, axis=0)
 
-    def left(log_weight: float) -> float:
+    def score_weight(log_weight: float) -> float:
         solution = np.linalg.solve(np.eye(count) + 10.0**log_weight * third.T @ third, noisy)
         return float(np.sqrt(np.mean((solution - true) ** 2)))
 
-    best = minimize_scalar(left, bounds=(0.0, 11.0), method="bounded").fun
+    best = minimize_scalar(score_weight, bounds=(0.0, 11.0), method="bounded").fun
     assert np.sqrt(np.mean((_smooth_curve(noisy) - true) ** 2)) < 1.5 * best
     # what has no curvature is let through untouched
     line = 0.3 + 1e-3 * np.arange(count)

@@ -52,7 +52,7 @@ def linear(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
 
 
 @pytest.fixture(scope="module")
-def geared():
+def geared_model():
     """The model of two sides at its nominal numbers, for tests that change nothing of it."""
     return linear(2)
 
@@ -104,37 +104,37 @@ SMALL = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_candidates_torque_does_what_the_effect_does(geared, name):
+def test_a_candidates_torque_does_what_the_effect_does(geared_model, name):
     """The effect in the simulated step, against its torque along the measured motion through the linear recursion."""
     effect = as_arrays(make_effect(name, **SMALL[name]), float)
 
     def with_effect(experiment):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
-    columns = errors(geared, Forces(geared.signals[0].of([effect])))
+    columns = errors(geared_model, Forces(geared_model.signals[0].of([effect])))
     expected = errors(linear(2, with_effect))[:, 0] - columns[:, 0]
     actual = columns[:, -1]
     assert size(expected) > 0.0
     assert size(actual - expected) < 0.03 * size(expected)
 
 
-def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared):
-    (signals,), lag = geared.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
-    steps, torque = geared.period / 0.01, signals.torque[: signals.samples]
+def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared_model):
+    (signals,), lag = geared_model.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
+    steps, torque = geared_model.period / 0.01, signals.torque[: signals.samples]
     settled, rested = (signals.of([lag], from_rest)[0][-1] for from_rest in (False, True))
     assert torque[0] != 0.0 and settled[0] == pytest.approx(0.0, abs=1e-12)
     # what the state at the first sample leaves until later
     decay = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
     np.testing.assert_allclose(settled - rested, decay, atol=1e-12)
-    variants = variants_of(geared.experiment, ["actuator.lag", "actuator.saturation"], geared.scales)
+    variants = variants_of(geared_model.experiment, ["actuator.lag", "actuator.saturation"], geared_model.scales)
     assert sorted({(variant.name, variant.from_rest) for variant in variants}) == [
         ("actuator.lag", False), ("actuator.lag", True), ("actuator.saturation", False)
     ]  # fmt: skip
 
 
-def test_numbers_of_waves_are_those_of_the_effect(geared):
+def test_numbers_of_waves_are_those_of_the_effect(geared_model):
     """A wave's two columns make up the effect that its numbers describe."""
-    signals = geared.signals[0]
+    signals = geared_model.signals[0]
     values = (0.3e-3, -0.4e-3)
     waves = (
         "load.gravity",
@@ -144,7 +144,7 @@ def test_numbers_of_waves_are_those_of_the_effect(geared):
         "transmission.eccentricity",
     )
     names = set()
-    for variant in variants_of(geared.experiment, waves, lambda name: LOG):
+    for variant in variants_of(geared_model.experiment, waves, lambda name: LOG):
         if variant.name in waves:
             (columns,) = columns_of([variant], signals)
             effect = as_arrays(make_effect(variant.name, **variant.numbers(values)), float)
@@ -166,9 +166,9 @@ def test_products_are_those_of_the_errors(sides):
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_products_of_candidates_are_those_of_their_errors(geared, coloured):
+def test_products_of_candidates_are_those_of_their_errors(geared_model, coloured):
     """Candidates are taken some at a time: those beside one another are the same as all at once."""
-    model = geared
+    model = geared_model
     variants = variants_of(model.experiment, list(SMALL), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
@@ -246,9 +246,11 @@ def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
     assert not np.isfinite(model.predictor(smoothness).squares).any()
 
 
-def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(geared):
-    travel = float(np.ptp(np.asarray(geared.parts[0].position["load"])))
+def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(geared_model):
+    travel = float(np.ptp(np.asarray(geared_model.parts[0].position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
     assert least < 10  # twice a motor turn, with a gear ratio of 5
-    trials = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(geared.scales("transmission.eccentricity"))
+    trials = (
+        EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(geared_model.scales("transmission.eccentricity"))
+    )
     assert tuple(trials) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)

@@ -47,13 +47,13 @@ def test_prediction_errors_are_least(setting):
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
-    def predicted(inputs):
+    def predict(inputs):
         candidate = set_free_parameters(plain, free, inputs[2:] * 0.01)
         start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(candidate, torque[0]))
         return plant_trajectory(candidate, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(inputs):
-        errors = np.asarray(reading - predicted(jnp.asarray(inputs)))
+        errors = np.asarray(reading - predict(jnp.asarray(inputs)))
         return len(errors) * np.log(np.sum(errors**2)) + np.sum((inputs[2:] * 0.01 / width) ** 2)
 
     here = np.concatenate([result.start[0], 100.0 * result.theta])

@@ -16,7 +16,7 @@ from jaxbl.records import Record, read_record
 MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}
 
 
-def written(path: Path, seed: int, zero: float) -> Path:
+def write_log(path: Path, seed: int, zero: float) -> Path:
     """A log of a motor with cogging of 5 a turn, whose encoder has a zero of its own."""
     time = 1e-3 * np.arange(6000)
     place = 20.0 * np.sin(1.5 * time + seed)
@@ -30,7 +30,7 @@ def written(path: Path, seed: int, zero: float) -> Path:
 @pytest.fixture(scope="module")
 def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("logs")
-    return [written(folder / f"{seed}.csv", seed, zero) for seed, zero in ((0, 0.0), (1, 0.3), (2, -0.2))]
+    return [write_log(folder / f"{seed}.csv", seed, zero) for seed, zero in ((0, 0.0), (1, 0.3), (2, -0.2))]
 
 
 def ahead(record: Record, paths: list[Path]) -> list[float]:

@@ -27,7 +27,7 @@ def test_gain_is_that_of_a_filter_that_has_run_long(smoothness):
     np.testing.assert_allclose(kalman_gain(smoothness, 0.1), gain * [1.0, 10.0], rtol=1e-6)
 
 
-def disturbed(force, seed=0):
+def simulate_disturbed_mass(force, seed=0):
     """A mass with viscous friction under a multisine and white random force (N²s), by exact discretisation."""
     random = np.random.default_rng(seed)
     mass, friction = 0.05, 0.15
@@ -53,7 +53,7 @@ def experiment_and_free():
 
 
 @jit
-def fitted(experiment, free, windows):
+def fit_numbers(experiment, free, windows):
     return fit(experiment, free, windows, jnp.zeros(2))
 
 
@@ -68,12 +68,12 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
     errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}
     force = 1e-4
     for seed in range(8):
-        torque, _, readings = disturbed(force, seed)
+        torque, _, readings = simulate_disturbed_mass(force, seed)
         windows = windows_of(torque, readings, 500)
         predicted, smoothness = predictor(experiment, windows)
         np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
         for name, cut_windows in (("free", windows), ("predicted", predicted)):
-            result = fitted(experiment, free, cut_windows)
+            result = fit_numbers(experiment, free, cut_windows)
             errors[name].append(result.theta)
             widths[name].append(np.sqrt(np.diag(spread(result).covariance)))
     size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}
@@ -84,10 +84,10 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
 
 def test_without_a_disturbance_the_predictor_runs_freely():
     experiment, free = experiment_and_free()
-    torque, _, readings = disturbed(1e-14)
+    torque, _, readings = simulate_disturbed_mass(1e-14)
     windows = windows_of(torque, readings, 500)
     predicted, smoothness = predictor(experiment, windows)
     assert smoothness["motor"] < 1e-9
     assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)
-    result = fitted(experiment, free, predicted)
+    result = fit_numbers(experiment, free, predicted)
     np.testing.assert_allclose(result.theta, 0.0, atol=0.005)
