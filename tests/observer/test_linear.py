@@ -1,5 +1,6 @@
 """Linear observers against scipy.signal, closed forms and the Riccati equation of scipy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +21,19 @@ def nominal(velocity):
 def observe(observer, measured, acceleration=nominal, period=H):
     """Estimates along measured positions, from the first one at rest."""
 
-    def step(state, y):
-        return observer.step(state, y, acceleration, period)
+    dtype, count = measured.dtype, len(measured)
+    observer, period = jax.tree.map(lambda x: jnp.asarray(x, dtype), (observer, period))
+    # signals of one length share the program of each kind
+    return jax.tree.map(lambda x: x[:count], run_observer(observer, np.resize(measured, SAMPLES), acceleration, period))
 
-    start = observer.start(jnp.asarray(measured[0]), jnp.zeros((), measured.dtype), acceleration, jnp.asarray(period))
-    return jax.jit(lambda y: jax.lax.scan(step, start, y)[1])(jnp.asarray(measured))
+
+SAMPLES = 4000
+
+
+@eqx.filter_jit
+def run_observer(observer, measured, acceleration, period):
+    start = observer.start(measured[0], jnp.zeros((), measured.dtype), acceleration, period)
+    return jax.lax.scan(lambda state, y: observer.step(state, y, acceleration, period), start, measured)[1]
 
 
 def model(period=H):

@@ -47,14 +47,24 @@ def test_implicit_step_solves_its_generalised_equation(dtype, magnitude, sign, l
     np.testing.assert_allclose(new.position, estimate.position + h * estimate.velocity, rtol=few, atol=few * abs(b))
 
 
+SAMPLES = 3000
+"""Samples of a block: signals of any length share the program of each observer."""
+
+
+@eqx.filter_jit
+def observe_block(observer, state, measured, acceleration, h):
+    return jax.lax.scan(lambda state, y: observer.step(state, y, acceleration, h), state, measured)
+
+
 def observe(observer, measured, h, acceleration=zero, state=(0.0, 0.0)):
     """Estimates along measured positions."""
-
-    def step(state, y):
-        return observer.step(state, y, acceleration, h)
-
-    start = ObserverState(*(jnp.asarray(x, measured.dtype) for x in state))
-    return jax.jit(lambda y: jax.lax.scan(step, start, y)[1])(measured)
+    dtype, count = measured.dtype, len(measured)
+    observer, state, h = jax.tree.map(lambda x: jnp.asarray(x, dtype), (observer, ObserverState(*state), h))
+    blocks = []
+    for block in np.resize(measured, (-(-count // SAMPLES), SAMPLES)):
+        state, estimates = observe_block(observer, state, block, acceleration, h)
+        blocks.append(estimates)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
