@@ -1,10 +1,16 @@
 """The page and figures of a verification."""
 
+import re
+import shutil
+
 import numpy as np
 import pytest
+import tomli_w
 from browser import check, needs_chromium, opened
+from shared_results import VERIFIED
 
 from jaxbl.report.verify import draw_verdict, write_verify_report
+from jaxbl.sweeps.engine import Engine
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +92,21 @@ def test_tuning_rules_in_figure_page_and_lines(checked):
 def test_the_page_in_a_browser(checked):
     with opened(checked[1] / "report.html") as (page,):
         check(page, 7)
+
+
+def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified, call, tmp_path, monkeypatch):
+    folder = tmp_path / "results" / "study"
+    shutil.copytree(verified[1], folder)
+    for name in ("verdict.json", "counterexamples.parquet"):
+        (folder / name).unlink()
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(VERIFIED))
+    # all runs are there
+    monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished verification simulates"))
+    code, lines, _ = call("verify", "study.toml")
+    assert code == 0
+    assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor", "conservatism", "claimed_bound"}
+    assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "verify/manifest.json"))
+    assert re.fullmatch(r"normalised: 63 cells, of which \d+ converge, with no counterexample to any condition.", lines[0])
+    assert lines[-1] == "results/study/report.html"
+    # the second call says the same
+    assert call("verify", "study.toml")[:2] == (0, lines)

@@ -21,6 +21,7 @@ from jaxbl.report.explorer.study import nearby, simulated, study_source, write_s
 from jaxbl.sweeps.sweep import open_study, share, sweep
 from jaxbl.sweeps.trial import run
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
 HOSTILE = "</script><script>alert(1)</script> <b>a</b> \u202e"
 AXES = [listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 2.0, 50.0, 6), spaced(LAMBDA, 1.0, 20.0, 5)]
 
