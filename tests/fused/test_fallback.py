@@ -6,7 +6,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from small_study import ALPHA, listed, small
+from small_study import ALPHA, listed, rigid
 
 import jaxbl
 from jaxbl import fused
@@ -58,8 +58,8 @@ def unknown(request, monkeypatch):
     single_plant._trajectory_loop.cache_clear()
 
 
-STUDY = small({"run.substeps": 2})
-SWEPT = small({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)])
+STUDY = rigid({"run.substeps": 2})
+SWEPT = rigid({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)], sweep={"metrics": ["velocity_rmse"]})
 
 
 @pytest.fixture(scope="module")
