@@ -11,14 +11,14 @@ import pytest
 from hidden.simulator import Machine, Run, simulate
 from hidden_log import GAP, GEARED
 from scipy.optimize import least_squares
-from small_study import small
+from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
-from jaxbl.identification.intervals import spread
+from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit
 from jaxbl.simulate import plant_trajectory
@@ -145,6 +145,35 @@ def test_the_gap_at_1_khz():
     *_, fits = fit_lanes(drive(3, period), *motion, {"motor": 1e-4, "load": 2e-5}, period)
     errors = np.expm1(fits.theta)
     assert np.abs(errors[:, 5]).max() < 0.005, errors[:, 5]
+
+
+def test_scales_that_one_record_cannot_part_are_refused():
+    """Torque gain, inertia and friction scaled alike give the same motion."""
+    effects = [{"kind": "actuator.gain_error", "relative": 0.0}, {"kind": "motor.coulomb_friction", "torque": 0.01}]
+    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1}, effects=effects)))
+    t = PERIOD * np.arange(1000)
+    torque = 0.1 * np.sin(9.0 * t) + 0.05 * np.sin(31.0 * t)
+    state = experiment.plant.init(experiment.initial)
+    simulated = jit(plant_trajectory)(experiment, state, jnp.asarray(torque)).position["motor"]
+    readings = {"motor": simulated + 1e-5 * jax.random.normal(jax.random.key(2), (1000,))}
+    paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
+    paths.append("effects.actuator.gain_error.relative")
+    free = make_free_parameters(experiment, paths, 0.1)
+    smoothed = smooth(readings["motor"], PERIOD)
+    start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
+    windows = cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250)
+    result = jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
+    refused, condition = refusals(free, spread(result))
+    assert condition > 1e4
+    (direction,) = refused
+    assert set(direction.direction) == set(paths)
+    np.testing.assert_allclose(list(direction.direction.values()), 1.0, rtol=0.05)
+    # without the gain's column
+    columns = np.arange(3)
+    refused, condition = refusals(free[:3], spread(result.only(columns)))
+    assert refused == []
+    assert condition < 1e3
+    np.testing.assert_allclose(result.theta[columns], np.log1p(result.theta[3]), rtol=0.0, atol=0.05)
 
 
 def test_residual_correlation_widens_intervals():
