@@ -56,16 +56,19 @@ def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, e
 
 
 def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
-    trace, segment = record(study(1, [FRICTION]), seed=1)
     experiment = prepare(read_config(study(1)))
-    (residual,) = residual_torques(experiment, [segment])["motor"]
-    missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    smoothed = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
-    assert rms((residual.torque - smoothed) / residual.deviation) == pytest.approx(1.0, abs=0.1)
-    assert scores(residual) > 3.0
-    # the other way round as the balance
-    balance_torque = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
-    assert np.corrcoef(balance_torque[200:-200], residual.torque[200:-200])[0, 1] > 0.97
+    errors = []
+    for seed in range(3):
+        trace, segment = record(study(1, [FRICTION]), seed)
+        (residual,) = residual_torques(experiment, [segment])["motor"]
+        missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
+        smoothed = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
+        errors.append(rms((residual.torque - smoothed) / residual.deviation))
+        assert scores(residual) > 3.0
+        # the other way round as the balance
+        balance_torque = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
+        assert np.corrcoef(balance_torque[200:-200], residual.torque[200:-200])[0, 1] > 0.97
+    assert np.mean(errors) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_measured_torque_takes_the_place_of_the_models():
