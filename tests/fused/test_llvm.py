@@ -41,15 +41,8 @@ def arrays():
 
 
 def test_a_loop_says_what_it_takes(loop):
-    assert [parameter.name for parameter in loop.signature] == list(arrays())
-    assert [parameter.extent for parameter in loop.signature] == [
-        "lanes",
-        "lanes",
-        "scalar",
-        "samples",
-        "samples",
-        "samples and lanes",
-    ]
+    assert [arg.name for arg in loop.signature] == list(arrays())
+    assert [arg.extent for arg in loop.signature] == ["lanes", "lanes", "scalar", "samples", "samples", "samples and lanes"]
     inputs = arrays()
     loop(list(inputs.values()), 5, 0, 2)
     np.testing.assert_array_equal(inputs["carry 0"], [110.0, 120.0])
