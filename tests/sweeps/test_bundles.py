@@ -54,10 +54,11 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
 
 
 def test_processes_of_this_machine_give_the_same_table(tmp_path):
-    sweep(thirty(), tmp_path / "alone")
-    other = thirty(sweep={"seeds": 2, "chunk": 256})
-    full_frame = sweep(other, tmp_path / "whole", devices=jax.devices()[:1]).frame
-    study = sweep(thirty(), tmp_path / "study", scheduler="local:2")
+    lanes = {"seeds": 2, "metrics": ["velocity_rmse"]}
+    data = thirty(sweep=lanes | {"chunk": 4})
+    sweep(data, tmp_path / "alone")
+    full_frame = sweep(thirty(sweep=lanes | {"chunk": 256}), tmp_path / "whole", devices=jax.devices()[:1]).frame
+    study = sweep(data, tmp_path / "study", scheduler="local:2")
     assert parts(tmp_path / "study") == parts(tmp_path / "alone")
     # in other chunks, on one device
     points = [ALPHA, LAMBDA, "seed"]
