@@ -176,8 +176,8 @@ def _waits(job):
 
 def test_a_scheduler_that_is_lost_is_said():
     # one thread, so that the job that waits begins after the other
-    own = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(**own) as there, Client(there, set_as_default=False) as connection, connect(connection) as workers:
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**options) as there, Client(there, set_as_default=False) as connection, connect(connection) as workers:
         results = workers.map_jobs(_waits, [False, True])
         assert next(results) is False
         connection.close()

@@ -248,8 +248,8 @@ def test_an_estimate_runs_every_seed(monkeypatch):
     used = []
     compiled = engine.compile_program
 
-    def counted(*arguments, **remainder):
-        program = compiled(*arguments, **remainder)
+    def compile_and_count(*arguments, **options):
+        program = compiled(*arguments, **options)
 
         def run(values, seeds):
             used.append((len(np.unique(seeds)), *(len(np.unique(column)) for column in values.values())))
@@ -257,7 +257,7 @@ def test_an_estimate_runs_every_seed(monkeypatch):
 
         return program._replace(run=run)
 
-    monkeypatch.setattr(engine, "compile_program", counted)
+    monkeypatch.setattr(engine, "compile_program", compile_and_count)
     dry_run(rigid(axes=[spaced(ALPHA, 1.0, 2.0, 5)], sweep={"seeds": 3}))
     assert set(used) == {(3, 5)}
 

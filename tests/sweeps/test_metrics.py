@@ -195,11 +195,11 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     counts = []
     pieces = under_test.apply_elementwise
 
-    def counted(function, columns, **keys):
+    def count_pieces(function, columns, **keys):
         counts.append((len(columns[0]), keys))
         return pieces(function, columns, **keys)
 
-    monkeypatch.setattr(under_test, "apply_elementwise", counted)
+    monkeypatch.setattr(under_test, "apply_elementwise", count_pieces)
     # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
     f_plus = {
         "motor.f_plus": np.array([[1.0, 2.0, 3.0], [1.0, 2.5, np.nan]]),
@@ -214,6 +214,6 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     assert counts == [(5, {"largest": 6}), (2, {"largest": 6})]
     for seed, lane in np.ndindex(2, 3):
         alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
-        of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}
+        of_lane = {side: ObserverGains(*(gain if gain.ndim == 0 else gain[lane] for gain in g)) for side, g in gains.items()}
         for name, value in add_gain_metrics(alone, of_lane).items():
             np.testing.assert_array_equal(result[name][seed, lane], value, err_msg=name)

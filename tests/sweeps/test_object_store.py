@@ -45,7 +45,7 @@ def keys(address):
     """Names below an address, with their content."""
     bucket, _, prefix = address.removeprefix("s3://").partition("/")
     client = boto3.client("s3")
-    names = [one["Key"] for one in client.list_objects_v2(Bucket=bucket, Prefix=prefix).get("Contents", [])]
+    names = [stored["Key"] for stored in client.list_objects_v2(Bucket=bucket, Prefix=prefix).get("Contents", [])]
     return {name.removeprefix(f"{prefix}/"): client.get_object(Bucket=bucket, Key=name)["Body"].read() for name in names}
 
 
@@ -75,9 +75,9 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
     address = f"{bucket}/b"
     sweep(thirty(), address)
     computed.clear()
-    one, other = (to_path(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
-    one.write_bytes(one.read_bytes()[:-1000])
-    other.unlink()
+    damaged, lost = (to_path(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    lost.unlink()
     with pytest.raises(InputError, match=r"part-00002\.parquet: is damaged"):
         _ = open_study(address).frame
     assert len(sweep(thirty(), address).damaged) == 1
