@@ -8,8 +8,8 @@ from .c import c_type, to_ascii, write_comment
 
 def input_columns(program: Program) -> list[str]:
     """Return the columns that the program reads."""
-    sides = [quantity.name.removesuffix("_position") for quantity in program.block.start_inputs]
-    return ["t", "u", *(POSITION_CHANNELS[side] for side in sides)]
+    positions = program.block.start_inputs
+    return ["t", "u", *(POSITION_CHANNELS[position.name.removesuffix("_position")] for position in positions)]
 
 
 def write_filter_code(program: Program) -> str:

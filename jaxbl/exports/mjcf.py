@@ -54,8 +54,7 @@ def write_mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, floa
     parts, answers, notes = _collect_parts(experiment, slides)
     period = float(experiment.run.sample_period)
     steps = _round_up(period / min(parts.step, parts.longest_step))
-    title = config.title or "A drive"
-    return _write_model(title, experiment, parts, answers, notes, steps), period / steps, answers
+    return _write_model(config.title or "A drive", experiment, parts, answers, notes, steps), period / steps, answers
 
 
 def _round_up(steps: float) -> int:

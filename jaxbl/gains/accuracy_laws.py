@@ -379,8 +379,8 @@ class _FigureLine:
         return stops
 
     def _local_slope(self, i: int, j: int) -> float:
-        slope = math.log(self.y[i] / self.y[j]) / math.log(self.x[i] / self.x[j])
-        return round(slope, 2) + 0.0  # no minus before a zero
+        # no minus before a zero
+        return round(math.log(self.y[i] / self.y[j], self.x[i] / self.x[j]), 2) + 0.0
 
 
 def _format_times(ratio: float) -> str:

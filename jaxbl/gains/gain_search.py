@@ -224,8 +224,7 @@ class GainSearch:
         ]
         result = self.stages.run(data, name)
         names = [f"{side}.{metric}" for side in self.sides for metric in GAIN_METRICS]
-        paths = [axis["path"] for axis in data["axes"]]
-        return result.read([*paths, "seed", "finite", *names])
+        return result.read([*(axis["path"] for axis in data["axes"]), "seed", "finite", *names])
 
 
 _WORST_BY_METRIC = {

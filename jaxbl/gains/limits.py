@@ -141,8 +141,9 @@ def _judge_direction(
     forbidden = near[near["missed"].map(bool)]
     if len(forbidden) and forbidden["error"].min() < (1.0 - LEAST_DIFFERENCE) * best["error"]:
         least = forbidden.loc[forbidden["error"].idxmin()]
-        judgement = {"limit": "constraint", "missed": forbidden["missed"].iloc[0], "at": least[gain]}
-        return judgement | {"change": least["error"] / best["error"] - 1.0, "by": None}
+        change = least["error"] / best["error"] - 1.0
+        missed = forbidden["missed"].iloc[0]
+        return {"limit": "constraint", "missed": missed, "at": least[gain], "change": change, "by": None}
     last = near.iloc[-1]
     change = last["error"] / best["error"] - 1.0
     # NaN, the error of diverged runs, counts as growth

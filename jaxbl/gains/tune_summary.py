@@ -22,8 +22,7 @@ _FLAT_SHARE = 0.05  # relative differences of the error below this do not matter
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
     """Select the feasible candidates that no other beats in both convergence time and error, fastest first."""
     feasible = candidates[candidates["feasible"]].sort_values(["convergence_time", "error"], kind="stable")
-    before = feasible["error"].cummin().shift(fill_value=math.inf)
-    return feasible[feasible["error"] < before]
+    return feasible[feasible["error"] < feasible["error"].cummin().shift(fill_value=math.inf)]
 
 
 class Summary:

@@ -194,8 +194,7 @@ def _idealise_study(config: Config) -> Config:
             del axis["zip"]
             if "values" in axis:
                 axis["values"] = list(dict.fromkeys(axis["values"]))
-    sweep_table = config.to_dict()["sweep"] | {"seeds": 1}
-    return _strip_study(config, encoders={}, observer=observer, axes=axes, sweep=sweep_table)
+    return _strip_study(config, encoders={}, observer=observer, axes=axes, sweep=config.to_dict()["sweep"] | {"seeds": 1})
 
 
 def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[dict[str, Any], pd.DataFrame]:

@@ -151,8 +151,7 @@ def _march(
         return jnp.clip(h - event_value / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
 
     h = jax.lax.fori_loop(0, 6, newton_step, 0.5 * step_size(state))
-    last = _runge_kutta(slope, state, h)
-    return jax.tree.map(partial(jnp.where, has_event), last, state), has_event
+    return jax.tree.map(partial(jnp.where, has_event), _runge_kutta(slope, state, h), state), has_event
 
 
 def least_lambda_simulated(

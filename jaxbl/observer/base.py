@@ -89,8 +89,9 @@ class AbstractObserver(eqx.Module):
 
     def gains(self) -> dict[str, float]:
         """Gains of this observer, by config key."""
-        names = [field.name for field, _ in parameters(self) if not field.kw_only]
-        return {config_key(name): float(getattr(self, name)) for name in names}
+        return {
+            config_key(field.name): float(getattr(self, field.name)) for field, _ in parameters(self) if not field.kw_only
+        }
 
     @abc.abstractmethod
     def start(self, position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar) -> ObserverState:

@@ -328,8 +328,7 @@ def convergence_time_worst(
     # origin; p + lambda is minus the slower root
     slides = x2 + zero > -_lowest_ray(lambda_, 2.0 * _safe_excess(alpha, f_plus)) * y
     longest = jnp.maximum(first + speed * time_from_peak, jnp.where(slides, x2 / _safe_excess(alpha, f_plus), 0.0))
-    moving = (x2 != 0.0) | away
-    return jnp.where(converges, jnp.where(moving, longest, 0.0), jnp.inf)
+    return jnp.where(converges, jnp.where((x2 != 0.0) | away, longest, 0.0), jnp.inf)
 
 
 class Condition(NamedTuple):

@@ -376,8 +376,7 @@ class Engine:
 
     def _predict_seconds(self, backend: Backend, config: Config) -> float:
         """Seconds that a chunk of a group should take."""
-        names = computed_metrics(backend, config.sweep.requested_metrics)
-        operations = count_operations(config, self._varied_paths, names)
+        operations = count_operations(config, self._varied_paths, computed_metrics(backend, config.sweep.requested_metrics))
         return load_costs(self.devices).sample_seconds(backend, operations, self.layout) * config.run.steps
 
 

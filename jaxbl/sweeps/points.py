@@ -116,8 +116,8 @@ class Points:
         if self.refinement is None:
             return np.ones(len(columns["seed"]), bool)
         stride = 1 << self.refinement.grid.depth
-        on_axes = [np.isin(columns[path], self.axis_values(path)[::stride]) for path in self.refinement.paths]
-        return np.logical_and.reduce(on_axes)
+        paths = self.refinement.paths
+        return np.logical_and.reduce([np.isin(columns[path], self.axis_values(path)[::stride]) for path in paths])
 
     def _refined_paths(self, config: Config) -> list[str]:
         """Paths of the refined axes."""

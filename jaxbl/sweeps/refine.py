@@ -73,8 +73,7 @@ class CellGrid:
 
     def coarse_indices(self, positions: np.ndarray) -> Indices:
         """Flat indices of vertices of the coarse grid by their positions in it."""
-        coordinates = np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes)
-        return np.stack(coordinates, axis=-1) @ self._strides
+        return np.stack(np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes), axis=-1) @ self._strides
 
     def coarse_vertices(self) -> Indices:
         """All vertices of the coarse grid."""

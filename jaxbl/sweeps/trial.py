@@ -66,8 +66,7 @@ def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend 
         results = add_gain_metrics(results, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in columns.items()})
     last = {name: to_jsonable(results.pop(name)) for name in list(results) if name.startswith("last.")}
-    metrics = {name: to_jsonable(metric) for name, metric in results.items()}
-    return Trial(config, trace, _summarise(config, last, metrics, seed))
+    return Trial(config, trace, _summarise(config, last, to_jsonable(results), seed))
 
 
 def run_perturbed(study: Config, seed: int, count: int) -> list[dict[str, Any]]:

@@ -72,7 +72,7 @@ def test_a_verdict_that_held_out_data_support_stays():
 
 
 @pytest.mark.parametrize(
-    ("given", "reason"),
+    ("changes", "reason"),
     [
         ({"errors": NOISE | {"torque_motor": 0.0121}}, {"failed": ["torque_motor"]}),
         ({"theta": -0.11}, {"far": {"drive.motor_inertia": pytest.approx(-5.5)}}),
