@@ -395,19 +395,19 @@ class Store:
     def _split_files(self) -> tuple[dict[int, Path], list[Path]]:
         """The files among the parts: those named as parts, by index, and all others."""
         indexed: dict[int, Path] = {}
-        others = []
+        foreign = []
         for path in self.list_part_files():
             number = path.stem.removeprefix("part-")
             if number.isdecimal() and path == self.part_path(int(number)):
                 indexed[int(number)] = path
             else:
-                others.append(path)
-        return indexed, others
+                foreign.append(path)
+        return indexed, foreign
 
     def checked_parts(self) -> dict[int, Path]:
         """Files of the stored parts by index. Raises `InputError` if a file among them is not a part of this study."""
-        indexed, others = self._split_files()
-        for path in [*others, *(path for index, path in indexed.items() if index >= self.manifest["parts"])]:
+        indexed, foreign = self._split_files()
+        for path in [*foreign, *(path for index, path in indexed.items() if index >= self.manifest["parts"])]:
             raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
         return indexed
 
