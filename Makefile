@@ -13,7 +13,7 @@ PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 test: .venv/installed-dev
 	$(PYTEST)
 
-# without tests that take a second or more, and those that call a browser or a compiler
+# without slow tests (tests/durations.json), and those that call a browser or a compiler
 test-fast: .venv/installed-dev
 	$(PYTEST) -m "not slow and not program"
 

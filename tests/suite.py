@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 DURATIONS = Path(__file__).with_name("durations.json")
-SLOW = 1.0
+SLOW = 0.7
 """Seconds from which a test function, over all of its cases, or a fixture is slow: the quick suite leaves it out."""
 
 _PACKAGES = {
