@@ -38,7 +38,7 @@ STUDY = small(axes=[listed(ALPHA, 5.0, 9.0)])
 
 
 def study(path: Path) -> str:
-    """What a command does with a study before it computes; the line that refuses it, or ""."""
+    """Check a study as a command does before it computes; return the line that refuses it, or ""."""
     try:
         config = read_config(path)
         check_figures(config, config.figures, metric_columns(config.build()))
@@ -50,7 +50,7 @@ def study(path: Path) -> str:
 
 
 def log(path: Path, model: Path | None = None) -> str:
-    """What a command does with a log before it computes; the line that refuses it, or its remarks."""
+    """Read a log as a command does before it computes; return the line that refuses it, or its remarks."""
     try:
         table = None if model is None else read_log_config(model)[0]
         return " ".join(read_record(path, table).notes)
@@ -392,7 +392,7 @@ def logs(draw, path: Path) -> tuple[Path, bytes]:
 
 
 def checked(read, *given) -> str:
-    """What is said of an input; an error where that is no line, or took too much."""
+    """Return the line about an input; raise an error if it is no line, or took too much."""
     # of the processor's time: a crowded machine is no failure; and what waits is ended after a while
     before = sum(os.times()[:2])
     faulthandler.dump_traceback_later(10 * SECONDS, exit=True)

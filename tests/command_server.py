@@ -80,7 +80,7 @@ class Process:
         self.send_signal(signal.SIGKILL)
 
     def communicate(self, timeout=300.0):
-        """What is left of stdout and of stderr; a command that does not end is killed."""
+        """Return the rest of stdout and of stderr; kill a command that does not end."""
         errors = []
         reader = threading.Thread(target=lambda: errors.append(self.stderr.read()))
         killer = threading.Timer(timeout, self.kill)
@@ -104,7 +104,7 @@ def run_command(*arguments, cwd, **environment):
 
 
 def run_python(*arguments, cwd, timeout=300.0, **environment):
-    """What `python` runs with these arguments, `-m MODULE`, `-c CODE` or a file. A `PYTHONPATH` that differs is searched
+    """Run what `python` runs with these arguments, `-m MODULE`, `-c CODE` or a file. A `PYTHONPATH` that differs is searched
     first, and the package is then imported anew, with what is installed there."""
     arguments = list(map(str, arguments))
     with Process(arguments, cwd, os.environ | environment) as process:

@@ -6,5 +6,5 @@ _LINE = re.compile(r"jaxbl: [^:]+, (for [\d.]+ \w+ so far|\d+ of \d+ \w+ \(\d+ %
 
 
 def without_progress(stderr):
-    """What it says besides."""
+    """Return the text without lines of progress."""
     return "".join(line for line in stderr.splitlines(keepends=True) if not _LINE.fullmatch(line))

@@ -78,7 +78,7 @@ SAID = {
 
 
 def read(what: str, folder: Path, count: int = 0) -> dict[str, str]:
-    """What was said of inputs of a kind, by a process that ends where one takes too much."""
+    """Lines about the inputs of a kind, by a process that ends where one takes too much."""
     done = run_python(HERE / "bad_inputs.py", what, folder, count, cwd=folder, timeout=1500.0)
     assert done.returncode == 0, done.stderr[-5000:]
     return json.loads((folder / "said.json").read_text())

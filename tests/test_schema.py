@@ -17,7 +17,7 @@ STUDIES = sorted((Path(__file__).parents[1] / "sweeps").glob("*.toml"))
 
 @pytest.fixture(scope="module")
 def errors():
-    """What is wrong with a study, by the schema."""
+    """Faults of a study, by the schema."""
     jsonschema.Draft7Validator.check_schema(build_schema())
     validator = jsonschema.Draft7Validator(build_schema())
     return lambda data: [error.message for error in validator.iter_errors(data)]
@@ -29,7 +29,7 @@ def test_it_takes_every_study(file, errors):
 
 
 def test_it_takes_what_a_part_may_have(errors):
-    """What is included has the other keys; a column's name alone stands for a table."""
+    """An included file has the other keys; a column's name alone stands for a table."""
     for part in ({}, {"include": "a.toml", "drive": {"motor_inertia": 0.1}}, {"log": {"theta_e": "x", "u": 3}}):
         assert errors(part) == []
     assert errors(Config.model_validate(small(axes=[listed(ALPHA, 1.0)])).to_dict()) == []

@@ -57,7 +57,7 @@ def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
 
 
 def accept_effects(monkeypatch, errors, shares, gain):
-    """What held-out data leave of effects, given by the torque of each, if `gain(name, names)` is what each one gains."""
+    """Return the effects that held-out data leave; `gain(name, names)` is the gain of each, `shares` its torque."""
     proof = Proof.__new__(Proof)
     proof.before, proof.noise = compare_errors(errors(9.0), errors(9.0)), LOG.noise_floor({"motor": TORQUE})
     proof.other = SimpleNamespace(compare=lambda experiment: compare_errors(errors(1.0), errors(1.0)))

@@ -44,7 +44,7 @@ def single_effect_trajectories(substeps, dtype=jnp.float64):
 
 
 def errors(values, *substeps):
-    """How far the drive is from the reference, by so many substeps."""
+    """Distances of the drive from the reference, by so many substeps."""
     expected = reference(effects=values)
     assert expected[:, 2:].min() > 0.1  # sliding forwards
     return [np.abs(trajectory(plant(*make_effects(values)), n) - expected).max() for n in substeps]

@@ -74,7 +74,7 @@ class FunctionBlock:
         return TYPES[kind](value)
 
     def _statement(self, node, depth):
-        """As lines of Python."""
+        """Translate a statement to lines of Python."""
         indent = "    " * depth
         if node.type in ("comment", "empty_statement"):
             return
@@ -107,7 +107,7 @@ class FunctionBlock:
             self._statement(node, depth)
 
     def _expression(self, node):
-        """As an expression in Python."""
+        """Translate an expression to Python."""
         named = node.named_children
         if node.type == "identifier":
             assert node.text.decode() in self.types, node.text
@@ -138,7 +138,7 @@ def _of(kind, value):
 
 
 def _alike(work, kinds=(np.floating, np.integer)):
-    """Of two numbers of one of these kinds, and of the same type."""
+    """Make `work` refuse two numbers unless both are of one of these kinds, and of the same type."""
 
     def worked(a, b):
         assert type(a) is type(b) and isinstance(a, kinds), (type(a), type(b))
@@ -147,7 +147,7 @@ def _alike(work, kinds=(np.floating, np.integer)):
     return worked
 
 
-def _divided(a, b):
+def _divide(a, b):
     # a controller would stop
     assert b != 0
     return a / b if isinstance(a, np.floating) else type(a)(math.trunc(int(a) / int(b)))
@@ -163,7 +163,7 @@ def _root(a):
     return np.sqrt(a)
 
 
-def _selected(which, no, yes):
+def _select(which, no, yes):
     assert type(which) is np.bool_ and type(no) is type(yes)
     return yes if which else no
 
@@ -183,7 +183,7 @@ class _Conversion:
 
 _LOGIC = {"AND": np.logical_and, "OR": np.logical_or, "XOR": np.logical_xor}
 _ORDER = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "=": np.equal, "<>": np.not_equal}
-_WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divided, "MOD": _alike(np.fmod, np.integer)}
+_WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _alike(np.fmod, np.integer)}
 _MEANING = {
     "of": _of,
     **TYPES,
@@ -196,7 +196,7 @@ _MEANING = {
         "ABS": lambda a: abs(_alike(lambda a, _: a)(a, a)),
         "MIN": _alike(np.minimum),
         "MAX": _alike(np.maximum),
-        "SEL": _selected,
+        "SEL": _select,
         **{f"{a}_TO_{b}": _Conversion(TYPES[a], TYPES[b]) for a in TYPES for b in TYPES if a != b},
     },
 }

@@ -102,7 +102,7 @@ def simulate(name):
 
 
 def free_run(path, summary, trace, start=None, **options):
-    """By FMPy, under the trace's input."""
+    """Simulate by FMPy under the trace's input."""
     period = summary["sample_period"]
     inputs = np.zeros(len(trace), [("time", float), ("u", float)])
     inputs["time"], inputs["u"] = np.arange(len(trace)) * period, trace.u
@@ -258,7 +258,7 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
 
 @pytest.fixture(scope="module")
 def wine(tmp_path_factory):
-    """What Wine needs in its environment: a folder for its Windows, which it makes once."""
+    """The environment of Wine: a folder for its Windows, which it makes once."""
     return os.environ | {
         "WINEPREFIX": str(tmp_path_factory.mktemp("wine")),
         "WINEDEBUG": "-all",
@@ -271,7 +271,7 @@ def wine(tmp_path_factory):
 @pytest.mark.program("x86_64-w64-mingw32-gcc", "wine")
 @pytest.mark.usefixtures("windows_too")
 def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
-    """By a program for Windows under Wine; a step of part of a period is refused with the same words."""
+    """A program for Windows runs it under Wine; a step of part of a period is refused with the same words."""
     path, summary = export_unit(study("motor.cou", "load.pre", transmission=GAP), tmp_path, fmi, name="axis")
     assert summary["binaries"] == (["linux64", "win64"] if fmi == 2 else ["x86_64-linux", "x86_64-windows"])
     library = zipfile.ZipFile(path).extract(f"binaries/{summary['binaries'][1]}/axis.dll", tmp_path)

@@ -220,13 +220,13 @@ def test_steps_resolve_gear_and_effects():
 
 
 class UnknownToMujoco(SideEffect):
-    """Of a package that knows nothing of MuJoCo."""
+    """An effect of a package that knows nothing of MuJoCo."""
 
     kind = "unknown_to_mujoco"
 
 
 class OwnFriction(CoulombFriction):
-    """Of another package, with an answer of its own."""
+    """An effect of another package, with an answer of its own."""
 
     kind = "own_friction"
 

@@ -65,7 +65,7 @@ def scan_lanes(experiment, values, reducer, seed):
 
 
 class Parts(LaneSimulator):
-    """What the loop or the kernel is made of, not compiled."""
+    """Parts of the loop or of the kernel, not compiled."""
 
     def _simulate(self, values, spans):
         raise NotImplementedError
@@ -94,7 +94,7 @@ def parts(half, precision):
     ids=["half", "others"],
 )
 def test_figures_are_those_of_the_scan(names, law, options):
-    """By threads that get different numbers of lanes."""
+    """Threads get different numbers of lanes."""
     full_experiment = experiment(names, law, **options)
     effects = [path for path in leaf_paths(full_experiment) if path.startswith("effects.")]
     values = spread(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)

@@ -34,7 +34,7 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def ahead(record: Record, paths: list[Path]) -> list[float]:
-    """By how much the positions of each log of a record were turned, rad."""
+    """Angles by which the positions of each log of a record were turned, rad."""
     read = np.concatenate([pd.read_csv(part)["theta_e"] for part in paths])
     return [float(np.mean(part)) for part in np.split(record.positions["motor"] - read, len(paths))]
 

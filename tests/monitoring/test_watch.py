@@ -274,7 +274,7 @@ def test_json_is_a_line_for_each_row_of_values_and_one_for_the_end(logs, tmp_pat
 
 @pytest.mark.parametrize(("number", "alarm"), [(signal.SIGINT, False), (signal.SIGTERM, True)], ids=["Ctrl+C", "kill"])
 def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, capsys, number, alarm):
-    """As a user sees it: values while the file grows, a summary at the end, and what came is kept."""
+    """A user sees values while the file grows, a summary at the end, and what came is kept."""
     log, rows = tmp_path / "log.csv", (logs / "same.csv").read_text().splitlines(keepends=True)
     log.write_text("".join(rows[:6000]))
     limit = ["--alarm-gap", str(0.9 * HALF_GAP)] if alarm else []

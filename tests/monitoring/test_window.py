@@ -43,7 +43,7 @@ def motion(count):
 
 
 def rows_of(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
-    """What observers without an error would give of a drive with known numbers; its model knows half of the friction."""
+    """Rows of observers without an error, for a drive with known numbers; its model knows half of the friction."""
     time, twist, motor, load = motion(count)
     speeds = {"motor": np.gradient(motor, time, edge_order=2), "load": np.gradient(load, time, edge_order=2)}
     draws = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
 
 @pytest.mark.parametrize("data", [axis(), small()], ids=["dead_zone", "sigmoid_backlash"])
 def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
-    """Of any lengths, also those of a block and one more."""
+    """Pieces have any length, also that of a block and one more."""
     experiment = prepare_window(data)
     count = 5000
     time, _, motor, load = motion(count)

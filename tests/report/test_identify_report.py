@@ -53,7 +53,7 @@ def torques_of(config, trace, sides):
 
 
 def make_identification(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
-    """What identify would find with the numbers of the study itself."""
+    """The identification that has the numbers of the study itself."""
     config = read_config(data)
     truth = _trace(json.dumps(data)).copy()
     sides = [side for side in ("motor", "load") if f"{side}.position" in truth]

@@ -38,7 +38,7 @@ def test_counted_work():
 
 
 def test_measured_costs_are_those_of_the_machine(monkeypatch):
-    """Of a made-up one, whose times follow from its costs."""
+    """The machine is made up, and its times follow from its costs."""
 
     def times(config, devices, cases):
         took = {}

@@ -136,7 +136,7 @@ def test_the_boundary_is_traced_from_end_to_end(name):
 
 @pytest.mark.parametrize("name", ["circle", "leaves its strip", "thin diagonal strip"])
 def test_one_piece_is_found_whole(name):
-    """Where the coarse grid sees a piece at all, it has every cell of the full grid's boundary."""
+    """If the coarse grid sees a piece at all, the study has every cell of the full grid's boundary."""
     function, n, depth = SHAPES[name]
     mask, full, _ = trace_boundary(function, square(n, depth))
     assert not (at_boundary(full) & ~simulated_cells(mask)).any()
