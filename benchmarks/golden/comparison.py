@@ -194,6 +194,9 @@ def compare_columns(file: str, name: str, base: np.ndarray, tree: np.ndarray, to
     return [Difference(file, name, description, relative)]
 
 
+_TOKEN = re.compile("[0-9a-f]{16}-[0-9a-f]{16}")
+"""The token of an FMU: hashes of its study and of its sources."""
+
 _COMMENTS = {
     ".c": re.compile(r"/\*.*?\*/", re.DOTALL),
     ".st": re.compile(r"\(\*.*?\*\)", re.DOTALL),
@@ -203,7 +206,7 @@ _COMMENTS[".h"] = _COMMENTS[".c"]
 
 
 def compare_text(file: str, base: str, tree: str) -> Difference:
-    """Compare two texts that differ: the first line that does, and whether only comments do."""
+    """Compare two texts that differ: the first line that does, and whether only comments, or the token of an FMU, do."""
     base_lines, tree_lines = base.splitlines(), tree.splitlines()
     pairs = enumerate(zip(base_lines, tree_lines, strict=False), 1)
     number = next(
@@ -214,4 +217,6 @@ def compare_text(file: str, base: str, tree: str) -> Difference:
     comments = _COMMENTS.get(Path(file).suffix)
     if comments is not None and comments.sub("", base).split() == comments.sub("", tree).split():
         return Difference(file, "comments", description)
+    if _TOKEN.sub("", base) == _TOKEN.sub("", tree):
+        return Difference(file, "token", description)
     return Difference(file, "", description)
