@@ -243,6 +243,12 @@ def difference(columns: np.ndarray, expected: np.ndarray) -> float:
         return float(np.max(np.sqrt(np.mean((columns - expected) ** 2, axis=0) / np.mean(expected**2, axis=0))))
 
 
+def model_difference(kind: str, config: Config, inputs: np.ndarray, expected: np.ndarray) -> float:
+    """Difference of the exported model of a drive from the study's own run, relative as in :func:`difference`."""
+    model, _, _ = write_mjcf(config, linear=KINDS[kind][1])
+    return difference(play(model, inputs, config.run.sample_period), expected)
+
+
 def free_runs(kind: str, count: int) -> tuple[list[float], list[float]]:
     """Differences of exported models from the studies' own runs, for `count` drives of a kind with determined motion.
 
@@ -259,8 +265,7 @@ def free_runs(kind: str, count: int) -> tuple[list[float], list[float]]:
         inputs, expected = simulate(config)
         step_difference = difference(expected, simulate(config, 4)[1])
         if step_difference < DETERMINED:
-            model, _, _ = write_mjcf(config, linear=KINDS[kind][1])
-            differences.append(difference(play(model, inputs, config.run.sample_period), expected))
+            differences.append(model_difference(kind, config, inputs, expected))
         else:
             chaotic.append(step_difference)
     return differences, chaotic

@@ -72,18 +72,18 @@ _checked_styles: set[str] = set()
 """Colours, backgrounds and sizes of texts whose contrast has been measured: it is that of all other texts with them."""
 
 _MARK_NEW_STYLES = """(checked) => {
-    const known = new Set(checked), backgrounds = new Map(), added = [];
+    const seen = new Set(checked), backgrounds = new Map(), added = [];
     for (const element of document.querySelectorAll("*")) {
         const style = getComputedStyle(element), box = element.getBoundingClientRect();
-        const own = [style.backgroundColor, style.backgroundImage, style.opacity].join();
+        const layer = [style.backgroundColor, style.backgroundImage, style.opacity].join();
         const behind = backgrounds.get(element.parentElement) ?? "";
-        backgrounds.set(element, own === "rgba(0, 0, 0, 0),none,1" ? behind : `${behind}; ${own}`);
+        backgrounds.set(element, layer === "rgba(0, 0, 0, 0),none,1" ? behind : `${behind}; ${layer}`);
         const key = [backgrounds.get(element), style.color, style.fontSize, style.fontWeight].join();
         const text = [...element.childNodes].some((node) => node.nodeType === Node.TEXT_NODE && node.data.trim());
         const visible = box.width * box.height > 0 && box.right > 0 && element.checkVisibility({visibilityProperty: true});
-        const isNew = (text || element.matches("input, select, textarea")) && visible && !known.has(key);
+        const isNew = (text || element.matches("input, select, textarea")) && visible && !seen.has(key);
         element.toggleAttribute("data-new-style", isNew);
-        if (isNew) added.push(key), known.add(key);
+        if (isNew) added.push(key), seen.add(key);
     }
     return added;
 }"""

@@ -118,9 +118,7 @@ def test_free_runs_are_those_of_the_study(kind):
     data = bench.draw_study(kind, DETERMINED.get(kind, 0))
     config = read_config(data | {"run": data["run"] | {"duration": 4.0}})
     inputs, expected = bench.simulate(config)
-    text, _, _ = write_mjcf(config, linear=bench.KINDS[kind][1])
-    columns = bench.play(text, inputs, config.run.sample_period)
-    assert bench.difference(columns, expected) < (0.03 if kind == bench.COARSE else 0.01)
+    assert bench.model_difference(kind, config, inputs, expected) < (0.03 if kind == bench.COARSE else 0.01)
 
 
 def test_smooth_gap_by_chords_is_as_near_as_said():

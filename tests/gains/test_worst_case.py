@@ -300,13 +300,15 @@ def test_with_damping_alpha_may_be_smaller_than_f_plus_by_what_friction_takes_up
     [(1.1, 1.0, 0.3, 1.0), (2.0, 1.0, 0.5, 0.5), (6.0, 3.0, 2.0, 0.7), (0.9, 1.0, 0.4, 1.0), (0.5, 1.0, 1.2, 0.8)],
 )
 def test_least_lambda_with_damping_is_where_scipys_peaks_stop_falling(alpha, f_plus, damping, speed):
-    half_cycles = float(least(alpha, f_plus, damping, speed))
-    assert 0.0 < half_cycles < np.inf
-    assert reference(half_cycles * 1.001, alpha, f_plus, damping, speed)[0] < 1.0
-    assert reference(half_cycles * 0.999, alpha, f_plus, damping, speed)[0] > 1.0
+    least_lambda = float(least(alpha, f_plus, damping, speed))
+    assert 0.0 < least_lambda < np.inf
+    assert reference(least_lambda * 1.001, alpha, f_plus, damping, speed)[0] < 1.0
+    assert reference(least_lambda * 0.999, alpha, f_plus, damping, speed)[0] > 1.0
 
 
 def test_columns_broadcast():
     lambda_, alpha = np.array([0.5, 1.0, 2.0])[:, None], np.array([1.5, 3.0])
-    half_cycles = jax.eval_shape(half_cycle, lambda_, alpha, 1.0, damping=0.3)
+    half_cycles = HALF(lambda_, alpha, 1.0, damping=0.3)
     assert half_cycles.ratio.shape == half_cycles.time.shape == (3, 2)
+    for computed, padded in zip(half_cycles, half(lambda_, alpha, damping=0.3), strict=True):
+        np.testing.assert_allclose(computed, padded, rtol=1e-12)
