@@ -19,7 +19,7 @@ from jaxbl import workers
 workers.start_jax()
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from small_study import ALPHA, LAMBDA, NOISE, made, rigid, spaced  # noqa: E402
+from small_study import ALPHA, LAMBDA, NOISE, make_result, rigid_study, spaced_axis  # noqa: E402
 
 from jaxbl.config import read_config, with_values  # noqa: E402
 from jaxbl.report.explorer.folder import Source, write_static  # noqa: E402
@@ -57,8 +57,10 @@ def clicks(page: Page) -> None:
 
 def large(place: Path) -> None:
     """A page of 10^7 points, one metric."""
-    axes = [spaced(NOISE, 1e-6, 1e-2, 10), spaced(ALPHA, 2.0, 50.0, 1000), spaced(LAMBDA, 1.0, 20.0, 1000)]
-    result = made(rigid(axes=axes), motor__velocity_rmse=lambda f: f[ALPHA] * f[LAMBDA] * (1.0 + 1e3 * f[NOISE]))
+    axes = [spaced_axis(NOISE, 1e-6, 1e-2, 10), spaced_axis(ALPHA, 2.0, 50.0, 1000), spaced_axis(LAMBDA, 1.0, 20.0, 1000)]
+    result = make_result(
+        rigid_study(axes=axes), motor__velocity_rmse=lambda f: f[ALPHA] * f[LAMBDA] * (1.0 + 1e3 * f[NOISE])
+    )
     source = Source("", [], lambda out, live: write_study(result, out, [], served=live), {}, lambda: None, lambda: None)
     began = time.perf_counter()
     index = write_static(source, place / "page")

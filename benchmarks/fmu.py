@@ -18,7 +18,7 @@ from jaxbl.config import read_config
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from small_study import small
+from small_study import small_study
 
 SWEEPS = Path(__file__).parents[1] / "sweeps"
 IMPACTS = {
@@ -83,7 +83,7 @@ def main() -> None:
         print(f"{file.stem:22} {run.duration:5g} s {run.substeps:3d}  {off:.1e}  {nanoseconds(file):6.0f} ns", flush=True)
     print("impacts: largest difference over range of the FMU, and of jaxbl's loop by XLA, to its fused loop")
     for duration in (2.0, 5.0, 10.0, 20.0):
-        study = small({"run.duration": duration, "run.substeps": 10}, **IMPACTS)
+        study = small_study({"run.duration": duration, "run.substeps": 10}, **IMPACTS)
         fused, scanned = (jaxbl.run(study, backend=backend).trace for backend in ("fused", "scan"))
         print(
             f"{duration:5g} s  {difference(free_run(study, fused), fused):.1e}  {difference(scanned, fused):.1e}", flush=True

@@ -20,7 +20,7 @@ from mujoco import rollout
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from effect_values import VALUES
-from small_study import small
+from small_study import small_study
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.exports.mjcf import write_mjcf
@@ -201,7 +201,7 @@ def draw_study(kind: str, seed: int) -> Study:
         study["effects"][1]["torque_constant"] = inertia / slowest
         study["effects"][1]["resistance"] = inertia / slowest
     without = {path: None for path in ("transmission", "observer.load") if law is None}
-    return small({"run.duration": DURATION, "run.substeps": 10} | without, **study)
+    return small_study({"run.duration": DURATION, "run.substeps": 10} | without, **study)
 
 
 def simulate(study: Config, finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -286,7 +286,7 @@ def _swung(effects: list[Study]) -> Study:
     excitation = {"kind": "multisine", "amplitude": 3.0, "frequency": 0.3, "count": 5}
     # a delay of that size is a few samples
     changes = {"run.duration": DURATION, "run.sample_period": 5e-3, "run.substeps": 50}
-    return small(changes, excitation=excitation, effects=effects)
+    return small_study(changes, excitation=excitation, effects=effects)
 
 
 def main(count: int) -> None:

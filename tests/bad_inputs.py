@@ -23,7 +23,7 @@ import tomli_w
 from hypothesis import HealthCheck, given, reject, settings
 from measured import simulate_log
 from scipy.io import savemat
-from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config, read_log_config
 from jaxbl.errors import InputError
@@ -34,7 +34,7 @@ from jaxbl.sweeps.points import Points
 
 SECONDS, BYTES = 10, 2 * 2**30
 ESC = "\x1b[31mred"
-STUDY = small(axes=[listed(ALPHA, 5.0, 9.0)])
+STUDY = small_study(axes=[listed_axis(ALPHA, 5.0, 9.0)])
 
 
 def study(path: Path) -> str:
@@ -75,7 +75,7 @@ def sine(frequency: float):
 
 
 def recorded(file: str):
-    return small(excitation={"kind": "recorded", "file": file})
+    return small_study(excitation={"kind": "recorded", "file": file})
 
 
 def pipe(folder: Path) -> str:
@@ -90,31 +90,33 @@ def short(folder: Path) -> str:
 
 # name -> text of the study, or its data
 STUDIES = {
-    "inertia": lambda folder: small({"drive.motor_inertia": 5e-324}),
-    "substeps of 1e30": lambda folder: small({"run.substeps": 10**30}),
-    "substeps of 1e9": lambda folder: small({"run.substeps": 10**9}),
+    "inertia": lambda folder: small_study({"drive.motor_inertia": 5e-324}),
+    "substeps of 1e30": lambda folder: small_study({"run.substeps": 10**30}),
+    "substeps of 1e9": lambda folder: small_study({"run.substeps": 10**9}),
     "nested": lambda folder: f"notes = {'[' * 900}{']' * 900}\n{text(STUDY)}",
     "nested tables": lambda folder: f"a.{'.'.join(['b'] * 49)} = 1\n{text(STUDY)}",
     "dotted": lambda folder: f"a.{'.'.join(['b'] * 900)} = 1\n{text(STUDY)}",
     "nested far": lambda folder: f"notes = {'[' * 100000}{']' * 100000}\n{text(STUDY)}",
-    "long kind": lambda folder: small(effects=[{"kind": "x" * 5000}]),
-    "long key": lambda folder: small({f"drive.{'x' * 5000}": 1.0}),
-    "long title": lambda folder: small(title="x" * 5000),
-    "long path": lambda folder: small(axes=[listed("o" * 5000, 1.0, 2.0)]),
+    "long kind": lambda folder: small_study(effects=[{"kind": "x" * 5000}]),
+    "long key": lambda folder: small_study({f"drive.{'x' * 5000}": 1.0}),
+    "long title": lambda folder: small_study(title="x" * 5000),
+    "long path": lambda folder: small_study(axes=[listed_axis("o" * 5000, 1.0, 2.0)]),
     "chained": lambda folder: included(folder, 2000, 1),
     "doubled": lambda folder: included(folder, 30, 2),
     "pipe included": lambda folder: f'include = "{pipe(folder)}"\n',
     "device included": lambda folder: 'include = "/dev/zero"\n',
     "pipe recorded": lambda folder: recorded(pipe(folder)),
     "device recorded": lambda folder: recorded("/dev/zero"),
-    "harmonics": lambda folder: small(excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 1.0, "count": 10**9}),
+    "harmonics": lambda folder: small_study(
+        excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 1.0, "count": 10**9}
+    ),
     "values": lambda folder: text(STUDY).replace("5.0,\n", ",".join(["5.0"] * 3_000_000) + ","),
     "fewer values": lambda folder: text(STUDY).replace("5.0,\n", ",".join(["5.0"] * 400_000) + ","),
-    "sine at the rate": lambda folder: small(excitation=sine(1000.0)),
-    "short steps": lambda folder: small(excitation={"kind": "steps", "amplitude": 0.1, "hold": 1e-12}),
+    "sine at the rate": lambda folder: small_study(excitation=sine(1000.0)),
+    "short steps": lambda folder: small_study(excitation={"kind": "steps", "amplitude": 0.1, "hold": 1e-12}),
     "short record": lambda folder: recorded(short(folder)),
-    "gear ratio": lambda folder: small({"drive.gear_ratio": 1e-12}),
-    "escape": lambda folder: small(title=ESC),
+    "gear ratio": lambda folder: small_study({"drive.gear_ratio": 1e-12}),
+    "escape": lambda folder: small_study(title=ESC),
 }
 
 
@@ -228,8 +230,8 @@ ODD = st.one_of(
 )
 NUMBERS = st.one_of(st.sampled_from(FLOATS), st.floats(-30.0, 30.0).map(lambda power: 10.0**power))
 WHOLE = [
-    small(
-        axes=[spaced(ALPHA, 5.0, 20.0, 3), listed(LAMBDA, 1.0, 2.0)],
+    small_study(
+        axes=[spaced_axis(ALPHA, 5.0, 20.0, 3), listed_axis(LAMBDA, 1.0, 2.0)],
         figures=[{"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse"}],
         effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}, {"kind": "actuator.delay", "delay": 0.01}],
         log={"t": {"unit": "ms"}, "theta_e": {"column": "x", "wrap": 6.0}, "where": {"mode": 1}},
@@ -238,15 +240,17 @@ WHOLE = [
         tune={"num": 3, "compare": [{"name": "old", "motor": {"lambda": 1.0, "alpha": 2.0},
                                      "load": {"lambda": 1.0, "alpha": 2.0}}]},
     ),
-    rigid(
-        axes=[spaced(ALPHA, 5.0, 20.0, None), spaced(LAMBDA, 1.0, 5.0, None)],
+    rigid_study(
+        axes=[spaced_axis(ALPHA, 5.0, 20.0, None), spaced_axis(LAMBDA, 1.0, 5.0, None)],
         sweep={"design": "sobol", "points": 16, "seeds": 2},
         excitation={"kind": "prbs", "amplitude": 1.0, "hold": 0.01, "order": 5},
         verify={"q": 0.5, "marks": [{"name": "usual", "lambda": 4.0, "alpha": 9.0}], "damping": [0.1]},
         figures=[{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}],
     ),
-    small(excitation={"kind": "chirp", "amplitude": 1.0, "start_frequency": 1.0, "stop_frequency": 9.0, "sweep_time": 1.0}),
-    small(excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 1.0, "count": 4}, title="another"),
+    small_study(
+        excitation={"kind": "chirp", "amplitude": 1.0, "start_frequency": 1.0, "stop_frequency": 9.0, "sweep_time": 1.0}
+    ),
+    small_study(excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 1.0, "count": 4}, title="another"),
 ]  # fmt: skip
 
 

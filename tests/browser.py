@@ -31,8 +31,8 @@ def _browser():
 
 
 @contextmanager
-def opened(*paths, **options):
-    """A page of each file or address in a profile of its own, without an error, or a request for anything elsewhere."""
+def open_pages(*paths, **options):
+    """Open a page for each file or address in a new profile; assert that none logs an error or asks for anything elsewhere."""
     browser, loop = _browser()
     # outside, other code of this thread may run loops
     asyncio._set_running_loop(loop)

@@ -26,8 +26,8 @@ GAP = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 FRICTIONS = [{"kind": "motor.coulomb_friction", "torque": 0.1}, {"kind": "load.coulomb_friction", "torque": 6.0}]
 
 
-def model(**tables: Any) -> dict[str, Any]:
-    """The study of someone who does not know of the friction, and whose numbers are a little off."""
+def nominal_study(**tables: Any) -> dict[str, Any]:
+    """The direct drive's nominal study: it lacks the friction, and its numbers are 1 % off."""
     return {
         "title": "direct drive",
         "drive": DRIVE | {"motor_inertia": 0.0202, "motor_viscous": 0.0296},
@@ -38,7 +38,7 @@ def model(**tables: Any) -> dict[str, Any]:
 
 
 @cache
-def logged(
+def simulate_multisine_log(
     effects: tuple[str, ...] = ("friction",),
     seed: int = 1,
     noise: float = 3e-5,
@@ -46,25 +46,27 @@ def logged(
     torque_noise: float = 0.0,
     felt: bool = False,
 ) -> Log:
-    """4 s of a multisine; `torque_noise`: of the recorded input, N m, which the drive has felt or not."""
+    """Simulate 4 s of the direct drive under a multisine; `torque_noise`: of the recorded input, N m, felt by the drive or not."""
     t = 2e-3 * np.arange(2000)
     phases = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
     k = np.arange(1, 7)
     torque = 0.3 * np.sum(np.sin(2.0 * np.pi * 0.5 * k[:, None] * t + phases[:, None]), axis=0)
-    shaking = torque_noise * np.random.default_rng(seed + 100).standard_normal(len(t))
-    log = driven(torque + shaking * felt, [FRICTION] if effects else [], noise, seed, inertia)
-    return replace(log, u=log.u + shaking * (not felt))
+    input_noise = torque_noise * np.random.default_rng(seed + 100).standard_normal(len(t))
+    log = simulate_direct_drive(torque + input_noise * felt, [FRICTION] if effects else [], noise, seed, inertia)
+    return replace(log, u=log.u + input_noise * (not felt))
 
 
-def driven(torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed: int, inertia: float = 0.02) -> Log:
-    """The direct drive under a torque (N m, every 2 ms)."""
+def simulate_direct_drive(
+    torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed: int, inertia: float = 0.02
+) -> Log:
+    """Simulate the direct drive under a torque (N m, every 2 ms)."""
     machine = Machine(DRIVE | {"motor_inertia": inertia}, None, effects)
     (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
     return Log(trace.t, trace.u, trace.theta_e, None)
 
 
-def part(log: Log, rows: Any) -> Log:
-    """Some samples of a log of a motor."""
+def select_samples(log: Log, rows: Any) -> Log:
+    """Select samples of a log without a load encoder."""
     return replace(log, t=log.t[rows], u=log.u[rows], theta_e=log.theta_e[rows])
 
 
@@ -98,8 +100,8 @@ def record_study(study: dict[str, Any], folder: Path) -> Record:
 
 
 @cache
-def geared() -> tuple[Log, dict[str, np.ndarray]]:
-    """4 s of a drive with a gap and hidden frictions, a small part of what is transmitted; and its true speeds, rad/s."""
+def simulate_geared_drive() -> tuple[Log, dict[str, np.ndarray]]:
+    """Simulate 4 s of a drive with a gap and hidden frictions, small beside the transmitted torque: log, true speeds (rad/s)."""
     t = 2e-3 * np.arange(2000)
     torque = 5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0))
     machine = Machine(GEARED, GAP, FRICTIONS)

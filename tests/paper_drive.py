@@ -11,7 +11,7 @@ DRIVE = TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
 LAW = SigmoidBacklash(1.0, 0.02, 20.0)
 
 
-def paper(
+def paper_experiment(
     discretisation="implicit",
     *,
     time_constant=0.0,
@@ -22,9 +22,9 @@ def paper(
     substeps=10,
     velocity_error=0.0,
     dtype=jnp.float64,
-    **others,
+    **replacements,
 ) -> Experiment:
-    """The experiment; `others` replaces whole members."""
+    """The experiment; `replacements` replaces whole members."""
     observer = DISCRETISATIONS[discretisation]
     members = {
         "drive": DRIVE,
@@ -38,4 +38,4 @@ def paper(
         "identifier": Identifier(start, 1.0, regressor_filter),
         "run": Run(1e-3, steps, substeps),
     }
-    return as_arrays(Experiment(**(members | others)), dtype)
+    return as_arrays(Experiment(**(members | replacements)), dtype)

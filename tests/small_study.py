@@ -1,4 +1,4 @@
-"""A study small enough to run in a test: the paper's drive for a moment, as a mapping to be changed."""
+"""Studies small enough to run in a test: the paper's drive for 0.2 s, as mappings."""
 
 import copy
 from pathlib import Path
@@ -35,8 +35,8 @@ _BASE: dict[str, Any] = {
 }
 
 
-def small(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
-    """The study with some dotted keys set (None removes one) and some whole tables replaced."""
+def small_study(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
+    """The paper's drive for 0.2 s: `changes` sets dotted keys (None removes one), `tables` replaces whole tables."""
     data = copy.deepcopy(_BASE | tables)
     for path, value in (changes or {}).items():
         *names, key = path.split(".")
@@ -50,44 +50,46 @@ def small(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any
     return data
 
 
-def thirty(**tables: Any) -> dict[str, Any]:
+def thirty_run_study(**tables: Any) -> dict[str, Any]:
     """Thirty runs of one inertia in eight chunks: 2 seeds of 15 points, 4 at once."""
-    axes = [spaced(ALPHA, 5.0, 20.0, 5), listed(LAMBDA, 0.3, 1.0, 5.0)]
-    return rigid(**{"axes": axes, "sweep": {"seeds": 2, "chunk": 4}} | tables)
+    axes = [spaced_axis(ALPHA, 5.0, 20.0, 5), listed_axis(LAMBDA, 0.3, 1.0, 5.0)]
+    return rigid_study(**{"axes": axes, "sweep": {"seeds": 2, "chunk": 4}} | tables)
 
 
-def parts(folder: Path) -> dict[str, bytes]:
-    """A sweep's parts by their names."""
+def read_parts(folder: Path) -> dict[str, bytes]:
+    """Read a sweep's parts: bytes by file name."""
     return {path.name: path.read_bytes() for path in (folder / "points").iterdir()}
 
 
-def swung(duration: float, **tables: Any) -> dict[str, Any]:
-    """The study under a multisine that moves it well, for a log of so many seconds."""
+def multisine_study(duration: float, **tables: Any) -> dict[str, Any]:
+    """The paper's drive under a multisine that moves it well, for a log of `duration` seconds."""
     observer = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
     excitation = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.7}
     changes = {"run.duration": duration, "run.substeps": 5}
-    return small(changes, **{"excitation": excitation, "observer": observer} | tables)
+    return small_study(changes, **{"excitation": excitation, "observer": observer} | tables)
 
 
-def rigid(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
-    """The same with one inertia."""
+def rigid_study(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
+    """The same for a single inertia, without a transmission and a load observer."""
     tables = {"drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.15}} | tables
-    without = {path: None for path in ("transmission", "observer.load") if path not in tables}
-    return small(without | (changes or {}), **tables)
+    removals = {path: None for path in ("transmission", "observer.load") if path not in tables}
+    return small_study(removals | (changes or {}), **tables)
 
 
-def listed(path: str, *values: Any, **keys: Any) -> dict[str, Any]:
+def listed_axis(path: str, *values: Any, **keys: Any) -> dict[str, Any]:
     """An axis of listed values."""
     return {"path": path, "values": list(values), **keys}
 
 
-def spaced(path: str, start: float, stop: float, num: int | None = None, scale: str = "log", **keys: Any) -> dict[str, Any]:
+def spaced_axis(
+    path: str, start: float, stop: float, num: int | None = None, scale: str = "log", **keys: Any
+) -> dict[str, Any]:
     """An axis between two ends."""
     return {"path": path, "start": start, "stop": stop, "scale": scale, **({} if num is None else {"num": num}), **keys}
 
 
-def made(data: dict[str, Any], **columns: Any) -> StudyResult:
-    """A result without a run: `columns` are functions of the frame of points; other metrics are all 1 and true."""
+def make_result(data: dict[str, Any], **columns: Any) -> StudyResult:
+    """Make a result without a run: `columns` are functions of the frame of points; other metrics are all 1 and true."""
     config = read_config(data)
     points, seeds = Points(config), config.sweep.seeds
     rows = []

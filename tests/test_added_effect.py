@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import tomli_w
 from command_server import run_command, run_python
-from hidden_log import driven, model
-from small_study import rigid
+from hidden_log import nominal_study, simulate_direct_drive
+from small_study import rigid_study
 
 ROOT = Path(__file__).parents[1]
 NAME = "motor.hysteretic_friction"
@@ -55,13 +55,13 @@ def logs(tmp_path_factory):
         random = np.random.default_rng(seed)
         rates, phases = 0.5 * np.arange(1, 7), random.uniform(-np.pi, np.pi, 6)
         torque = 0.3 * np.sum(np.sin(2.0 * np.pi * rates[:, None] * t + phases[:, None]), axis=0)
-        driven(torque, hidden, 3e-5, seed).write(folder / name)
+        simulate_direct_drive(torque, hidden, 3e-5, seed).write(folder / name)
     return folder / "log.csv", folder / "other.csv"
 
 
 def test_it_is_simulated_and_swept_over(installed, tmp_path):
     study = tmp_path / "study.toml"
-    study.write_text(tomli_w.dumps(rigid()) + study_block(), encoding="utf-8")
+    study.write_text(tomli_w.dumps(rigid_study()) + study_block(), encoding="utf-8")
     jaxbl(installed, "simulate", study, "--out", tmp_path / "run")
     jaxbl(installed, "sweep", study, "--out", tmp_path / "sweep")
     assert (tmp_path / "run" / "report.html").exists()
@@ -69,7 +69,7 @@ def test_it_is_simulated_and_swept_over(installed, tmp_path):
 
 
 def test_its_numbers_are_identified(installed, logs, tmp_path):
-    known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
+    known = nominal_study(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
     (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
     jaxbl(installed, "identify", logs[0], "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
     parameters = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
@@ -79,7 +79,7 @@ def test_its_numbers_are_identified(installed, logs, tmp_path):
 
 def test_it_is_named_where_it_is_missing(installed, logs, tmp_path):
     log, other = logs
-    (tmp_path / "model.toml").write_text(tomli_w.dumps(model()), encoding="utf-8")
+    (tmp_path / "model.toml").write_text(tomli_w.dumps(nominal_study()), encoding="utf-8")
     out = tmp_path / "found"
     jaxbl(installed, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
     content = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))

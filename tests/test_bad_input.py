@@ -14,7 +14,7 @@ import tomli_w
 from command_server import run_command, run_python
 from measured import simulate_log
 from progress_lines import without_progress
-from small_study import ALPHA, listed, rigid
+from small_study import ALPHA, listed_axis, rigid_study
 
 HERE = Path(__file__).parent
 
@@ -127,9 +127,9 @@ def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
 
 def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     """The figures come after all computing: a name must not make them fail."""
-    axes = [listed(ALPHA, 5.0, 9.0)]
+    axes = [listed_axis(ALPHA, 5.0, 9.0)]
     figures = [{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}]
-    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid_study(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
     done = run_command("sweep", "study.toml", cwd=tmp_path)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     # and where the results may only be read, that is said before the figures are drawn
@@ -150,7 +150,7 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
 def test_an_interrupt_before_work_begins(tmp_path, default_interrupt, wait):
     """While modules are loaded; some of them swallow a KeyboardInterrupt."""
     simulate_log().to_csv(tmp_path / "log.csv", index=False)
-    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid()))
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid_study()))
     call = [sys.executable, "-X", "importtime", "-m", "jaxbl", "identify", "log.csv", "--model", "study.toml"]
     with subprocess.Popen(call, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         # Python itself is up once it has loaded a module that only jaxbl asks for

@@ -26,7 +26,7 @@ from measured import EMPS, real, simulate_log
 from passed import PASSED
 from progress_lines import without_progress
 from shared_results import ATLAS
-from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, small_study, spaced_axis
 
 from jaxbl import cli, terminal
 from jaxbl.cli import setup
@@ -39,8 +39,8 @@ from jaxbl.sweeps.engine import Engine
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
-AXES = [listed(ALPHA, 5.0, 9.0, 20.0)]
-GAINS = [listed(ALPHA, 5.0, 9.0), listed(LAMBDA, 3.0, 6.0)]
+AXES = [listed_axis(ALPHA, 5.0, 9.0, 20.0)]
+GAINS = [listed_axis(ALPHA, 5.0, 9.0), listed_axis(LAMBDA, 3.0, 6.0)]
 
 
 def interrupt(*_):
@@ -57,7 +57,7 @@ def jaxbl(*arguments, cwd, **environment):
 
 def write(folder, data=None, name="study.toml"):
     path = folder / name
-    path.write_text(tomli_w.dumps(data or rigid(axes=AXES, figures=[FIGURE])))
+    path.write_text(tomli_w.dumps(data or rigid_study(axes=AXES, figures=[FIGURE])))
     return path
 
 
@@ -84,7 +84,7 @@ def test_help_does_not_wait_for_jax(tmp_path):
 
 def test_a_sweep_and_its_second_call(tmp_path):
     """As a user sees it: what is printed, what is left, no progress bar in a pipe, no work done twice."""
-    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 2}))
+    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 2}))
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
@@ -102,8 +102,8 @@ def test_a_sweep_and_its_second_call(tmp_path):
 
 def test_interrupted_sweep_says_how_to_go_on(tmp_path):
     """SIGINT while chunks are computed; the line that it prints finishes the study."""
-    axes = [listed("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
-    study = write(tmp_path, rigid(axes=axes), "a study.toml")
+    axes = [listed_axis("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
+    study = write(tmp_path, rigid_study(axes=axes), "a study.toml")
     folder = tmp_path / "out"
     with start_command("sweep", study.name, "--out", "out", cwd=tmp_path) as process:
         for _ in range(3600):
@@ -255,16 +255,16 @@ BAD = {
 def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     arguments, message = BAD[case]
     write(tmp_path)
-    write(tmp_path, rigid(), "plain.toml")
-    write(tmp_path, rigid(sweep={"seeds": 2}), "seeds.toml")
-    write(tmp_path, rigid({"run.durations": 1.0}), "wrong.toml")
-    write(tmp_path, rigid(axes=[listed("observer.motor.alfa", 1.0)]), "axis.toml")
-    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
+    write(tmp_path, rigid_study(), "plain.toml")
+    write(tmp_path, rigid_study(sweep={"seeds": 2}), "seeds.toml")
+    write(tmp_path, rigid_study({"run.durations": 1.0}), "wrong.toml")
+    write(tmp_path, rigid_study(axes=[listed_axis("observer.motor.alfa", 1.0)]), "axis.toml")
+    write(tmp_path, rigid_study(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
     still = {"excitation.amplitude": 0.0, "observer.motor.velocity_error": 0.0}
-    write(tmp_path, rigid(still), "rest.toml")
-    write(tmp_path, rigid(axes=GAINS), "gains.toml")
-    write(tmp_path, rigid(axes=GAINS, verify={"q": 1.2}), "q.toml")
-    write(tmp_path, rigid(axes=GAINS, verify={"alpha_ratio": {"start": 0.9, "stop": 2.0, "num": 4}}), "below.toml")
+    write(tmp_path, rigid_study(still), "rest.toml")
+    write(tmp_path, rigid_study(axes=GAINS), "gains.toml")
+    write(tmp_path, rigid_study(axes=GAINS, verify={"q": 1.2}), "q.toml")
+    write(tmp_path, rigid_study(axes=GAINS, verify={"alpha_ratio": {"start": 0.9, "stop": 2.0, "num": 4}}), "below.toml")
     (tmp_path / "part.toml").write_text('include = "none.toml"')
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
@@ -291,7 +291,7 @@ def test_wrong_usage_exits_2(arguments, monkeypatch, capsys):
 
 
 def test_dry_run_says_the_cost_and_writes_nothing(call, tmp_path):
-    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 4, "chunk": 4}))
+    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}))
     code, lines, _ = call("sweep", "study.toml", "--dry-run")
     assert code == 0
     assert left(tmp_path) == ["study.toml"]
@@ -301,7 +301,7 @@ def test_dry_run_says_the_cost_and_writes_nothing(call, tmp_path):
 
 
 def test_shares_and_how_far_they_are(call, tmp_path):
-    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 4, "chunk": 4}, title="small [red]"))
+    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}, title="small [red]"))
     code, lines, _ = call("sweep", "study.toml", "--share", "2/2", "--out", "a")
     assert code == 0
     assert lines[0] == "a: 'small [red]', 2 of 4 parts (50 %) of 12 runs"
@@ -316,7 +316,7 @@ def test_shares_and_how_far_they_are(call, tmp_path):
 
 
 def test_a_sweep_is_explored(call, tmp_path):
-    write(tmp_path, rigid(axes=GAINS))
+    write(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
     assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
@@ -328,7 +328,7 @@ def test_a_sweep_is_explored(call, tmp_path):
 
 
 def test_explore_serves_until_it_is_interrupted(call, tmp_path):
-    write(tmp_path, rigid(axes=GAINS))
+    write(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
     with start_command("explore", "out", "--json", cwd=tmp_path, TMPDIR=str(tmp_path)) as process:
         (url,) = (line.split()[1] for line in iter(process.stderr.readline, "Ctrl+C ends it.\n") if line.startswith("Open "))
@@ -352,17 +352,19 @@ def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeyp
     assert code == 0
     assert lines[-1] == str(folder / "report.html")
     assert [path.name for path in folder.glob("figures/*")] == ["line_motor_velocity_rmse.png"]
-    write(tmp_path, rigid({"title": "other title"}, axes=AXES, figures=[FIGURE | {"value": "motor.chatter"}]), "b.toml")
+    write(
+        tmp_path, rigid_study({"title": "other title"}, axes=AXES, figures=[FIGURE | {"value": "motor.chatter"}]), "b.toml"
+    )
     call("plot", folder, "--config", "b.toml")
     assert "other title" in (folder / "report.html").read_text()
     assert (folder / "figures" / "line_motor_chatter.png").exists()
-    write(tmp_path, rigid({"run.duration": 0.3}, axes=AXES), "c.toml")
+    write(tmp_path, rigid_study({"run.duration": 0.3}, axes=AXES), "c.toml")
     with pytest.raises(InputError, match=r"c\.toml: is not the study in .*; only title, notes and figures may differ"):
         call("plot", folder, "--config", "c.toml")
 
 
 def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
-    write(tmp_path, rigid(axes=AXES))
+    write(tmp_path, rigid_study(axes=AXES))
     code, lines, _ = call("simulate", "study.toml", "--every", 10, "--seed", 3)
     folder = tmp_path / "results" / "study"
     assert code == 0
@@ -373,7 +375,7 @@ def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
 
 
 def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):
-    write(tmp_path, rigid(axes=GAINS, verify=ATLAS))
+    write(tmp_path, rigid_study(axes=GAINS, verify=ATLAS))
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
     assert code == 130
@@ -387,11 +389,11 @@ TUNE = {"num": 3, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lam
 def tunable(**table):
     """A drive under a constant torque, its observer starting 0.1 rad/s off."""
     changes = {"encoders.noise": 1e-5, "observer.motor.velocity_error": 0.1, "run.position_tolerance": 0.01}
-    return rigid(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
+    return rigid_study(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
 
 
 def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_path):
-    write(tmp_path, small(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
+    write(tmp_path, small_study(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
     assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
     assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
@@ -449,7 +451,7 @@ def test_an_interrupted_search_says_how_to_go_on(call, tmp_path, monkeypatch):
 
 
 def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
-    write(tmp_path, rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
+    write(tmp_path, rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
     code, lines, _ = call("simulate", "study.toml")
     assert code == 1
     assert any(line.startswith("The run diverged") for line in lines)
@@ -459,7 +461,7 @@ def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
 def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_path):
     write(tmp_path)
     call("sweep", "study.toml", "--out", "out")
-    write(tmp_path, rigid({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
+    write(tmp_path, rigid_study({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
     for command in ("sweep", "simulate"):
         with pytest.raises(InputError, match=r"out: holds another study \('small', other numbers\)"):
             call(command, "b.toml", "--out", "out")
@@ -602,7 +604,7 @@ def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(cal
     assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
     # again, and with a gear ratio that it contradicts
     assert call("inspect", "axis.csv")[:2] == (0, lines)
-    write(tmp_path, small({"drive.gear_ratio": 5.0}), "model.toml")
+    write(tmp_path, small_study({"drive.gear_ratio": 5.0}), "model.toml")
     with pytest.raises(InputError, match=r"axis.csv: theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
         call("inspect", "axis.csv", "--model", "model.toml")
 
@@ -613,7 +615,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     assert call("inspect", "axis.parquet", "--model", "log.toml")[0] == 0
     (tmp_path / "part.toml").write_text('include = "log.toml"\ntitle = "my axis"\n')
     assert call("inspect", "axis.parquet", "--model", "part.toml")[0] == 0
-    write(tmp_path, rigid(log={"theta_e": "x"}), "study.toml")
+    write(tmp_path, rigid_study(log={"theta_e": "x"}), "study.toml")
     assert call("inspect", "axis.parquet", "--model", "study.toml")[0] == 0
     (tmp_path / "wrong.toml").write_text('[log]\ntheta_e = { colum = "x" }\n')
     with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
@@ -669,10 +671,10 @@ def test_inspect_runs_without_a_word_on_stderr(tmp_path):
 
 
 def test_a_refined_sweep_from_the_command_line(call, tmp_path):
-    axes = [spaced(LAMBDA, 0.5, 40.0, 3), spaced(ALPHA, 2.0, 200.0, 3)]
+    axes = [spaced_axis(LAMBDA, 0.5, 40.0, 3), spaced_axis(ALPHA, 2.0, 200.0, 3)]
     figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.converged"}
     explicit = {"observer.discretisation": "explicit", "run.duration": 0.1, "run.velocity_tolerance": 0.1}
-    write(tmp_path, rigid(explicit, axes=axes, figures=[figure], sweep={"refine": 3, "chunk": 32}))
+    write(tmp_path, rigid_study(explicit, axes=axes, figures=[figure], sweep={"refine": 3, "chunk": 32}))
     code, lines, _ = call("sweep", "study.toml", "--dry-run")
     assert code == 0
     assert lines[:3] == [
@@ -691,7 +693,7 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
 
 
 # of one length and structure: what one test has compiled serves the others
-AXIS = rigid(
+AXIS = rigid_study(
     {"run.duration": 0.6, "encoders.noise": 1e-5, "excitation.frequency": 4.0, "run.substeps": 2},
     effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}],
     identify={"starts": 1, "window": 0.1},

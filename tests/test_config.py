@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings
-from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import numeric_paths, read_config, with_values
 from jaxbl.drive import EFFECTS, EXCITATIONS, TRANSMISSIONS, config_key, get_leaf, leaf_paths, parameters
@@ -129,140 +129,180 @@ def test_byte_order_mark(tmp_path):
 
 A = ALPHA
 BAD = {
-    "unknown table": (small(drives={}), "unknown key 'drives'; did you mean 'drive'?"),
+    "unknown table": (small_study(drives={}), "unknown key 'drives'; did you mean 'drive'?"),
     "unknown key": (
-        small({"drive.motor_inertai": 1.0}),
+        small_study({"drive.motor_inertai": 1.0}),
         "drive: unknown key 'motor_inertai'; did you mean 'motor_inertia'?",
     ),
     "unknown gain": (
-        small({"observer.motor.lambda_": 1.0}),
+        small_study({"observer.motor.lambda_": 1.0}),
         "observer.motor: unknown key 'lambda_'; did you mean 'lambda'?",
     ),
-    "unknown key, none near": (small({"log.zzz": 1}), "log: unknown key 'zzz'; valid: kind, hold, initial_state"),
-    "line break in a key": (small({"drive.a\nb": 1}), r"drive: unknown key 'a\nb'"),
-    "line break in a tag": (small({"drive.kind": "a\nb"}), r"drive.kind: unknown kind 'a\nb'; valid: two_inertia, rigid"),
-    "key of another law": (small({"transmission.half_gap": 0.1}), "transmission: unknown key 'half_gap'"),
-    "missing table": (small({"drive": None}), "drive: this key is missing"),
-    "missing key": (small({"observer.motor.alpha": None}), "observer.motor.alpha: this key is missing"),
-    "missing kind": (small({"excitation.kind": None}), "excitation: the key 'kind' is missing"),
-    "unknown law": (small({"transmission.law": "sigmoid"}), "unknown law 'sigmoid'; did you mean 'sigmoid_backlash'?"),
-    "unknown effect": (small(effects=[{"kind": "load.coulumb_friction"}]), "did you mean 'load.coulomb_friction'?"),
-    "effect's key": (small(effects=[{"kind": "actuator.lag", "time": 1.0}]), "effects[0]: unknown key 'time'"),
+    "unknown key, none near": (small_study({"log.zzz": 1}), "log: unknown key 'zzz'; valid: kind, hold, initial_state"),
+    "line break in a key": (small_study({"drive.a\nb": 1}), r"drive: unknown key 'a\nb'"),
+    "line break in a tag": (
+        small_study({"drive.kind": "a\nb"}),
+        r"drive.kind: unknown kind 'a\nb'; valid: two_inertia, rigid",
+    ),
+    "key of another law": (small_study({"transmission.half_gap": 0.1}), "transmission: unknown key 'half_gap'"),
+    "missing table": (small_study({"drive": None}), "drive: this key is missing"),
+    "missing key": (small_study({"observer.motor.alpha": None}), "observer.motor.alpha: this key is missing"),
+    "missing kind": (small_study({"excitation.kind": None}), "excitation: the key 'kind' is missing"),
+    "unknown law": (small_study({"transmission.law": "sigmoid"}), "unknown law 'sigmoid'; did you mean 'sigmoid_backlash'?"),
+    "unknown effect": (small_study(effects=[{"kind": "load.coulumb_friction"}]), "did you mean 'load.coulomb_friction'?"),
+    "effect's key": (small_study(effects=[{"kind": "actuator.lag", "time": 1.0}]), "effects[0]: unknown key 'time'"),
     "effect's range": (
-        small(effects=[TABLES["motor.cogging"], TABLES["actuator.lag"] | {"time_constant": 0.0}]),
+        small_study(effects=[TABLES["motor.cogging"], TABLES["actuator.lag"] | {"time_constant": 0.0}]),
         "effects[1].time_constant: should be greater than 0, not 0.0",
     ),
-    "effects as a table": (small(effects=TABLES["actuator.lag"]), "effects: should be an array, not {"),
-    "text for a number": (small({"drive.motor_inertia": "0.05"}), "motor_inertia: should be a valid number, not '0.05'"),
-    "truth for a number": (small({"drive.motor_inertia": True}), "motor_inertia: should be a valid number, not True"),
-    "number for a table": (small(run=3), "run: should be a table, not 3"),
-    "number for a text": (small(title=3), "title: should be a valid string, not 3"),
-    "text for an array": (small(notes="a"), "notes: should be an array, not 'a'"),
-    "part of a step": (small({"run.substeps": 2.5}), "run.substeps: should be a valid integer, not 2.5"),
-    "nan": (small({"encoders.noise": float("nan")}), "encoders.noise: should be a finite number, not nan"),
-    "inf": (small({"encoders.noise": float("inf")}), "encoders.noise: should be a finite number, not inf"),
+    "effects as a table": (small_study(effects=TABLES["actuator.lag"]), "effects: should be an array, not {"),
+    "text for a number": (
+        small_study({"drive.motor_inertia": "0.05"}),
+        "motor_inertia: should be a valid number, not '0.05'",
+    ),
+    "truth for a number": (small_study({"drive.motor_inertia": True}), "motor_inertia: should be a valid number, not True"),
+    "number for a table": (small_study(run=3), "run: should be a table, not 3"),
+    "number for a text": (small_study(title=3), "title: should be a valid string, not 3"),
+    "text for an array": (small_study(notes="a"), "notes: should be an array, not 'a'"),
+    "part of a step": (small_study({"run.substeps": 2.5}), "run.substeps: should be a valid integer, not 2.5"),
+    "nan": (small_study({"encoders.noise": float("nan")}), "encoders.noise: should be a finite number, not nan"),
+    "inf": (small_study({"encoders.noise": float("inf")}), "encoders.noise: should be a finite number, not inf"),
     "endless integer": (
-        small({"drive.motor_inertia": 10**400}),
+        small_study({"drive.motor_inertia": 10**400}),
         "should be a number of 64 bits, not 0x1b4ec7",
     ),
-    "negative inertia": (small({"drive.motor_inertia": -1.0}), "drive.motor_inertia: should be greater than 0, not -1.0"),
+    "negative inertia": (
+        small_study({"drive.motor_inertia": -1.0}),
+        "drive.motor_inertia: should be greater than 0, not -1.0",
+    ),
     "negative noise": (
-        small({"encoders.noise": -1e-4}),
+        small_study({"encoders.noise": -1e-4}),
         "encoders.noise: should be greater than or equal to 0, not -0.0001",
     ),
-    "forgetting": (small({"identifier.forgetting": 1.1}), "forgetting: should be less than or equal to 1, not 1.1"),
-    "choice": (small({"run.precision": "float16"}), "run.precision: should be 'float64' or 'float32', not 'float16'"),
-    "period over duration": (small({"run.sample_period": 0.5}), "sample_period 0.5 s is longer than duration 0.2 s"),
-    "few samples": (small({"run.duration": 5e-3}), "holds only 5 samples of 0.001 s; at least 8 are needed"),
-    "too many samples": (small({"run.duration": 1e9}), "holds more than 2e+09 samples of 0.001 s"),
+    "forgetting": (small_study({"identifier.forgetting": 1.1}), "forgetting: should be less than or equal to 1, not 1.1"),
+    "choice": (small_study({"run.precision": "float16"}), "run.precision: should be 'float64' or 'float32', not 'float16'"),
+    "period over duration": (small_study({"run.sample_period": 0.5}), "sample_period 0.5 s is longer than duration 0.2 s"),
+    "few samples": (small_study({"run.duration": 5e-3}), "holds only 5 samples of 0.001 s; at least 8 are needed"),
+    "too many samples": (small_study({"run.duration": 1e9}), "holds more than 2e+09 samples of 0.001 s"),
     "rigid with transmission": (
-        rigid(transmission={"law": "linear_shaft", "stiffness": 1.0}),
+        rigid_study(transmission={"law": "linear_shaft", "stiffness": 1.0}),
         "[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'",
     ),
-    "rigid with load observer": (rigid({"observer.load": {"lambda": 1.0, "alpha": 1.0}}), "observer.load has no meaning"),
-    "rigid with load effect": (rigid(effects=[TABLES["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
-    "no transmission": (small({"transmission": None}), "[transmission] is missing"),
-    "no load observer": (small({"observer.load": None}), "observer.load is missing"),
-    "exact path": (small({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),
-    "start >= stop": (small(axes=[spaced(A, 3.0, 2.0, 4)]), "axes[0]: axis observer.motor.alpha: start 3.0 should be less"),
-    "log through zero": (small(axes=[spaced(A, 0.0, 2.0, 4)]), "a log scale needs start > 0, not 0.0"),
-    "no values": (small(axes=[listed(A)]), "axis observer.motor.alpha is empty"),
-    "neither": (small(axes=[{"path": A, "num": 4}]), "should have values, or start and stop"),
-    "both": (small(axes=[listed(A, 1.0, num=4)]), "has both values and start/stop/num"),
-    "one of two ends": (small(axes=[spaced(A, 1.0, 2.0, 1)]), "num = 1 cannot span start ... stop"),
-    "value twice": (small(axes=[listed(A, 1, 1.0)]), "lists a value twice"),
-    "truth among values": (small(axes=[listed(A, True)]), "axes[0].values[0]: should be a valid number, not True"),
-    "values of no kind": (small(axes=[listed(A, [1.0])]), "axes[0].values[0]: should be a valid number, not [1.0]"),
+    "rigid with load observer": (
+        rigid_study({"observer.load": {"lambda": 1.0, "alpha": 1.0}}),
+        "observer.load has no meaning",
+    ),
+    "rigid with load effect": (rigid_study(effects=[TABLES["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
+    "no transmission": (small_study({"transmission": None}), "[transmission] is missing"),
+    "no load observer": (small_study({"observer.load": None}), "observer.load is missing"),
+    "exact path": (small_study({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),
+    "start >= stop": (
+        small_study(axes=[spaced_axis(A, 3.0, 2.0, 4)]),
+        "axes[0]: axis observer.motor.alpha: start 3.0 should be less",
+    ),
+    "log through zero": (small_study(axes=[spaced_axis(A, 0.0, 2.0, 4)]), "a log scale needs start > 0, not 0.0"),
+    "no values": (small_study(axes=[listed_axis(A)]), "axis observer.motor.alpha is empty"),
+    "neither": (small_study(axes=[{"path": A, "num": 4}]), "should have values, or start and stop"),
+    "both": (small_study(axes=[listed_axis(A, 1.0, num=4)]), "has both values and start/stop/num"),
+    "one of two ends": (small_study(axes=[spaced_axis(A, 1.0, 2.0, 1)]), "num = 1 cannot span start ... stop"),
+    "value twice": (small_study(axes=[listed_axis(A, 1, 1.0)]), "lists a value twice"),
+    "truth among values": (
+        small_study(axes=[listed_axis(A, True)]),
+        "axes[0].values[0]: should be a valid number, not True",
+    ),
+    "values of no kind": (
+        small_study(axes=[listed_axis(A, [1.0])]),
+        "axes[0].values[0]: should be a valid number, not [1.0]",
+    ),
     "two axes on one path": (
-        small(axes=[listed(A, 1.0), listed(A, 2.0)]),
+        small_study(axes=[listed_axis(A, 1.0), listed_axis(A, 2.0)]),
         "axes[1]: path 'observer.motor.alpha' has an axis",
     ),
     "unknown path": (
-        small(axes=[listed("observer.motor.alfa", 1.0)]),
+        small_study(axes=[listed_axis("observer.motor.alfa", 1.0)]),
         "axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
     ),
-    "path of a table": (small(axes=[listed("observer.motor", 1.0)]), "nearest valid path: 'observer.motor.alpha'"),
-    "path of a choice": (small(axes=[listed("drive.kind", "rigid")]), "axes[0]: unknown path 'drive.kind'"),
+    "path of a table": (
+        small_study(axes=[listed_axis("observer.motor", 1.0)]),
+        "nearest valid path: 'observer.motor.alpha'",
+    ),
+    "path of a choice": (small_study(axes=[listed_axis("drive.kind", "rigid")]), "axes[0]: unknown path 'drive.kind'"),
     "path of two effects": (
-        small(effects=[TABLES["actuator.lag"]] * 2, axes=[listed("effects.actuator.lag.time_constant", 1.0)]),
+        small_study(effects=[TABLES["actuator.lag"]] * 2, axes=[listed_axis("effects.actuator.lag.time_constant", 1.0)]),
         "unknown path 'effects.actuator.lag.time_constant'; nearest valid path: 'effects.1.time_constant'",
     ),
     "axis out of range": (
-        small(axes=[spaced(A, -3.0, 2.0, 4, "linear")]),
+        small_study(axes=[spaced_axis(A, -3.0, 2.0, 4, "linear")]),
         "axes[0]: observer.motor.alpha: should be greater",
     ),
-    "axis value out of range": (small(axes=[listed(A, 2.0, -1.0)]), "should be greater than or equal to 0, not -1.0"),
-    "words on a numeric axis": (small(axes=[listed(A, "a")]), "observer.motor.alpha: should be a valid number, not 'a'"),
+    "axis value out of range": (
+        small_study(axes=[listed_axis(A, 2.0, -1.0)]),
+        "should be greater than or equal to 0, not -1.0",
+    ),
+    "words on a numeric axis": (
+        small_study(axes=[listed_axis(A, "a")]),
+        "observer.motor.alpha: should be a valid number, not 'a'",
+    ),
     "parts of a step": (
-        small(axes=[spaced("run.substeps", 1, 4, 3, "linear")]),
+        small_study(axes=[spaced_axis("run.substeps", 1, 4, 3, "linear")]),
         "run.substeps: should be a valid integer, not 2.5",
     ),
-    "num missing": (small(axes=[spaced(A, 1.0, 2.0)]), "axes[0]: num is missing for 'observer.motor.alpha'"),
+    "num missing": (small_study(axes=[spaced_axis(A, 1.0, 2.0)]), "axes[0]: num is missing for 'observer.motor.alpha'"),
     "endless grid": (
-        small(axes=[spaced(f"observer.{p}", 1.0, 2.0, 10**5) for p in ("motor.alpha", "motor.lambda", "load.alpha")]),
+        small_study(
+            axes=[spaced_axis(f"observer.{p}", 1.0, 2.0, 10**5) for p in ("motor.alpha", "motor.lambda", "load.alpha")]
+        ),
         "axes: 1e+15 runs are more than 1e+10",
     ),
     "zip of unequal length": (
-        small(axes=[listed(A, 1.0, 2.0, zip="g"), listed(LAMBDA, 1.0, zip="g")]),
+        small_study(axes=[listed_axis(A, 1.0, 2.0, zip="g"), listed_axis(LAMBDA, 1.0, zip="g")]),
         "'observer.motor.lambda' has 1 values, the others zipped as 'g' have 2",
     ),
     "zip alone": (
-        small(axes=[listed(A, 1.0), listed(LAMBDA, 1.0, zip=A)]),
+        small_study(axes=[listed_axis(A, 1.0), listed_axis(LAMBDA, 1.0, zip=A)]),
         "zip = 'observer.motor.alpha' should stand on two axes",
     ),
     "zipped point twice": (
-        small(axes=[listed(A, 1.0, 1.0, zip="g"), listed(LAMBDA, 2.0, 2.0, zip="g")]),
+        small_study(axes=[listed_axis(A, 1.0, 1.0, zip="g"), listed_axis(LAMBDA, 2.0, 2.0, zip="g")]),
         "the axes zipped as 'g' list a point twice",
     ),
-    "points of a grid": (small(sweep={"points": 4}), "sweep.points belongs to design"),
-    "design without points": (small(sweep={"design": "sobol"}, axes=[spaced(A, 1.0, 2.0)]), "sweep.points is missing"),
+    "points of a grid": (small_study(sweep={"points": 4}), "sweep.points belongs to design"),
+    "design without points": (
+        small_study(sweep={"design": "sobol"}, axes=[spaced_axis(A, 1.0, 2.0)]),
+        "sweep.points is missing",
+    ),
     "design without range": (
-        small(sweep={"design": "sobol", "points": 4}, axes=[listed(A, 1.0)]),
+        small_study(sweep={"design": "sobol", "points": 4}, axes=[listed_axis(A, 1.0)]),
         "sweep.design: 'sobol' needs",
     ),
     "design over structure": (
-        small(sweep={"design": "sobol", "points": 4}, axes=[spaced("run.duration", 1.0, 2.0)]),
+        small_study(sweep={"design": "sobol", "points": 4}, axes=[spaced_axis("run.duration", 1.0, 2.0)]),
         "'run.duration' is fixed at compile time; list its values",
     ),
     "design with zip": (
-        small(sweep={"design": "sobol", "points": 4}, axes=[spaced(A, 1.0, 2.0, zip="g")]),
+        small_study(sweep={"design": "sobol", "points": 4}, axes=[spaced_axis(A, 1.0, 2.0, zip="g")]),
         "is sampled quasi-randomly and cannot be zipped",
     ),
-    "heatmap without y": (small(figures=[{"kind": "heatmap", "x": A, "value": "finite"}]), "figures[0]: a heatmap needs y"),
+    "heatmap without y": (
+        small_study(figures=[{"kind": "heatmap", "x": A, "value": "finite"}]),
+        "figures[0]: a heatmap needs y",
+    ),
     "line with y": (
-        small(figures=[{"kind": "line", "x": A, "y": LAMBDA, "value": "finite"}]),
+        small_study(figures=[{"kind": "line", "x": A, "y": LAMBDA, "value": "finite"}]),
         "a line has no y; use series",
     ),
     "heatmap with series": (
-        small(figures=[{"kind": "heatmap", "x": A, "y": LAMBDA, "series": "a", "value": "finite"}]),
+        small_study(figures=[{"kind": "heatmap", "x": A, "y": LAMBDA, "series": "a", "value": "finite"}]),
         "a heatmap has no series; use facet",
     ),
     "axis used twice": (
-        small(figures=[{"kind": "heatmap", "x": A, "y": A, "value": "finite"}]),
+        small_study(figures=[{"kind": "heatmap", "x": A, "y": A, "value": "finite"}]),
         "observer.motor.alpha is used twice",
     ),
     "overlays over two observers": (
-        small(figures=[{"kind": "heatmap", "x": A, "y": "observer.load.lambda", "value": "finite", "overlays": ["exact"]}]),
+        small_study(
+            figures=[{"kind": "heatmap", "x": A, "y": "observer.load.lambda", "value": "finite", "overlays": ["exact"]}]
+        ),
         "overlays need a map over alpha and lambda of one observer",
     ),
 }
@@ -307,7 +347,7 @@ def test_folder_instead_of_a_file(tmp_path):
 
 
 def recorded(path, **keys):
-    return read_config(small(excitation={"kind": "recorded", "file": str(path), **keys}))
+    return read_config(small_study(excitation={"kind": "recorded", "file": str(path), **keys}))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -317,7 +357,7 @@ def test_recorded_excitation_is_found_beside_the_config_and_starts_at_zero(tmp_p
     file = tmp_path / "sub" / f"drive{suffix}"
     frame.to_csv(file) if suffix == ".csv" else frame.to_parquet(file)
     names = {"time_column": "time", "torque_column": "torque", "gain": 0.5}
-    config = read_config(small(excitation={"kind": "recorded", "file": f"sub/drive{suffix}", **names}))
+    config = read_config(small_study(excitation={"kind": "recorded", "file": f"sub/drive{suffix}", **names}))
     (tmp_path / "study.toml").write_text(config.to_toml())
     excitation = read_config(tmp_path / "study.toml").build().excitation
     np.testing.assert_allclose(excitation.times, [0.0, 0.1, 0.2], atol=1e-12)
@@ -376,7 +416,7 @@ def table(section, tag, name, module):
 )
 def test_every_module_has_the_table_of_its_parameters(section, tag, name, module):
     inputs = table(section, tag, name, module)
-    data = (rigid if name == "rigid" else small)(**{section: inputs})
+    data = (rigid_study if name == "rigid" else small_study)(**{section: inputs})
     config = read_config(data)
     built = getattr(config.build(), section)
     assert type(built) is module
@@ -395,7 +435,7 @@ def parameters_by_name(module):
 
 @pytest.mark.parametrize("name", TABLES)
 def test_every_effect_is_built_with_its_numbers_and_its_name(name):
-    config = read_config(small(effects=[TABLES[name]]))
+    config = read_config(small_study(effects=[TABLES[name]]))
     (effect,) = config.build().effects
     assert isinstance(effect, EFFECTS[name])
     assert effect.name == name
@@ -411,7 +451,7 @@ TABULATED = {"kind": "motor.tabulated", "positions": [0.0, 1.0], "position_torqu
 
 
 def test_a_table_of_torques_is_built_and_no_axis_goes_over_it():
-    config = read_config(small(effects=[TABULATED]))
+    config = read_config(small_study(effects=[TABULATED]))
     (effect,) = config.build().effects
     assert effect.positions == (0.0, 1.0) and effect.position_torques == (0.1, 0.2) and effect.turn and effect.speeds == ()
     assert not any("tabulated" in path for path in (*numeric_paths(config), *leaf_paths(config.build())))
@@ -427,10 +467,12 @@ def test_a_table_of_torques_is_built_and_no_axis_goes_over_it():
 )
 def test_a_wrong_table_of_torques_is_refused(change, message):
     with pytest.raises(InputError, match=re.escape(f"effects[0]: motor.tabulated: {message}")):
-        read_config(small(effects=[TABULATED | change]))
+        read_config(small_study(effects=[TABULATED | change]))
 
 
-@pytest.mark.parametrize("data", [small(effects=[TABLES["motor.cogging"], *[TABLES["load.gravity"]] * 2]), rigid()])
+@pytest.mark.parametrize(
+    "data", [small_study(effects=[TABLES["motor.cogging"], *[TABLES["load.gravity"]] * 2]), rigid_study()]
+)
 def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
     config = read_config(data)
     experiment = config.build()
@@ -449,7 +491,7 @@ def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
 
 
 def test_with_values_names_the_nearest_path_and_takes_whole_numbers():
-    config = read_config(small())
+    config = read_config(small_study())
     assert with_values(config, {"run.substeps": 4.0}).run.substeps == 4
     assert with_values(config, {"encoders.load_noise": 1e-5}).build().encoders.load_noise == 1e-5
     assert config.run.substeps == 1
@@ -513,18 +555,18 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
 
 def test_inertia_effects_must_leave_some():
     with pytest.raises(InputError, match=r"motor.inertia leaves a total inertia of .* on the motor"):
-        read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
+        read_config(rigid_study(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
 
 
 def test_a_delay_lasts_no_longer_than_what_is_kept():
     delay = [{"kind": "actuator.delay", "delay": 0.0161}]
     with pytest.raises(InputError, match=r"effects\[0\]: actuator.delay: delay: 0.0161 s .* at most 0.016 s"):
-        read_config(rigid({"run.sample_period": 1e-3}, effects=delay))
+        read_config(rigid_study({"run.sample_period": 1e-3}, effects=delay))
 
 
 def files(folder, **texts):
     """TOML files by name; `base` has the rigid drive without gains."""
-    data = rigid({"observer": None})
+    data = rigid_study({"observer": None})
     for name, text in {"base": tomli_w.dumps(data), **texts}.items():
         path = folder / f"{name}.toml"
         path.parent.mkdir(exist_ok=True, parents=True)
@@ -644,7 +686,9 @@ def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
 
 
 def test_first_seed_shifts_the_noise():
-    early, late = (sweep(rigid(sweep={"seeds": seeds, "first_seed": first})).frame for seeds, first in ((4, 0), (2, 2)))
+    early, late = (
+        sweep(rigid_study(sweep={"seeds": seeds, "first_seed": first})).frame for seeds, first in ((4, 0), (2, 2))
+    )
     assert list(late["seed"]) == [2, 3]
     for column in late.columns:
         np.testing.assert_array_equal(late[column], early[column].iloc[2:])

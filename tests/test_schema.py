@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from small_study import ALPHA, listed, rigid, small
+from small_study import ALPHA, listed_axis, rigid_study, small_study
 
 from jaxbl.config import Config
 from jaxbl.config.schema import build_schema
@@ -32,21 +32,21 @@ def test_it_takes_what_a_part_may_have(errors):
     """An included file has the other keys; a column's name alone stands for a table."""
     for part in ({}, {"include": "a.toml", "drive": {"motor_inertia": 0.1}}, {"log": {"theta_e": "x", "u": 3}}):
         assert errors(part) == []
-    assert errors(Config.model_validate(small(axes=[listed(ALPHA, 1.0)])).to_dict()) == []
+    assert errors(Config.model_validate(small_study(axes=[listed_axis(ALPHA, 1.0)])).to_dict()) == []
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
         {"runs": {}},
-        rigid({"run.durations": 1.0}),
-        rigid({"drive.motor_inertia": 0.0}),
-        rigid({"drive.motor_inertia": "0.1"}),
-        rigid({"excitation.kind": "sinus"}),
-        rigid({"encoders.load_noise": -1.0}),
-        rigid(effects=[{"kind": "motor.coulomb_friction"}]),
-        rigid(effects=[{"kind": "motor.coulomb_friction", "torque": 1.0, "level": 2.0}]),
-        rigid(axes=[{"values": [1.0]}]),
+        rigid_study({"run.durations": 1.0}),
+        rigid_study({"drive.motor_inertia": 0.0}),
+        rigid_study({"drive.motor_inertia": "0.1"}),
+        rigid_study({"excitation.kind": "sinus"}),
+        rigid_study({"encoders.load_noise": -1.0}),
+        rigid_study(effects=[{"kind": "motor.coulomb_friction"}]),
+        rigid_study(effects=[{"kind": "motor.coulomb_friction", "torque": 1.0, "level": 2.0}]),
+        rigid_study(axes=[{"values": [1.0]}]),
         {"log": {"theta_e": {"unit": "kg"}}},
         {"tune": {"compare": [{"name": "a", "motor": {"lambda": 1.0}}]}},
     ],

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paper_drive import DRIVE, paper
+from paper_drive import DRIVE, paper_experiment
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.signal import lfilter
@@ -50,7 +50,7 @@ def identification_errors(result):
 
 
 def test_torque_of_the_implicit_observer_needs_no_low_pass():
-    result, torque = jit(lambda e: scan(e, SEED, (ALL_METRICS,), record=lambda s, g: g.torque))(paper())
+    result, torque = jit(lambda e: scan(e, SEED, (ALL_METRICS,), record=lambda s, g: g.torque))(paper_experiment())
     rms = np.sqrt(np.mean(np.square(torque[15_000:])))
     assert result["motor.torque_rmse"] < 0.01 * rms
     assert result["load.torque_rmse"] < 0.01 * rms
@@ -58,7 +58,7 @@ def test_torque_of_the_implicit_observer_needs_no_low_pass():
 
 @pytest.mark.parametrize(("discretisation", "time_constant"), [("implicit", 0.0), ("implicit", 0.02), ("explicit", 0.02)])
 def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
-    errors = identification_errors(figures(paper(discretisation, time_constant=time_constant)))
+    errors = identification_errors(figures(paper_experiment(discretisation, time_constant=time_constant)))
     assert max(errors["stiffness_error"]) < 0.01
     assert max(errors["dead_zone_error"]) < 0.005
 
@@ -66,7 +66,7 @@ def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_matched_regressor_beats_none_in_the_dead_zone(discretisation):
     matched, none = (
-        identification_errors(figures(paper(discretisation, time_constant=0.02, regressor_filter=kind)))
+        identification_errors(figures(paper_experiment(discretisation, time_constant=0.02, regressor_filter=kind)))
         for kind in ("matched", "none")
     )
     for ours, papers in zip(matched["dead_zone_error"], none["dead_zone_error"], strict=True):
@@ -133,7 +133,7 @@ def independent(experiment, noise, steps):
 
 def test_whole_trace_against_an_independent_copy():
     steps = 400
-    experiment = paper(
+    experiment = paper_experiment(
         time_constant=0.01,
         start=0.1,
         steps=steps,
@@ -187,7 +187,7 @@ def test_unit_noise_is_a_function_of_seed_and_index():
 
 def test_noise_is_the_same_in_runs_of_any_length_precision_and_level():
     def noise_of(steps, dtype, level):
-        signals = trace(paper(noise=level, steps=steps, substeps=1, dtype=dtype))
+        signals = trace(paper_experiment(noise=level, steps=steps, substeps=1, dtype=dtype))
         return [
             np.asarray(signals.side(s).measured - signals.side(s).true.position, float) * gain / level
             for s, gain in (("motor", 1.0), ("load", 5.0))
@@ -213,7 +213,7 @@ def lane_values(count):
 
 def test_lanes_equal_single_runs():
     """Also where a plant that no axis varies is simulated once for all lanes."""
-    experiment = paper(time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
+    experiment = paper_experiment(time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
     for values in (lane_values(7), dict(list(lane_values(7).items())[:3])):
         lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (ALL_METRICS,))[0]))(values)
         for i in (0, 3, 6):
@@ -225,7 +225,7 @@ def test_lanes_equal_single_runs():
 
 
 def test_a_diverging_lane_leaves_its_neighbours_alone():
-    experiment = paper(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
+    experiment = paper_experiment(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
     run = jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (ALL_METRICS,))[0]))
     lanes, calm = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
@@ -240,7 +240,7 @@ def test_a_diverging_lane_leaves_its_neighbours_alone():
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_rigid_drive_observes_what_resists_beyond_the_model(discretisation):
     observer = {"implicit": ImplicitSuperTwisting, "explicit": ExplicitSuperTwisting}[discretisation]
-    experiment = paper(
+    experiment = paper_experiment(
         time_constant=0.02,
         steps=4000,
         substeps=1,
@@ -267,7 +267,7 @@ def test_rigid_drive_observes_what_resists_beyond_the_model(discretisation):
 
 @pytest.mark.parametrize("stride", [7, 64, 100, 1000])
 def test_record_keeps_every_so_many_samples(stride):
-    experiment = paper(time_constant=0.01, noise=1e-4, steps=523, substeps=1)
+    experiment = paper_experiment(time_constant=0.01, noise=1e-4, steps=523, substeps=1)
     full, thin = trace(experiment), trace(experiment, stride=stride)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x[::stride], rtol=1e-9, atol=1e-12), full, thin)
 
@@ -278,7 +278,7 @@ def test_reducers_see_every_sample_whatever_is_recorded():
         lambda experiment, carry, index, signals: carry + index,
         lambda experiment, carry, state: {"sum": carry},
     )
-    experiment = paper(steps=523, substeps=1)
+    experiment = paper_experiment(steps=523, substeps=1)
     for record, stride in ((None, 1), (everything, 10)):
         out, _ = jit(lambda e, record=record, stride=stride: scan(e, SEED, (count,), record, stride))(experiment)
         assert out == {"sum": 523 * 522 // 2}
@@ -287,7 +287,7 @@ def test_reducers_see_every_sample_whatever_is_recorded():
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_derivatives_through_the_run(discretisation):
     """Forward and reverse, finite from the first sample, where every error is zero, and right on the plant."""
-    experiment = paper(discretisation, time_constant=0.01, steps=200, substeps=2)
+    experiment = paper_experiment(discretisation, time_constant=0.01, steps=200, substeps=2)
 
     def run(stiffness):
         signals = scan(set_leaves(experiment, {"transmission.stiffness": stiffness}), SEED, record=everything)[1]
@@ -314,13 +314,13 @@ def test_one_compilation_serves_all_values():
 
     compiled = jit(counted)
     for noise in (0.0, 1e-4, 1e-3):
-        compiled(paper(noise=noise, steps=64, substeps=1))
+        compiled(paper_experiment(noise=noise, steps=64, substeps=1))
     assert traces == 1
 
 
 @pytest.mark.parametrize("stride", [1, 7])
 def test_a_replayed_record_gives_what_the_observers_gave(stride):
-    experiment = paper(noise=1e-4, start=0.1, steps=700)
+    experiment = paper_experiment(noise=1e-4, start=0.1, steps=700)
     signals = trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
     run = jit(lambda *columns: replay(*columns, record=everything, stride=stride, state=initial_state(experiment)))
@@ -334,7 +334,7 @@ def test_a_replayed_record_gives_what_the_observers_gave(stride):
 
 
 def test_what_observers_are_told_is_not_in_their_equivalent_control():
-    experiment = paper(noise=0.0, steps=2000)
+    experiment = paper_experiment(noise=0.0, steps=2000)
     signals = trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
     # of the true acceleration, its mean over each sampling period
@@ -351,7 +351,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
 
 
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
-    experiment = paper(steps=300)
+    experiment = paper_experiment(steps=300)
     signals = trace(experiment)
     states = jit(lambda u: plant_trajectory(experiment, experiment.plant.init(experiment.initial), u))(signals.input)
     for side in experiment.sides:

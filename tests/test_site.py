@@ -11,7 +11,7 @@ from urllib.parse import unquote, urldefrag, urlsplit
 
 import nbformat
 import pytest
-from browser import assert_accessible, assert_readable, needs_chromium, opened
+from browser import assert_accessible, assert_readable, needs_chromium, open_pages
 from markdown_blocks import blocks_of, without_numbers
 from progress_lines import without_progress
 
@@ -78,7 +78,7 @@ def test_tutorials_print_what_their_texts_say(pages, name):
 def test_every_page_can_be_read_by_everyone(pages):
     """Each in both colour schemes and at both widths."""
     files = [file for file in pages if file != SITE / "index.html"]  # it only leads to the first
-    with opened(files[0]) as (page,):
+    with open_pages(files[0]) as (page,):
         for file in files:
             page.emulate_media(color_scheme="light")
             page.set_viewport_size({"width": 1100, "height": 900})

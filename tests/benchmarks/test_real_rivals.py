@@ -9,7 +9,7 @@ from real.derivatives import parts_of, terms_of, torque_error
 from real.mujoco_sysid import sysid
 from real.rivals import stepwise
 from real_machines import _margin
-from small_study import rigid
+from small_study import rigid_study
 
 from jaxbl import read_config, read_record
 
@@ -24,7 +24,7 @@ def record(tmp_path_factory):
 
 
 def model(inertia=INERTIA, effects=()):
-    return read_config(rigid({"drive.motor_inertia": inertia, "drive.motor_viscous": VISCOUS}, effects=[*effects]))
+    return read_config(rigid_study({"drive.motor_inertia": inertia, "drive.motor_viscous": VISCOUS}, effects=[*effects]))
 
 
 FRICTION = {"kind": "motor.coulomb_friction", "torque": COULOMB}

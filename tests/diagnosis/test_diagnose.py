@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from browser import check, needs_chromium, opened
-from hidden_log import FRICTION, driven, logged, model, part
+from browser import check, needs_chromium, open_pages
+from hidden_log import FRICTION, nominal_study, select_samples, simulate_direct_drive, simulate_multisine_log
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
@@ -31,17 +31,17 @@ FIRST, LAST = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
-    logged().write(folder / "axis.csv")
+    simulate_multisine_log().write(folder / "axis.csv")
     # parts as long as those that are split off the whole
-    part(logged(), FIRST).write(folder / "first.csv")
-    part(logged(), LAST).write(folder / "last.csv")
-    logged(seed=2).write(folder / "other.csv")
+    select_samples(simulate_multisine_log(), FIRST).write(folder / "first.csv")
+    select_samples(simulate_multisine_log(), LAST).write(folder / "last.csv")
+    simulate_multisine_log(seed=2).write(folder / "other.csv")
     return folder
 
 
 @pytest.fixture(scope="module")
 def diagnosis(logs):
-    return diagnose(logs / "axis.csv", model())
+    return diagnose(logs / "axis.csv", nominal_study())
 
 
 def test_the_missing_effect_is_named_with_its_number(diagnosis):
@@ -59,9 +59,9 @@ def test_the_missing_effect_is_named_with_its_number(diagnosis):
 
 
 def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path):
-    log = logged(torque_noise=0.02)
+    log = simulate_multisine_log(torque_noise=0.02)
     log.write(tmp_path / "axis.csv")
-    diagnosis = diagnose(tmp_path / "axis.csv", model())
+    diagnosis = diagnose(tmp_path / "axis.csv", nominal_study())
     (finding,) = diagnosis.summary["findings"]
     assert finding["effect"] == "motor.coulomb_friction"
     assert finding["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
@@ -72,8 +72,8 @@ def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path)
 
 @pytest.mark.parametrize("felt", [False, True])
 def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
-    logged(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
-    task = read_diagnosis_task(tmp_path / "axis.csv", model())
+    simulate_multisine_log(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
     assert setup.input_noise.unfelt == (0.0 if felt else pytest.approx(0.02, rel=0.1))
@@ -99,7 +99,7 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(diagnosis):
 
 def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, diagnosis):
     full_record = read_record(logs / "axis.csv")
-    task = read_diagnosis_task(logs / "axis.csv", model())
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study())
     assert len(task.record.time) == 1500 and task.record.segments == (slice(DELAY_SAMPLES, 1500),)
     assert task.holdout.segments == (slice(1500, 2000),)
     np.testing.assert_array_equal(task.holdout.time, full_record.time)
@@ -147,7 +147,7 @@ def test_the_observers_are_a_second_witness(diagnosis):
 
 
 def test_an_observer_that_does_not_converge_is_noted(logs):
-    task = read_diagnosis_task(logs / "axis.csv", model(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
     assert "observer.motor" not in task.missing
     with jax.enable_x64(True):
         setup = set_up(task)
@@ -173,7 +173,7 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, t
 @needs_chromium
 def test_the_page_in_a_browser(diagnosis, tmp_path):
     write_diagnosis_report(diagnosis, tmp_path)
-    with opened(tmp_path / "report.html") as (page,):
+    with open_pages(tmp_path / "report.html") as (page,):
         check(page, len(list((tmp_path / "figures").iterdir())))
         assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
 
@@ -190,7 +190,7 @@ def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, diagnosis, 
 
 def test_what_is_known_exactly_is_no_candidate(logs):
     uncertainty = {"relative": 0.02, "exact": ["drive.motor_inertia", "actuator.gain_error"]}
-    task = read_diagnosis_task(logs / "axis.csv", model(uncertainty=uncertainty))
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study(uncertainty=uncertainty))
     with jax.enable_x64(True):
         lacking = new_search(set_up(task)).lacking
     assert not {"motor.inertia", "actuator.gain_error"} & set(lacking)
@@ -198,7 +198,7 @@ def test_what_is_known_exactly_is_no_candidate(logs):
 
 
 def test_a_steady_torque_is_no_other_one_when_shuffled(logs):
-    task = read_diagnosis_task(logs / "axis.csv", model())
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
         (segment,) = setup.holdout.segments
@@ -228,7 +228,7 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
         return fit._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
-    task = read_diagnosis_task(logs / "first.csv", model(), holdout=logs / "last.csv")
+    task = read_diagnosis_task(logs / "first.csv", nominal_study(), holdout=logs / "last.csv")
     stages = []
     diagnosis = run_diagnosis(task, lambda *counts: stages.append(counts))
     assert stages == [(i, 6) for i in range(1, 7)]
@@ -252,7 +252,7 @@ def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     messages = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
     assert messages[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
-    rival = {"effect": "motor.quadratic_drag", "drive": model()["drive"], "effects": other}
+    rival = {"effect": "motor.quadratic_drag", "drive": nominal_study()["drive"], "effects": other}
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
     summary = {"findings": [finding], "rival": rival}
     largest = np.max(np.abs(record.torque))
@@ -274,16 +274,16 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
     fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
     log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
-    part(driven(fast, [friction], 1e-3, 1), FIRST).write(log)
-    part(driven(0.8 * fast, [friction], 1e-3, 2), LAST).write(holdout)
-    task = read_diagnosis_task(log, model(), holdout=holdout)
+    select_samples(simulate_direct_drive(fast, [friction], 1e-3, 1), FIRST).write(log)
+    select_samples(simulate_direct_drive(0.8 * fast, [friction], 1e-3, 2), LAST).write(holdout)
+    task = read_diagnosis_task(log, nominal_study(), holdout=holdout)
     diagnosis = run_diagnosis(task)
     pair = tied(diagnosis.summary)
     assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
     best = next_experiment(diagnosis.summary, diagnosis.model, task.record, travel=6.0)
     assert best is not None and best.apart > 100.0
-    driven(best.torque, [friction], 1e-3, 3).write(other)
-    (finding,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
+    simulate_direct_drive(best.torque, [friction], 1e-3, 3).write(other)
+    (finding,) = diagnose([log, other], nominal_study(), holdout=holdout).summary["findings"]
     assert finding["effect"] == "motor.coulomb_friction" and finding["confidence"] > 0.99
     assert finding["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
 
@@ -297,13 +297,13 @@ def expect_refusal(logs, *arguments, **keywords):
 
 
 def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
-    log, axis = logged(seed=2), logs / "axis.csv"
+    log, axis = simulate_multisine_log(seed=2), logs / "axis.csv"
     coarse, again = tmp_path / "coarse.csv", tmp_path / "again.csv"
     means = log.u.reshape(-1, 2).mean(axis=1)
     dataclasses.replace(log, t=log.t[::2], u=means, theta_e=log.theta_e[::2]).write(coarse)
     log.write(again)
     for inputs, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], again)):
-        task = read_diagnosis_task(inputs, model(), holdout=holdout)
+        task = read_diagnosis_task(inputs, nominal_study(), holdout=holdout)
         for record in (task.record, task.holdout):
             assert record.sample_period == pytest.approx(0.004)
         output = [
@@ -317,39 +317,39 @@ def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
 
 def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
     axis = logs / "axis.csv"
-    assert "is the log itself" in expect_refusal(logs, axis, model(), holdout=axis)
-    log = logged(seed=2)
-    logged(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
-    assert "shows an inertia of 0.1" in expect_refusal(logs, axis, model(), holdout=tmp_path / "heavy.csv")
+    assert "is the log itself" in expect_refusal(logs, axis, nominal_study(), holdout=axis)
+    log = simulate_multisine_log(seed=2)
+    simulate_multisine_log(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
+    assert "shows an inertia of 0.1" in expect_refusal(logs, axis, nominal_study(), holdout=tmp_path / "heavy.csv")
     dataclasses.replace(log, theta_e=-log.theta_e).write(tmp_path / "sign.csv")
-    assert "sign" in expect_refusal(logs, axis, model(), holdout=tmp_path / "sign.csv")
+    assert "sign" in expect_refusal(logs, axis, nominal_study(), holdout=tmp_path / "sign.csv")
 
 
 def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
-    part(logged(), slice(150)).write(tmp_path / "short.csv")
-    assert "too few to hold a quarter of them out" in expect_refusal(logs, tmp_path / "short.csv", model())
+    select_samples(simulate_multisine_log(), slice(150)).write(tmp_path / "short.csv")
+    assert "too few to hold a quarter of them out" in expect_refusal(logs, tmp_path / "short.csv", nominal_study())
 
 
 def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
     """And not called complete: friction of a third of the input goes unseen."""
-    torque = 2e-3 * logged().u
-    driven(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
+    torque = 2e-3 * simulate_multisine_log().u
+    simulate_direct_drive(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
     messages = (
         r"axis\.csv: noise hides everything: with readings as noisy as 0\.03 rad \(theta_e\), no torque of less than "
         r"2\d\d % of the input would be seen; noise 7 times smaller, or torques as many times larger, are needed$"
     )
     with pytest.raises(InputError, match=messages):
-        diagnose(tmp_path / "axis.csv", model())
+        diagnose(tmp_path / "axis.csv", nominal_study())
 
 
 def test_effects_of_one_name_behind_an_actuator_are_refused(logs):
     """They are called by their positions, which effects that are tried before that of the actuator would shift."""
     waves = [{"kind": "motor.cogging", "amplitude": 1e-4, "harmonic": n} for n in (3.0, 5.0)]
     with pytest.raises(InputError, match=r"effects: two are motor\.cogging; list them before those of the actuator"):
-        diagnose(logs / "axis.csv", model() | {"effects": [{"kind": "actuator.lag", "time_constant": 1e-3}, *waves]})
+        diagnose(logs / "axis.csv", nominal_study() | {"effects": [{"kind": "actuator.lag", "time_constant": 1e-3}, *waves]})
 
 
 def test_a_model_that_diverges_is_refused(logs):
-    unstable = model(effects=[{"kind": "motor.viscous_friction", "viscous": -2.0}])
+    unstable = nominal_study(effects=[{"kind": "motor.viscous_friction", "viscous": -2.0}])
     with pytest.raises(InputError, match=r"axis\.csv: the model diverges under this log's input"):
         diagnose(logs / "axis.csv", unstable)

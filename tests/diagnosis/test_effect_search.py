@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hidden.cases import cases
-from hidden_log import driven, logged, model
+from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
 from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
 from jaxbl.identification.free_parameters import make_free_parameters
@@ -59,11 +59,11 @@ def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
 
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     """Free functions have knots where there are no samples."""
-    log = logged()
+    log = simulate_multisine_log()
     keep = (log.t < 1.2) | (log.t > 2.0)
     table = np.column_stack([log.t, log.u, log.theta_e])[keep]
     np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    effect_search = search(tmp_path / "log.csv", model())
+    effect_search = search(tmp_path / "log.csv", nominal_study())
     assert len(effect_search.segments) == 2
     explanation = effect_search.run()
     assert explanation.verdict == "explained"
@@ -82,8 +82,10 @@ HIDDEN = {
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
-    driven(logged().u[:1000], [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")
-    explanation = search(tmp_path / "log.csv", model()).run()
+    simulate_direct_drive(simulate_multisine_log().u[:1000], [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(
+        tmp_path / "log.csv"
+    )
+    explanation = search(tmp_path / "log.csv", nominal_study()).run()
     assert explanation.verdict == "explained"
     assert [finding.effect for finding in explanation.findings] == [name]
     for key, value in HIDDEN[name].items():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hidden_log import record_study
-from small_study import swung
+from small_study import multisine_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.free_starts import best_runs
@@ -17,7 +17,7 @@ from jaxbl.identification.segments import segments_of, windows_of
 from jaxbl.identification.trajectory import projected_residual
 from jaxbl.simulate import with_effects
 
-STUDY = swung(
+STUDY = multisine_study(
     2.0,
     transmission={"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.02},
     effects=[{"kind": "load.coulomb_friction", "torque": 2.0}, {"kind": "actuator.delay", "delay": 2e-3}],

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 from hidden_log import simulate_study
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
@@ -31,9 +31,9 @@ def setting(sides):
     settings = {"run.duration": 2.0, "run.substeps": 5}
     excitation = {"kind": "multisine", "amplitude": 5.0 if sides == 2 else 1.0, "frequency": 0.7}
     if sides == 2:
-        data = small(settings, excitation=excitation, transmission=SHAFT, observer=OBSERVER)
+        data = small_study(settings, excitation=excitation, transmission=SHAFT, observer=OBSERVER)
     else:
-        data = rigid(settings, excitation=excitation, observer={"motor": OBSERVER["motor"]})
+        data = rigid_study(settings, excitation=excitation, observer={"motor": OBSERVER["motor"]})
     return prepare(read_config(data)), segment_of(simulate_study(data, seed=8))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hidden_log import simulate_study
 from scipy.signal import lfilter
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
@@ -186,7 +186,9 @@ def residuals_of(true, model):
 
 def test_a_geared_drive_with_hidden_friction_on_its_load():
     hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
-    experiment, residuals, segment = residuals_of(small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED))
+    experiment, residuals, segment = residuals_of(
+        small_study(SETTINGS, effects=hidden, **GEARED), small_study(SETTINGS, **GEARED)
+    )
     location = localise(experiment, residuals, [segment], all_coordinates(experiment, [segment], residuals, ()))
     assert not location["motor"].significant
     assert "by the direction of motion" in sentence_of(location["load"])
@@ -197,7 +199,7 @@ def test_a_geared_drive_with_hidden_friction_on_its_load():
 
 
 def test_coordinates_know_turning_from_sliding():
-    moving = rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
+    moving = rigid_study(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
     experiment, residuals, segment = residuals_of(moving, moving)
     turning = coordinates_of(experiment, segment, residuals["motor"][0])
     sliding = coordinates_of(experiment, segment, residuals["motor"][0], ["motor"])
@@ -206,5 +208,5 @@ def test_coordinates_know_turning_from_sliding():
     assert np.ptp(turning["turn"].values) <= 2.0 * np.pi
     assert experiment.plant.half_gap == 0.0
     added = [{"kind": "transmission.backlash", "half_gap": 0.02}]
-    assert prepare(read_config(small(SETTINGS, effects=added, **GEARED))).plant.half_gap == pytest.approx(0.1)
+    assert prepare(read_config(small_study(SETTINGS, effects=added, **GEARED))).plant.half_gap == pytest.approx(0.1)
     assert segment.time.shape == turning["time"].values.shape

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hidden.cases import Log
 from hidden.simulator import Machine, Run, simulate
-from hidden_log import FRICTIONS, GAP, GEARED, geared, part
+from hidden_log import FRICTIONS, GAP, GEARED, select_samples, simulate_geared_drive
 
 from jaxbl.config import read_model
 from jaxbl.diagnosis import motor_alone
@@ -28,7 +28,7 @@ STUDY = {
 
 def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     path = tmp_path / "motor.csv"
-    replace(geared()[0], theta_s=None).write(path)
+    replace(simulate_geared_drive()[0], theta_s=None).write(path)
     diagnosis = diagnose(path, STUDY)
     assert diagnosis.summary["verdict"] == "explained"
     numbers = {finding["effect"]: finding["parameters"] for finding in diagnosis.summary["findings"]}
@@ -60,8 +60,8 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     log = driven(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
     # the first part is too short to be fitted, and stays in the trace; the other one gives up its beginning
     path, other = tmp_path / "motor.csv", tmp_path / "other.csv"
-    part(log, np.r_[0:50, 60:1060]).write(path)
-    part(log, np.r_[1060:1310]).write(other)
+    select_samples(log, np.r_[0:50, 60:1060]).write(path)
+    select_samples(log, np.r_[1060:1310]).write(other)
     done = []
     task = read_diagnosis_task(path, EXACT, holdout=other)
     diagnosis = run_diagnosis(task, lambda *counted: done.append(counted))

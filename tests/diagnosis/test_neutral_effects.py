@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
@@ -21,7 +21,7 @@ KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
 def model(sides):
-    data = small() if sides == 2 else rigid()
+    data = small_study() if sides == 2 else rigid_study()
     return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
 
 
@@ -75,7 +75,7 @@ def test_buckets_are_few_and_large_enough():
 
 
 def test_given_effects_keep_their_order():
-    data = small()
+    data = small_study()
     saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
     full = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
     acting = [effect.name for effect in full.effects if effect.place == "actuator"]

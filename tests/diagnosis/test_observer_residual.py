@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden_log import DRIVE, FRICTION, FRICTIONS, GAP, GEARED, geared, logged, model
+from hidden_log import DRIVE, FRICTION, FRICTIONS, GAP, GEARED, nominal_study, simulate_geared_drive, simulate_multisine_log
 from scipy.signal import lfilter
 
 import jaxbl.diagnosis.observer_residual as under_test
@@ -37,8 +37,8 @@ def _double():
 def logs(tmp_path_factory):
     """Logs of a direct drive and of a geared one, and the speeds of the latter."""
     folder = tmp_path_factory.mktemp("logs")
-    logged().write(folder / "direct.csv")
-    log, speeds = geared()
+    simulate_multisine_log().write(folder / "direct.csv")
+    log, speeds = simulate_geared_drive()
     log.write(folder / "geared.csv")
     return folder, speeds
 
@@ -68,7 +68,7 @@ def late(torque, period):
 
 
 def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
-    experiment, residuals, observed = read_residuals(logs, "geared", model(drive=GEARED, transmission=GAP))
+    experiment, residuals, observed = read_residuals(logs, "geared", nominal_study(drive=GEARED, transmission=GAP))
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
         (witness,) = observed[side]
         assert witness.converged and witness.stuck < 0.02
@@ -93,7 +93,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretis
     tables = {"drive": DRIVE, "effects": [FRICTION]}
     if drive == "geared":
         tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
-    _, _, observed = read_residuals(logs, drive, model(observer={"discretisation": discretisation}, **tables))
+    _, _, observed = read_residuals(logs, drive, nominal_study(observer={"discretisation": discretisation}, **tables))
     for side, (name,) in observed.items():
         scores = [rms(name.residual.torque / name.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
@@ -107,7 +107,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretis
 
 
 def test_a_rigid_drive_has_one_witness(logs):
-    experiment, residuals, observed = read_residuals(logs, "direct", model())
+    experiment, residuals, observed = read_residuals(logs, "direct", nominal_study())
     assert list(observed) == ["motor"]
     description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
     assert description["correlation"] > 0.98 and description["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
@@ -116,7 +116,7 @@ def test_a_rigid_drive_has_one_witness(logs):
 @pytest.mark.parametrize("alpha", [1.0, 2.5])
 def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
     """The torque that is missing makes 3 rad/s^2."""
-    experiment, residuals, observed = read_residuals(logs, "direct", model(), {"motor": (2.0, alpha)})
+    experiment, residuals, observed = read_residuals(logs, "direct", nominal_study(), {"motor": (2.0, alpha)})
     (witness,) = observed["motor"]
     assert witness.stuck > 0.5 and not witness.converged
     description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
@@ -130,5 +130,5 @@ def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
         return {side: values.at[0, -1].set(np.inf) for side, values in real(*inputs).items()}
 
     monkeypatch.setattr(under_test, "_controls", controls)
-    _, _, observed = read_residuals(logs, "direct", model())
+    _, _, observed = read_residuals(logs, "direct", nominal_study())
     assert not observed["motor"][0].converged and np.isnan(observed["motor"][0].residual.deviation).all()

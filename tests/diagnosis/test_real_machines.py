@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from measured import EMPS, XL330, real
-from small_study import rigid
+from small_study import rigid_study
 
 from jaxbl.diagnosis import effect_search
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
@@ -20,7 +20,7 @@ OFFSET = {"kind": "motor.constant_torque", "torque": -3.2}
 
 def emps(*effects):
     """The positioning system as a mass, with some of its effects; linear: kg, N, m."""
-    study = rigid(
+    study = rigid_study(
         {"drive.motor_inertia": 95.0, "drive.motor_viscous": 0.0, "run.substeps": 2},
         effects=[*effects],
         log=EMPS,
@@ -71,7 +71,7 @@ def test_emps_an_effect_that_is_taken_out_is_named_again(monkeypatch):
 
 def test_xl330_gravity_and_then_dry_friction_are_named():
     """A pendulum released, neither gravity nor friction in the model."""
-    study = rigid(
+    study = rigid_study(
         {"drive.motor_inertia": 0.0049, "drive.motor_viscous": 0.0, "run.substeps": 2, "run.sample_period": 3.5e-3},
         effects=[],
         uncertainty={"exact": ["drive.motor_inertia"]},

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from hidden_log import record_study
-from small_study import swung
+from small_study import multisine_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.reference_log import ReferenceLog
@@ -13,7 +13,7 @@ from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.identification.segments import segments_of
 from jaxbl.simulate import with_effects
 
-STUDY = swung(
+STUDY = multisine_study(
     3.0,
     transmission={"law": "linear_shaft", "stiffness": 60.0},
     effects=[{"kind": "load.coulomb_friction", "torque": 4.0}],

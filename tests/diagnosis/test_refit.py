@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden_log import FRICTION, logged, model
+from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 from scipy.optimize import minimize
 
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
@@ -25,8 +25,8 @@ NAME = "motor.coulomb_friction"
 @pytest.fixture(scope="module")
 def setting(tmp_path_factory):
     log = tmp_path_factory.mktemp("log") / "axis.csv"
-    logged().write(log)
-    task = read_diagnosis_task(log, model())
+    simulate_multisine_log().write(log)
+    task = read_diagnosis_task(log, nominal_study())
     bare = on_record(task.config, task.record)
     experiment = with_numbers(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
     torque = float(np.std(task.record.torque))
@@ -69,8 +69,8 @@ def test_deviations_are_those_of_repetitions(tmp_path):
     values, stated = [], []
     for seed in range(12):
         log = tmp_path / f"{seed}.csv"
-        logged(seed=seed).write(log)
-        task = read_diagnosis_task(log, model())
+        simulate_multisine_log(seed=seed).write(log)
+        task = read_diagnosis_task(log, nominal_study())
         bare = on_record(task.config, task.record)
         experiment = with_numbers(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
         torque = float(np.std(task.record.torque))

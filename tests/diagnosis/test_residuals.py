@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hidden_log import simulate_study
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
@@ -19,9 +19,9 @@ FRICTION = {"kind": "motor.coulomb_friction", "torque": 0.1}
 def study(sides, effects=()):
     tables = {"effects": list(effects), "observer": OBSERVER if sides == 2 else {"motor": OBSERVER["motor"]}}
     if sides == 1:
-        return rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}, **tables)
+        return rigid_study(SETTINGS, excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}, **tables)
     excitation = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5}
-    return small(SETTINGS, excitation=excitation, transmission=GAP, **tables)
+    return small_study(SETTINGS, excitation=excitation, transmission=GAP, **tables)
 
 
 def record(data, seed=0, transmitted=None):

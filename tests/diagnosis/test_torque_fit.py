@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from hidden_log import FRICTION, logged, model
+from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 
 from jaxbl.diagnosis.diagnose import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
@@ -16,8 +16,8 @@ KIND, TORQUE = FRICTION["kind"], FRICTION["torque"]
 
 
 def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins(tmp_path):
-    logged(("friction",)).write(tmp_path / "axis.csv")
-    task = read_diagnosis_task(tmp_path / "axis.csv", model())
+    simulate_multisine_log(("friction",)).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
         search = new_search(setup)

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from hidden_log import FRICTION, logged, model
+from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 
 from jaxbl.diagnosis.diagnose import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
@@ -12,8 +12,8 @@ from jaxbl.diagnosis.torque_regression import _proposals, _replaced
 
 
 def proposals(folder, *effects):
-    logged(effects).write(folder / "axis.csv")
-    task = read_diagnosis_task(folder / "axis.csv", model())
+    simulate_multisine_log(effects).write(folder / "axis.csv")
+    task = read_diagnosis_task(folder / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
         search = new_search(setup)

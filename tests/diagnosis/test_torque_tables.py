@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 import pytest
-from hidden_log import driven, model, simulate_study
-from small_study import rigid
+from hidden_log import nominal_study, simulate_direct_drive, simulate_study
+from small_study import rigid_study
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
@@ -24,7 +24,7 @@ DRAG = {"kind": "motor.quadratic_drag", "drag": 0.004}
 
 def study(*effects):
     excitation = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
-    return rigid(SETTINGS, excitation=excitation, observer=OBSERVER, effects=list(effects))
+    return rigid_study(SETTINGS, excitation=excitation, observer=OBSERVER, effects=list(effects))
 
 
 def tables(*effects):
@@ -62,8 +62,8 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     """The torque is that of the bench's own simulator, which shares nothing with the package."""
     t = 2e-3 * np.arange(2000)
     torque = 0.3 * sum(np.sin(2.0 * np.pi * 0.5 * k * t + k**2) for k in range(1, 7))
-    driven(torque, [WAVE], 3e-5, 1).write(tmp_path / "axis.csv")
-    task = read_diagnosis_task(tmp_path / "axis.csv", model())
+    simulate_direct_drive(torque, [WAVE], 3e-5, 1).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
         proof = Proof(setup)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, ran, samples
-from small_study import small
+from small_study import small_study
 from strict import Strict
 
 import jaxbl
@@ -27,7 +27,7 @@ GAINS = {
 
 def study(kind="super_twisting", **more):
     observer = {"kind": kind, "motor": GAINS, "load": GAINS} | more.pop("observer", {})
-    return small(identifier={"start": 0.1}, observer=observer, **more)
+    return small_study(identifier={"start": 0.1}, observer=observer, **more)
 
 
 def export_native(tmp_path, data, precision="double", **flags):

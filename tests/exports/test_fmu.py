@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from effect_values import ENCODERS, VALUES
 from native import STRICT, bits, ran
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 from strict import Strict
 
 import jaxbl
@@ -43,7 +43,7 @@ GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
 MOVED = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
 
 
-def study(*places, base=small, **tables):
+def study(*places, base=small_study, **tables):
     """A drive that swings for 1.5 s, with the effects of some places; encoders with noise and counts."""
     effects = [table for table in EFFECT_TABLES if table["kind"].startswith(places)] if places else []
     inputs = {"effects": effects, "excitation": EXCITATION, "encoders": {"noise": 1e-3, "motor_resolution": 1e-3}}
@@ -53,7 +53,7 @@ def study(*places, base=small, **tables):
 GAP_CHANGES = {"drive.motor_inertia": 0.08, "transmission.half_gap": 0.05, "effects.load.gravity.phase": 1.1,
                "initial.motor_velocity": 2.0}  # fmt: skip
 STUDIES = {
-    "rigid": study("motor.pre", "actuator.back", "encoder.", base=rigid),
+    "rigid": study("motor.pre", "actuator.back", "encoder.", base=rigid_study),
     "shaft": study(transmission={"law": "linear_shaft", "stiffness": 1.0}),
     "moved gap": study(transmission=GAP, initial=MOVED),
     "all effects": study("", initial=MOVED),
@@ -295,7 +295,7 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
 
 @COMPILED
 def test_in_single_precision_it_is_near_the_simulation(tmp_path):
-    path, summary = export_unit(small({"run.precision": "float32"}, **STUDIES["moved gap"]), tmp_path)
+    path, summary = export_unit(small_study({"run.precision": "float32"}, **STUDIES["moved gap"]), tmp_path)
     assert summary["precision"] == "float"
     # 1e-7 of rounding; accelerations are differences over a sample, which make it a thousand times as large
     trace = simulate("moved gap")

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from effect_values import ENCODERS, VALUES
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 
 import jaxbl
 from jaxbl.config import read_config
@@ -40,7 +40,7 @@ SAID += [
     ({"kind": "load.inertia", "inertia": 1.0}, GAP, ()),
     ({"kind": "transmission.hardening", "cubic_stiffness": 20.0}, GAP, ()),
     ({"kind": "transmission.damping", "damping": 0.1}, GAP, ()),
-    ({"kind": "transmission.backlash", "half_gap": 0.05}, small()["transmission"], ()),
+    ({"kind": "transmission.backlash", "half_gap": 0.05}, small_study()["transmission"], ()),
 ]
 
 
@@ -50,7 +50,7 @@ DETERMINED = {"gap, damping, flexible load, delay": 1}
 
 def study(*effects, **tables):
     """A study of 1 ms samples with these effects."""
-    return read_config(small(effects=list(effects), **tables))
+    return read_config(small_study(effects=list(effects), **tables))
 
 
 def compile_model(config, linear=()):
@@ -164,7 +164,7 @@ def test_every_part_is_listed_with_its_path(tmp_path):
 
 def test_sides_on_a_line_slide():
     numbers = {"amplitude": 0.1, "harmonic": 6.0}
-    config = read_config(rigid(effects=[{"kind": "motor.cogging", **numbers}]))
+    config = read_config(rigid_study(effects=[{"kind": "motor.cogging", **numbers}]))
     text, _, _ = write_mjcf(config, linear=["motor"])
     (joint,) = ET.fromstring(text).iter("joint")
     assert joint.get("type") == "slide"

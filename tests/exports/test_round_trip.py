@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from native import STRICT, UNCONTRACTED, ran
-from small_study import swung
+from small_study import multisine_study
 
 from jaxbl.cli import app, main
 from jaxbl.config import read_config
@@ -28,7 +28,7 @@ def command(*words):
 @pytest.mark.program("gcc")
 def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     # at ten times the noise the load's observer amplifies XLA's joined products to 1e-7 of the torque's rms
-    data = swung(2.0, tune=TUNE, encoders={"noise": 1e-5})
+    data = multisine_study(2.0, tune=TUNE, encoders={"noise": 1e-5})
     for path, value in TOLERANCES.items():
         table, key = path.split(".")
         data[table][key] = value

@@ -6,7 +6,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from small_study import ALPHA, listed, rigid
+from small_study import ALPHA, listed_axis, rigid_study
 
 import jaxbl
 from jaxbl import fused
@@ -58,8 +58,8 @@ def unknown(request, monkeypatch):
     single_plant._trajectory_loop.cache_clear()
 
 
-STUDY = rigid({"run.substeps": 2})
-SWEPT = rigid({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)], sweep={"metrics": ["velocity_rmse"]})
+STUDY = rigid_study({"run.substeps": 2})
+SWEPT = rigid_study({"run.substeps": 2}, axes=[listed_axis(ALPHA, 5.0, 9.0, 20.0)], sweep={"metrics": ["velocity_rmse"]})
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from small_study import LAMBDA, NOISE, listed, made, rigid, spaced
+from small_study import LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
 import jaxbl
 from jaxbl.config import read_config
@@ -25,12 +25,12 @@ def law(x=PERIOD, value=VELOCITY, theory=1.0, **keys):
 
 
 def study(*figures, axes=None, **tables):
-    axes = axes or [listed(PERIOD, *PERIODS), listed(NOISE, *NOISES)]
-    return rigid({"run.duration": 1.0}, axes=axes, figures=list(figures), **tables)
+    axes = axes or [listed_axis(PERIOD, *PERIODS), listed_axis(NOISE, *NOISES)]
+    return rigid_study({"run.duration": 1.0}, axes=axes, figures=list(figures), **tables)
 
 
 def fit_only_law(data, **columns):
-    (fitted_law,) = accuracy_laws(made(data, **columns))
+    (fitted_law,) = accuracy_laws(make_result(data, **columns))
     return fitted_law
 
 
@@ -104,14 +104,14 @@ def test_of_two_laws_the_wider_counts():
 
 
 def test_laws_of_each_series_and_panel_with_seeds_as_replicates():
-    axes = [listed(PERIOD, *PERIODS), listed(WORDS, "explicit", "implicit"), listed(LAMBDA, 0.5, 1.0)]
+    axes = [listed_axis(PERIOD, *PERIODS), listed_axis(WORDS, "explicit", "implicit"), listed_axis(LAMBDA, 0.5, 1.0)]
     data = study(law(series=WORDS, facet=LAMBDA), axes=axes, sweep={"seeds": 3})
 
     def error(frame):
         power = frame[LAMBDA] + 0.5 * (frame[WORDS] == "implicit")
         return frame[PERIOD] ** power * (1.0 + 0.5 * frame["seed"])
 
-    laws = accuracy_laws(made(data, motor__velocity_rmse=error))
+    laws = accuracy_laws(make_result(data, motor__velocity_rmse=error))
     assert [(fitted_law.series[WORDS], fitted_law.where[LAMBDA], round(fitted_law.slope, 6)) for fitted_law in laws] == [
         ("explicit", 0.5, 0.5), ("implicit", 0.5, 1.0), ("explicit", 1.0, 1.0), ("implicit", 1.0, 1.5),
     ]  # fmt: skip
@@ -144,7 +144,10 @@ def test_law_of_the_period_ends_at_the_floor_of_noise():
 
 def test_white_noise_that_the_period_still_averages_is_named():
     fitted_law = fit_only_law(
-        study(law(NOISE, POSITION, where={PERIOD: "least"}), axes=[listed(PERIOD, 1e-5, 4e-5), listed(NOISE, *NOISES)]),
+        study(
+            law(NOISE, POSITION, where={PERIOD: "least"}),
+            axes=[listed_axis(PERIOD, 1e-5, 4e-5), listed_axis(NOISE, *NOISES)],
+        ),
         motor__position_rmse=lambda f: np.hypot(0.1 * f[NOISE], 1.0 * f[NOISE] ** 0.75 * f[PERIOD] ** 0.5),
         motor__velocity_rmse=lambda f: 0.0 * f[NOISE],
     )
@@ -212,20 +215,22 @@ BAD = {
 def test_figures_that_cannot_be_fitted(case):
     figure, message = BAD[case]
     with pytest.raises(InputError) as error:
-        accuracy_laws(made(study(figure)))
+        accuracy_laws(make_result(study(figure)))
     assert str(error.value) == f"figures[0].{message}"
 
 
 def test_words_and_sampled_axes_in_where():
-    axes = [listed(PERIOD, *PERIODS), listed(WORDS, "explicit", "implicit")]
+    axes = [listed_axis(PERIOD, *PERIODS), listed_axis(WORDS, "explicit", "implicit")]
     data = study(law(where={WORDS: "implicit"}), axes=axes)
     fitted_law = fit_only_law(data, motor__velocity_rmse=lambda f: f[PERIOD] ** np.where(f[WORDS] == "implicit", 2.0, 1.0))
     assert fitted_law.slope == pytest.approx(2.0)
     with pytest.raises(InputError, match="has no value 'implict'; did you mean 'implicit'"):
-        accuracy_laws(made(study(law(where={WORDS: "implict"}), axes=axes)))
-    data = study(law(where={LAMBDA: 1.0}), axes=[axes[0], spaced(LAMBDA, 1.0, 2.0)], sweep={"design": "sobol", "points": 4})
+        accuracy_laws(make_result(study(law(where={WORDS: "implict"}), axes=axes)))
+    data = study(
+        law(where={LAMBDA: 1.0}), axes=[axes[0], spaced_axis(LAMBDA, 1.0, 2.0)], sweep={"design": "sobol", "points": 4}
+    )
     with pytest.raises(InputError, match="is sampled quasi-randomly and repeats no value"):
-        accuracy_laws(made(data))
+        accuracy_laws(make_result(data))
 
 
 WRONG = {
@@ -257,10 +262,10 @@ def test_wrong_keys_of_a_figure(case):
 def real():
     """The shipped study made small: one inertia with a cogging torque that the observer does not know."""
     axes = [
-        listed(WORDS, "explicit", "implicit"),
-        listed(PERIOD, 1e-4, 2.5e-4, 6.25e-4, 2e-3, zip="period"),
-        listed("run.substeps", 1, 1, 1, 2, zip="period"),
-        listed(NOISE, 0.0, 3e-5, 1e-4, 3e-4, 1e-3),
+        listed_axis(WORDS, "explicit", "implicit"),
+        listed_axis(PERIOD, 1e-4, 2.5e-4, 6.25e-4, 2e-3, zip="period"),
+        listed_axis("run.substeps", 1, 1, 1, 2, zip="period"),
+        listed_axis(NOISE, 0.0, 3e-5, 1e-4, 3e-4, 1e-3),
     ]
     figures = [
         law(value=POSITION, theory=2.0, series=WORDS, where={NOISE: 0.0}),
@@ -268,7 +273,7 @@ def real():
         law(NOISE, POSITION, 1.0, series=WORDS, where={PERIOD: "least"}),
         law(NOISE, VELOCITY, 0.5, series=WORDS, where={PERIOD: "least"}),
     ]
-    data = rigid(
+    data = rigid_study(
         {"run.duration": 4.0, "observer.motor.lambda": 8.0, "observer.motor.velocity_error": 0.0},
         axes=axes,
         figures=figures,

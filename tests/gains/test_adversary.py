@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from error_steps import stepped
+from error_steps import step_errors
 
 from jaxbl.gains import adversary
 from jaxbl.gains.adversary import explore_errors, search_violations
@@ -47,7 +47,7 @@ def test_the_way_that_is_found_leads_there(system):
     for noise, mean, moment, nominal in zip(*way, strict=True):
         assert abs(noise) <= system.noise
         assert abs(moment - 0.5 * mean) <= 0.25 * (1.0 - mean**2) + 1e-15
-        e, g, error = stepped(system, e, g, noise, mean, moment, system.push * nominal)
+        e, g, error = step_errors(system, e, g, noise, mean, moment, system.push * nominal)
         errors.append(float(error[0]))
     assert errors[-1] == pytest.approx(result.worst, rel=1e-9)
     assert result.state_count > 10
@@ -61,7 +61,7 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
     e, g, largest = np.zeros(1), np.zeros(1), 0.0
     for _ in range(5):
         count = len(choices)
-        e, g, error = stepped(
+        e, g, error = step_errors(
             system, np.repeat(e, count), np.repeat(g, count),
             *(np.tile(x, len(e)) for x in (system.noise * noise, mean, moment, system.push * nominal)),
         )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_study import ALPHA, LAMBDA, listed, rigid
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 
 from jaxbl.config import read_config, with_values
 from jaxbl.gains.below_bound import missing_acceleration, summarise_converged_below
@@ -10,10 +10,10 @@ from jaxbl.sweeps.sweep import sweep
 from jaxbl.sweeps.trial import run
 
 AMPLITUDE = "excitation.amplitude"
-AXES = [listed(AMPLITUDE, 0.1, 0.3), listed(LAMBDA, 1.5, 3.0), listed(ALPHA, 1.8, 1.95, 4.0)]
+AXES = [listed_axis(AMPLITUDE, 0.1, 0.3), listed_axis(LAMBDA, 1.5, 3.0), listed_axis(ALPHA, 1.8, 1.95, 4.0)]
 # friction that the observer does not know
 STUDY = read_config(
-    rigid(
+    rigid_study(
         {"observer.motor.velocity_error": 0.05, "encoders.noise": 0.0, "run.duration": 6.0, "run.sample_period": 1e-3},
         effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}],
         axes=AXES,

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 from differentiation_bound import least_worst_error
-from small_study import rigid
+from small_study import rigid_study
 
 import jaxbl
 from jaxbl.config import read_config
@@ -197,7 +197,7 @@ def study(**asked):
     changes = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
                "encoders.noise": 1e-5, "encoders.motor_resolution": 2e-5, "run.duration": 0.2}  # fmt: skip
     torque = [{"kind": "motor.constant_torque", "torque": 0.05}]
-    return rigid(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": asked}})
+    return rigid_study(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": asked}})
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differentiation_bound import least_worst_error
-from error_steps import stepped
+from error_steps import step_errors
 
 from jaxbl.errors import NoResult
 from jaxbl.gains.adversary import explore_errors
@@ -56,7 +56,7 @@ def test_image_holds_whatever_the_adversary_does(system):
     g = (k - rows.half_count + np.where(rng.random(n) < 0.3, rng.integers(0, 2, n), rng.random(n))) * rows.dg
     noise = system.noise * np.where(rng.random(n) < 0.5, np.sign(rng.normal(size=n)), rng.uniform(-1.0, 1.0, n))
     mean, moment = drawn_pushes(rng, n)
-    e, g, error = stepped(system, e, g, noise, mean, moment, system.push * np.sign(rng.normal(size=n)))
+    e, g, error = step_errors(system, e, g, noise, mean, moment, system.push * np.sign(rng.normal(size=n)))
     assert error.max() <= bound * (1.0 + 1e-12)
     # ends of rows belong to both
     row = np.floor(g / rows.dg).astype(int) + rows.half_count
@@ -95,7 +95,7 @@ def test_no_sequence_of_a_short_horizon_exceeds_the_bounds(system):
         for k in range(4 if system.push else 5):
             pairs = np.array(list(itertools.product(range(len(e)), range(len(choices)))))
             taken = choices[pairs[:, 1]]
-            new_e, new_g, error = stepped(
+            new_e, new_g, error = step_errors(
                 system, e[pairs[:, 0]], g[pairs[:, 0]], system.noise * taken[:, 0], *taken[:, 1:3].T,
                 system.push * taken[:, 3],
             )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_study import rigid
+from small_study import rigid_study
 
 from jaxbl.config import read_config
 from jaxbl.gains.marks import judge_marks
@@ -16,7 +16,7 @@ MARKS = [
 ]
 # friction that the observer does not know: 2 rad/s^2 where it slips, less where it sticks
 STUDY = read_config(
-    rigid(
+    rigid_study(
         {"observer.motor.velocity_error": 0.05, "encoders.noise": 0.0, "run.duration": 6.0, "run.sample_period": 1e-3},
         effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}],
         verify={"marks": MARKS},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tomli_w
 from scipy import stats
-from small_study import listed, rigid, small
+from small_study import listed_axis, rigid_study, small_study
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -26,7 +26,7 @@ def study(changes=None, **table):
     base = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5, "run.duration": 0.2}
     effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
     arguments = {"observers": KINDS, "trials": 32, "refine": 1} | table
-    return rigid(base | (changes or {}), effects=effects, tune=arguments, sweep={"seeds": 2})
+    return rigid_study(base | (changes or {}), effects=effects, tune=arguments, sweep={"seeds": 2})
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_the_search_agrees_with_brute_force(chosen):
     data.pop("tune")
     data["observer"] = {"kind": "luenberger", "motor": ranking["gains"] | {"velocity_error": 0.1}}
     axes = {"bandwidth": np.geomspace(1.0, 3e3, 32), "damping": np.geomspace(0.003, 10.0, 20)}
-    data["axes"] = [listed(f"observer.motor.{key}", *values) for key, values in axes.items()]
+    data["axes"] = [listed_axis(f"observer.motor.{key}", *values) for key, values in axes.items()]
     data["sweep"]["metrics"] = ["velocity_rmse"]
     frame = sweep(data).frame
     errors = frame.groupby(list(map("observer.motor.{}".format, axes)))["motor.velocity_rmse"].max()
@@ -97,7 +97,7 @@ def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
         data |= {"excitation": SINE, "sweep": {"seeds": 8, "first_seed": 2, "metrics": ["velocity_rmse"]}}
         data["observer"] = {"kind": kind, "motor": kind_data["gains"] | {"velocity_error": 0.1}}
         # lanes that differ are quickly compiled
-        data["axes"] = [listed("observer.motor.velocity_error", 0.1)]
+        data["axes"] = [listed_axis("observer.motor.velocity_error", 0.1)]
         errors = sweep(data).frame["motor.velocity_rmse"]
         assert kind_data["worst"] == pytest.approx(errors.max())
         logs[kind] = np.log(errors).mean()
@@ -124,7 +124,7 @@ def test_the_chosen_observer_can_be_included(chosen, tmp_path):
 
 def test_a_point_of_a_map_is_what_the_study_there_gives(tmp_path):
     """Also where the point is fixed at compile time; a finished search is only read."""
-    axes = [listed("run.sample_period", 1e-3, 2e-3), listed("encoders.noise", 1e-5, 1e-4)]
+    axes = [listed_axis("run.sample_period", 1e-3, 2e-3), listed_axis("encoders.noise", 1e-5, 1e-4)]
     table = {"observers": ["super_twisting", "kalman"], "trials": 8, "refine": 0}
     choice = tune(study(**table, axes=axes), tmp_path)
     assert [list(kind_data["values"].values()) for kind_data in choice.summary["points"]] == [
@@ -141,7 +141,9 @@ def test_a_point_of_a_map_is_what_the_study_there_gives(tmp_path):
 
 def test_the_low_pass_is_searched_with_the_torque_and_each_side_has_its_own():
     ranking = tune(
-        small(tune={"observers": ["super_twisting", "extended_state"], "objective": "torque", "trials": 8, "refine": 0})
+        small_study(
+            tune={"observers": ["super_twisting", "extended_state"], "objective": "torque", "trials": 8, "refine": 0}
+        )
     )
     sides = ranking.summary["points"][0]["sides"]
     constants = [sides[side]["kinds"]["extended_state"]["gains"]["equivalent_control.time_constant"] for side in sides]
@@ -193,19 +195,19 @@ def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
         ({"observers": ["kalman", "kalman"]}, r"observers\[1\]: 'kalman' is listed already"),
         ({"observers": ["kalman"], "margin_exact": 1.5}, r"margin_exact does not go with observers"),
         (
-            {"observers": ["kalman"], "axes": [listed("observer.motor.alpha", 1.0)]},
+            {"observers": ["kalman"], "axes": [listed_axis("observer.motor.alpha", 1.0)]},
             r"axes\[0\].path: 'observer.motor.alpha' is",
         ),
         (
             {"observers": ["kalman"], "axes": [{"path": "encoders.noise", "start": 0.0, "stop": 1.0}]},
             r"axes\[0\].num is missing",
         ),
-        ({"axes": [listed("encoders.noise", 1.0)]}, r"axes needs observers"),
+        ({"axes": [listed_axis("encoders.noise", 1.0)]}, r"axes needs observers"),
         ({"trials": 8}, r"trials needs observers"),
     ],
 )
 def test_wrong_tables_get_one_line(table, message):
-    arguments = rigid(tune=table)
+    arguments = rigid_study(tune=table)
     with pytest.raises(InputError, match=message) as caught:
         tune(arguments)
     assert "\n" not in str(caught.value)
@@ -213,4 +215,4 @@ def test_wrong_tables_get_one_line(table, message):
 
 def test_an_axis_over_no_path_names_the_nearest():
     with pytest.raises(InputError, match=r"axes\[0\]: unknown path 'encoders.nois'; nearest valid path: 'encoders.noise'"):
-        tune(study(axes=[listed("encoders.nois", 1e-5)]))
+        tune(study(axes=[listed_axis("encoders.nois", 1e-5)]))

@@ -2,7 +2,7 @@
 
 import pandas as pd
 import pytest
-from small_study import ALPHA, LAMBDA, listed, parts, rigid, thirty
+from small_study import ALPHA, LAMBDA, listed_axis, read_parts, rigid_study, thirty_run_study
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -13,7 +13,7 @@ from jaxbl.sweeps.sweep import sweep
 
 def stage(folder, changes=None, **options):
     """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
-    study = read_config(thirty(**(changes or {})))
+    study = read_config(thirty_run_study(**(changes or {})))
     with open_stages(study, "tune", folder, None, **options) as stages:
         manifest = dict(stages.manifest)
         stages.write_manifest(pilot=1.5)
@@ -39,16 +39,19 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
     stage(tmp_path)
     path = tmp_path / "tune" / "manifest.json"
     path.write_text(path.read_text().replace("1.5", "1.6"))
-    before = path.read_bytes(), parts(tmp_path / "tune" / "coarse")
+    before = path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")
     with pytest.raises(InputError, match=r"(belongs to|holds) another study"):
         stage(tmp_path, {"encoders": {"noise": 1e-3}})
     (tmp_path / "tune" / "table.parquet").unlink()
     with pytest.raises(InputError, match="holds another study"):
         stage(tmp_path, {"encoders": {"noise": 1e-3}})
-    assert (path.read_bytes(), parts(tmp_path / "tune" / "coarse")) == before
+    assert (path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")) == before
     assert sorted(path.name for path in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
     # of a command that is not there nobody can say whose it is
-    with pytest.raises(InputError, match="is damaged"), open_stages(read_config(thirty()), "verify", tmp_path, None):
+    with (
+        pytest.raises(InputError, match="is damaged"),
+        open_stages(read_config(thirty_run_study()), "verify", tmp_path, None),
+    ):
         pass
 
 
@@ -67,10 +70,10 @@ def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
     monkeypatch.setattr(
         programs, "_compile_fused", lambda *options, real=programs._compile_fused: compiled.append(options) or real(*options)
     )
-    axes = [[listed(ALPHA, *alphas), listed(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
+    axes = [[listed_axis(ALPHA, *alphas), listed_axis(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
     inertias = 0.05, 0.05, 0.06
     studies = [
-        rigid({"drive.motor_inertia": path}, axes=study_axes) for path, study_axes in zip(inertias, axes, strict=True)
+        rigid_study({"drive.motor_inertia": path}, axes=study_axes) for path, study_axes in zip(inertias, axes, strict=True)
     ]
     with open_stages(read_config(studies[0]), "tune", None, None, backend="fused") as stages:
         manifest = [stages.run(study, str(i)).frame for i, study in enumerate(studies)]

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from small_study import listed, rigid, small
+from small_study import listed_axis, rigid_study, small_study
 
 import jaxbl
 from jaxbl.config import read_config
@@ -28,7 +28,7 @@ def one_side(changes=None, **tables):
     study = {"effects": DISTURBED, "tune": TABLE, "sweep": {"seeds": 2}} | tables
     base = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
             "encoders.noise": 1e-5, "run.duration": 0.4}  # fmt: skip
-    return rigid(base | (changes or {}), **study)
+    return rigid_study(base | (changes or {}), **study)
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def test_optimum_agrees_with_brute_force_over_a_fine_grid(chosen):
     """A sweep of its own over 11 x 11 gains finds none that is feasible and much better."""
     bound = chosen.summary["f_plus"]["motor"]
     axes = [
-        listed("observer.motor.alpha", *(bound * np.geomspace(1.2, 20.0, 11))),
-        listed("observer.motor.lambda", *(math.sqrt(bound) * np.geomspace(0.5, 20.0, 11))),
+        listed_axis("observer.motor.alpha", *(bound * np.geomspace(1.2, 20.0, 11))),
+        listed_axis("observer.motor.lambda", *(math.sqrt(bound) * np.geomspace(0.5, 20.0, 11))),
     ]
     metrics = ["velocity_rmse", "converged", "margin_alpha", "margin_exact"]
     study = one_side(axes=axes, sweep={"seeds": 2, "metrics": metrics})
@@ -158,7 +158,7 @@ BOTH = {"num": 3, "refine": 1, "worst_over_uncertainty": True, "margin_exact": 1
 
 
 def test_both_sides_at_once_over_uncertain_drives_and_a_restart(tmp_path, monkeypatch):
-    study = small(
+    study = small_study(
         {"observer.motor.velocity_error": None, "run.velocity_tolerance": 5.0, "run.position_tolerance": 0.1,
          "uncertainty.relative": 0.1, "excitation.amplitude": 0.5},
         effects=[{"kind": "motor.inertia", "inertia": 0.001}],
@@ -344,7 +344,7 @@ BAD = {
         "tune.compare[0].load has no meaning on a rigid drive",
     ),
     "no load": (
-        small(tune={"compare": [{"name": "a", "motor": PAIR}]}),
+        small_study(tune={"compare": [{"name": "a", "motor": PAIR}]}),
         "tune.compare[0].load is missing",
     ),
     "kind of the holdout": (one_side(tune={"holdout": {"kind": "sinus"}}), "tune.holdout.kind: unknown kind 'sinus'; did"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
-from small_study import small
+from small_study import small_study
 
 from jaxbl.config import read_config
 from jaxbl.gains.under_tuned import (
@@ -212,7 +212,7 @@ TABLE_1 = {"motor": {"lambda": 0.005, "alpha": 1.8}, "load": {"lambda": 0.5, "al
 def test_gains_of_table_1_end_in_the_cycle_on_the_papers_drive_at_a_higher_frequency(amplitude, frequency):
     excitation = {"kind": "sine", "amplitude": amplitude, "frequency": frequency}
     timed = {"duration": 10.0, "sample_period": 1e-4}
-    study = read_config(small(encoders={}, observer=TABLE_1, excitation=excitation, run=timed))
+    study = read_config(small_study(encoders={}, observer=TABLE_1, excitation=excitation, run=timed))
     trace = run(study).trace
     part = trace[trace["t"] >= 10.0 - 8.0 / frequency]
     velocity, acceleration, torque = (part[name].to_numpy() for name in ("motor.velocity", "motor.acceleration", "u"))

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from shared_results import ATLAS, GAINS, INPUTS, VERIFIED
-from small_study import ALPHA, LAMBDA, listed, rigid
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -244,15 +244,15 @@ def test_another_studys_folder_is_left_as_it_is(verified):
     _, folder = verified
     before = contents(folder)
     with pytest.raises(InputError, match="holds another study"):
-        verify(rigid({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
+        verify(rigid_study({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
     assert contents(folder) == before
 
 
-AT_REST = rigid(
+AT_REST = rigid_study(
     {"encoders.noise": 0.0, "observer.motor.velocity_error": 0.0},
     excitation={"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
     effects=[{"kind": "motor.coulomb_friction", "torque": 0.2}],
-    axes=[listed(LAMBDA, 0.1, 6.0), listed(ALPHA, 0.5, 9.0)],
+    axes=[listed_axis(LAMBDA, 0.1, 6.0), listed_axis(ALPHA, 0.5, 9.0)],
     verify=ATLAS,
 )
 
@@ -295,14 +295,14 @@ def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
 @pytest.mark.parametrize("q", [-0.1, 0.0, 1.0, 1.5, float("nan")])
 def test_q_outside_of_its_range(q, tmp_path):
     with pytest.raises(InputError, match=r"^config: verify\.q: should be "):
-        verify(rigid(axes=GAINS, verify={"q": q}), tmp_path / "new")
+        verify(rigid_study(axes=GAINS, verify={"q": q}), tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("axes", [[], GAINS[:1], GAINS[1:], INPUTS])
 def test_a_study_without_gain_axes(axes, tmp_path):
     with pytest.raises(InputError, match=r"^axes: verify needs axes over both gains of an observer, such as"):
-        verify(rigid(axes=axes), tmp_path / "new")
+        verify(rigid_study(axes=axes), tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
@@ -310,28 +310,31 @@ def test_a_study_without_gain_axes(axes, tmp_path):
     ("study", "message"),
     [
         (
-            rigid(axes=[listed(LAMBDA, 1.0, 2.0, zip="g"), listed(ALPHA, 2.0, 3.0, zip="g")]),
+            rigid_study(axes=[listed_axis(LAMBDA, 1.0, 2.0, zip="g"), listed_axis(ALPHA, 2.0, 3.0, zip="g")]),
             r"axes\[0\]\.zip: verify seeks the least lambda",
         ),
         (
-            rigid(
+            rigid_study(
                 axes=[{"path": path, "start": 1.0, "stop": 9.0} for path in (LAMBDA, ALPHA)],
                 sweep={"design": "sobol", "points": 4},
             ),
             r"sweep\.design: .* whole grid; remove it",
         ),
         (
-            rigid(
+            rigid_study(
                 axes=[{"path": path, "start": 1.0, "stop": 9.0, "num": 3} for path in (LAMBDA, ALPHA)],
                 sweep={"refine": 1},
             ),
             r"sweep\.refine: .* whole grid; remove it",
         ),
         (
-            rigid(axes=GAINS, verify={"marks": [{"name": "m", "side": "load", "lambda": 1.0, "alpha": 2.0}]}),
+            rigid_study(axes=GAINS, verify={"marks": [{"name": "m", "side": "load", "lambda": 1.0, "alpha": 2.0}]}),
             r"verify\.marks\[0\]\.side: 'load' has no meaning on a rigid drive; it should be 'motor'",
         ),
-        (rigid(axes=GAINS, verify={"damping": [3000.0]}), r"verify\.damping\[0\]: should be less than or equal to 1000"),
+        (
+            rigid_study(axes=GAINS, verify={"damping": [3000.0]}),
+            r"verify\.damping\[0\]: should be less than or equal to 1000",
+        ),
     ],
     ids=["zipped lambda", "sobol", "refined", "load mark on a rigid drive", "damping"],
 )
@@ -342,7 +345,7 @@ def test_what_cannot_be_judged_is_refused_before_anything_runs(study, message, t
 
 
 def test_without_anything_unknown_there_is_nothing_to_check():
-    study = rigid({"drive.motor_viscous": 0.0, "encoders.noise": 0.0}, axes=GAINS, verify=ATLAS)
+    study = rigid_study({"drive.motor_viscous": 0.0, "encoders.noise": 0.0}, axes=GAINS, verify=ATLAS)
     with pytest.raises(InputError, match=r"motor: f⁺ = 0: "):
         verify(study)
 
@@ -361,7 +364,7 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verif
 
 
 def test_runs_repeated_for_their_cause_keep_their_noise():
-    study = read_config(rigid(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
+    study = read_config(rigid_study(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
     frame = sweep(study).frame
     rows = repeat_runs(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2}, Stages(study, "verify"), "again")
     keys = [LAMBDA, ALPHA, "seed"]

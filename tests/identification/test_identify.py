@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from hidden_log import simulate_study
 from measured import EMPS, XL330, read_stretch, real
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
@@ -47,7 +47,7 @@ def geared_study(changes=None, **tables):
         "identify": {"starts": 2, "window": 0.5},
         "observer": OBSERVER,
     } | tables
-    return small(SETTINGS | (changes or {}), **tables)
+    return small_study(SETTINGS | (changes or {}), **tables)
 
 
 NOMINAL = geared_study(
@@ -277,7 +277,7 @@ def test_a_direction_that_the_log_does_not_show_is_refused(tmp_path):
         {"kind": "load.gravity", "torque": 0.2, "phase": 0.3},
         {"kind": "actuator.gain_error", "relative": 0.0},
     ]
-    study = rigid({"run.duration": 2.0}, excitation=SWING, effects=effects, identify={"starts": 1, "window": 0.5})
+    study = rigid_study({"run.duration": 2.0}, excitation=SWING, effects=effects, identify={"starts": 1, "window": 0.5})
     summary = identify(write_log(simulate_study(study), tmp_path / "axis.csv"), study).summary
     (refusal,) = summary["refused"]
     torques = {"effects.motor.coulomb_friction.torque", "effects.load.gravity.torque"}
@@ -295,7 +295,9 @@ def test_a_direction_that_the_log_does_not_show_is_refused(tmp_path):
 
 
 def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart():
-    study = rigid({"run.duration": 2.0, "encoders.noise": 0.0}, excitation=SWING, identify={"starts": 4, "window": 0.5})
+    study = rigid_study(
+        {"run.duration": 2.0, "encoders.noise": 0.0}, excitation=SWING, identify={"starts": 4, "window": 0.5}
+    )
     trace, experiment = simulate_study(study), prepare(read_config(study))
     # an exact model: by its own integrator
     start = experiment.plant.init(experiment.initial)
@@ -310,7 +312,7 @@ def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart():
 
 def test_emps_agrees_with_what_was_published():
     """A real axis in closed loop, by a rigid model; values of Janot, Gautier, Brunot (2019)."""
-    study = rigid(
+    study = rigid_study(
         {"drive.motor_inertia": 80.0, "drive.motor_viscous": 150.0, "run.substeps": 2},
         effects=[{"kind": "motor.coulomb_friction", "torque": 15.0}, {"kind": "motor.constant_torque", "torque": 0.0}],
         log=EMPS,
@@ -338,7 +340,7 @@ def test_emps_agrees_with_what_was_published():
 
 def test_xl330_pendulum_swings_freely():
     """Gravity and friction from two free swings with uneven stamps; better than the published 0.018 rad rms."""
-    study = rigid(
+    study = rigid_study(
         {"drive.motor_inertia": 0.0049, "drive.motor_viscous": 0.005, "run.substeps": 2, "run.sample_period": 3.5e-3},
         effects=[{"kind": "load.gravity", "torque": 0.4}, {"kind": "motor.coulomb_friction", "torque": 0.02}],
         uncertainty={"exact": ["drive.motor_inertia"]},

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from small_study import rigid
+from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
@@ -33,7 +33,7 @@ def record(seed=0, size=0.2, drag=0.15):
 
 
 def fit_numbers(paths, windows):
-    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
+    experiment = prepare(read_config(rigid_study({"run.sample_period": PERIOD, "run.substeps": 1})))
     free = make_free_parameters(experiment, paths, 1.0)
     (result,) = fits(experiment, free, windows, np.zeros((1, len(free))))
     return experiment, free, result

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
-from small_study import rigid
+from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
@@ -48,7 +48,7 @@ def simulate_disturbed_mass(force, seed=0):
 
 
 def experiment_and_free():
-    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
+    experiment = prepare(read_config(rigid_study({"run.sample_period": PERIOD, "run.substeps": 1})))
     return experiment, make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
 
 

@@ -7,7 +7,7 @@ import pytest
 from filtered_derivatives import differentiate
 from measured import EMPS, real
 from scipy import signal
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
@@ -49,7 +49,7 @@ def test_balance_is_the_equations_of_motion():
         {"kind": "load.inertia", "inertia": 0.7},
         {"kind": "actuator.gain_error", "relative": 0.1},
     ]
-    experiment = prepare(read_config(small(transmission=LAW, effects=effects)))
+    experiment = prepare(read_config(small_study(transmission=LAW, effects=effects)))
     position, velocity, acceleration = motion((1.0, 0.2), (5.0, 4.0))
     u = jnp.cos(3.0 * T)
     result = balance(experiment, Kinematics(T, u, position, velocity, acceleration))
@@ -84,7 +84,7 @@ def test_balance_is_the_equations_of_motion():
 
 def test_a_lag_of_the_actuator_is_followed():
     effects = [{"kind": "actuator.lag", "time_constant": 0.05}]
-    experiment = prepare(read_config(rigid({"run.sample_period": 5e-4}, effects=effects)))
+    experiment = prepare(read_config(rigid_study({"run.sample_period": 5e-4}, effects=effects)))
     still = {"motor": jnp.zeros_like(T)}
     result = balance(experiment, Kinematics(T, jnp.ones_like(T), still, still, still, before=jnp.zeros(1)))
     np.testing.assert_allclose(result["motor"].residual, 1.0 - jnp.exp(-T / 0.05), atol=0.011)
@@ -116,7 +116,7 @@ def geared_record(noise, seed=0):
 def test_a_measured_torque_gives_stiffness_and_gap_directly():
     """No observer: torque over twist. The truth is a hard gap; 40 realisations of the noise."""
     t, load, z, c, random = geared_record(1e-4)
-    experiment = prepare(read_config(small(transmission=LAW | {"stiffness": 40.0, "half_gap": 0.06})))
+    experiment = prepare(read_config(small_study(transmission=LAW | {"stiffness": 40.0, "half_gap": 0.06})))
     free = make_free_parameters(experiment, ["transmission.stiffness", "transmission.half_gap"], 1.0)
     in_contact = np.abs(c) > 0.5
     hits = np.zeros(2)
@@ -137,7 +137,7 @@ def test_a_measured_torque_gives_stiffness_and_gap_directly():
 
 def test_emps_by_the_published_method_and_measure():
     """Values and errors of Janot, Gautier, Brunot (2019): 4.08 % on the estimation record, 5.4 % on the other."""
-    study = rigid(
+    study = rigid_study(
         {"drive.motor_inertia": 80.0, "drive.motor_viscous": 150.0, "run.sample_period": 1e-3},
         effects=[{"kind": "motor.coulomb_friction", "torque": 15.0}, {"kind": "motor.constant_torque", "torque": 0.0}],
         log=EMPS,

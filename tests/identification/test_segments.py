@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hidden.cases import Log
 from hidden.simulator import Machine, Run, simulate
-from hidden_log import GAP, GEARED, driven, model
+from hidden_log import GAP, GEARED, nominal_study, simulate_direct_drive
 from scipy.signal import lfilter
 
 from jaxbl.config import read_model
@@ -26,9 +26,9 @@ LAG = {"kind": "actuator.lag", "time_constant": 0.05}
 def setting(tmp_path_factory):
     t = 2e-3 * np.arange(2000)
     path = tmp_path_factory.mktemp("log") / "axis.csv"
-    driven(0.5 * np.sin(2.0 * np.pi * 1.3 * t), [LAG], 3e-5, 1).write(path)
+    simulate_direct_drive(0.5 * np.sin(2.0 * np.pi * 1.3 * t), [LAG], 3e-5, 1).write(path)
     record = read_record(path)
-    true = model(drive={"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}, effects=[LAG])
+    true = nominal_study(drive={"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}, effects=[LAG])
     experiment = on_record(read_model(true)[0], record)
     return record, experiment, segments_of(record, experiment.sides)
 
@@ -67,7 +67,7 @@ def test_effects_begin_with_what_the_inputs_before_left(setting):
     """A dead time and a lag along a part of an input act as along the whole of it."""
     record, _, _ = setting
     late = [{"kind": "actuator.delay", "delay": 0.0246}, {"kind": "actuator.lag", "time_constant": 0.05}]
-    experiment = on_record(read_model(model(effects=late))[0], record)
+    experiment = on_record(read_model(nominal_study(effects=late))[0], record)
     still = {"motor": np.zeros(200)}
     time, torque = record.time[:200], np.cos(30.0 * record.time[:200])
     states, acting = effect_path(experiment, Path(time, torque, still, still))
@@ -85,7 +85,7 @@ def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):
     torque = 5.0 * np.sin(2.0 * np.pi * 0.9 * 2e-3 * np.arange(2000))
     (trace,) = simulate([Run(Machine(GEARED, GAP, [LAG]), 2e-3, torque, motor_noise=1e-5, load_noise=2e-6, seed=1)])
     Log(trace.t, trace.u, trace.theta_e, trace.theta_s).write(tmp_path / "axis.csv")
-    config, _ = read_model(model(drive=GEARED, transmission=GAP, effects=[LAG]))
+    config, _ = read_model(nominal_study(drive=GEARED, transmission=GAP, effects=[LAG]))
     record = read_record(tmp_path / "axis.csv", gear_ratio=GEARED["gear_ratio"])
     experiment = on_record(config, record)
     segments = segments_of(record, experiment.sides)

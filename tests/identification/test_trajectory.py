@@ -11,7 +11,7 @@ import pytest
 from hidden.simulator import Machine, Run, simulate
 from hidden_log import GAP, GEARED
 from scipy.optimize import least_squares
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
@@ -39,7 +39,7 @@ LANES, WINDOWS, SAMPLES = 100, 4, 300
 def drive(substeps, period=PERIOD, **changes):
     law = {"law": "dead_zone", "stiffness": TRUE["transmission.stiffness"], "half_gap": TRUE["transmission.half_gap"]}
     settings = {"run.sample_period": period, "run.substeps": substeps, "run.duration": 50 * period}
-    return prepare(read_config(small(settings, transmission=law, **changes)))
+    return prepare(read_config(small_study(settings, transmission=law, **changes)))
 
 
 def simulate_motion(kind, samples, period=PERIOD):
@@ -150,7 +150,7 @@ def test_the_gap_at_1_khz():
 def test_scales_that_one_record_cannot_part_are_refused():
     """Torque gain, inertia and friction scaled alike give the same motion."""
     effects = [{"kind": "actuator.gain_error", "relative": 0.0}, {"kind": "motor.coulomb_friction", "torque": 0.01}]
-    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1}, effects=effects)))
+    experiment = prepare(read_config(rigid_study({"run.sample_period": PERIOD, "run.substeps": 1}, effects=effects)))
     t = PERIOD * np.arange(1000)
     torque = 0.1 * np.sin(9.0 * t) + 0.05 * np.sin(31.0 * t)
     state = experiment.plant.init(experiment.initial)
@@ -205,7 +205,7 @@ def test_residual_correlation_widens_intervals():
 def test_what_cannot_be_fitted(paths, message):
     law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
     with pytest.raises(InputError, match=message):
-        make_free_parameters(read_config(small(transmission=law)).build(), paths, 1.0)
+        make_free_parameters(read_config(small_study(transmission=law)).build(), paths, 1.0)
 
 
 def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():

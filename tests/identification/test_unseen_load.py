@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from hidden.cases import Log
 from hidden.simulator import Machine, Run, simulate
-from hidden_log import FRICTIONS, GAP, GEARED, geared
+from hidden_log import FRICTIONS, GAP, GEARED, simulate_geared_drive
 from typer.testing import CliRunner
 
 from jaxbl import cli
@@ -41,7 +41,7 @@ def motor_only(folder, log):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    return motor_only(tmp_path_factory.mktemp("log"), geared()[0])
+    return motor_only(tmp_path_factory.mktemp("log"), simulate_geared_drive()[0])
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_gap_and_friction_behind_the_gear_are_found(identification):
 
 
 def test_the_load_that_the_model_makes_of_it_is_the_true_one(identification):
-    log, _ = geared()
+    log, _ = simulate_geared_drive()
     # an angle that no channel holds: apart by a constant
     apart = identification.trace["load.modelled_position"].to_numpy() - log.theta_s
     assert np.std(apart[200:]) < 0.01 * np.std(log.theta_s)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from small_study import swung
+from small_study import multisine_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.simulate import Sample, initial_state, step, unit_noise
@@ -17,7 +17,7 @@ LAW = {"law": "dead_zone", "stiffness": STIFFNESS, "half_gap": HALF_GAP}
 def axis(duration=10.0, **tables):
     """A geared axis with a hard gap, as a mapping; gains above the bounds that its impacts ask for."""
     observer = {"motor": {"lambda": 60.0, "alpha": 2000.0}, "load": {"lambda": 6.0, "alpha": 60.0}}
-    return swung(duration, **{"transmission": LAW, "observer": observer} | tables)
+    return multisine_study(duration, **{"transmission": LAW, "observer": observer} | tables)
 
 
 def log_of(data, gaps, seed=0):

@@ -15,9 +15,9 @@ import pytest
 import tomli_w
 from command_server import start_command
 from growing import HALF_GAP, STIFFNESS, axis, log_of
-from hidden_log import FRICTIONS, GAP, geared
+from hidden_log import FRICTIONS, GAP, simulate_geared_drive
 from mcap_log import write_mcap
-from small_study import rigid, small, swung
+from small_study import multisine_study, rigid_study, small_study
 
 import jaxbl
 from jaxbl.cli import app, main
@@ -110,7 +110,9 @@ def test_a_gap_that_stays_raises_none(same):
 
 def test_the_paper_s_law_is_watched(tmp_path):
     """Its half gap is 4 j_0."""
-    data = swung(6.0, transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 40.0})
+    data = multisine_study(
+        6.0, transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 40.0}
+    )
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
     watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
     assert watch.summary["last"]["half_gap"] == pytest.approx(0.08, rel=0.02)
@@ -118,7 +120,7 @@ def test_the_paper_s_law_is_watched(tmp_path):
 
 
 def test_a_law_without_a_gap_has_its_stiffness_watched(tmp_path):
-    data = swung(6.0, transmission={"law": "linear_shaft", "stiffness": 60.0})
+    data = multisine_study(6.0, transmission={"law": "linear_shaft", "stiffness": 60.0})
     jaxbl.run(data).trace[["t", "u", "theta_e", "theta_s"]].to_csv(tmp_path / "log.csv", index=False)
     watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
     assert watch.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
@@ -305,7 +307,7 @@ def without(data, *tables):
 
 
 BAD = {
-    "no gap to watch": (rigid(), {}, "drive.kind rigid has no gap to watch"),
+    "no gap to watch": (rigid_study(), {}, "drive.kind rigid has no gap to watch"),
     "no gains": (without(axis(), "observer"), {}, r"\[observer.motor\] has no gains; jaxbl tune"),
     "window too short": (axis(), {"window": 0.1}, "window is 0.1 s; .* at least 0.5 s"),
     "window longer than the log": (axis(), {"window": 100.0}, "has 9.999 s, window is 100 s"),
@@ -313,7 +315,7 @@ BAD = {
     "limit": (axis(), {"alarm_gap": -1.0}, "alarm-gap is -1; it should be positive"),
     "values too often": (axis(), {"interval": 1e-4}, "every is 0.0001 s; it should be at least the sampling period"),
     "period": (
-        small({"run.sample_period": 2e-3}),
+        small_study({"run.sample_period": 2e-3}),
         {},
         r"samples are 1 ms apart, \[run\] sample_period of the model is 2 ms",
     ),
@@ -378,7 +380,7 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
 
 def test_a_drive_by_another_simulator(tmp_path):
     """One that shares nothing with the package: gap, stiffness and dry friction of both sides, which the model lacks."""
-    log, _ = geared()
+    log, _ = simulate_geared_drive()
     log.write(tmp_path / "log.csv")
     data = axis(4.0, transmission=GAP | {"half_gap": 0.06, "stiffness": 50.0})
     data["run"]["sample_period"] = 2e-3

@@ -6,7 +6,7 @@ import pytest
 from growing import HALF_GAP, STIFFNESS, axis
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
-from small_study import small
+from small_study import small_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.monitoring.live_chain import BLOCKS, LiveChain
@@ -133,7 +133,7 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
     assert again.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
 
 
-@pytest.mark.parametrize("data", [axis(), small()], ids=["dead_zone", "sigmoid_backlash"])
+@pytest.mark.parametrize("data", [axis(), small_study()], ids=["dead_zone", "sigmoid_backlash"])
 def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
     """Pieces have any length, also that of a block and one more."""
     experiment = prepare_window(data)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from paper_drive import paper
+from paper_drive import paper_experiment
 
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, ObserverState
 from jaxbl.simulate import Sample, initial_state, scan, step
@@ -135,7 +135,7 @@ def test_errors_grow_with_the_noise_as_theory_says(cls):
 
 @pytest.mark.parametrize("discretisation", ["explicit", "implicit"])
 def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(discretisation):
-    experiment = paper(discretisation, time_constant=0.01, noise=1e-4, start=0.2, steps=1000, velocity_error=0.5)
+    experiment = paper_experiment(discretisation, time_constant=0.01, noise=1e-4, start=0.2, steps=1000, velocity_error=0.5)
 
     def keep(state, signals):
         numbers = [
@@ -164,7 +164,7 @@ def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(dis
 
 
 def test_a_record_starts_from_its_first_positions_at_standstill():
-    experiment = paper(velocity_error=0.5)
+    experiment = paper_experiment(velocity_error=0.5)
     start = initial_state(experiment, {"motor": jnp.asarray(0.4), "load": jnp.asarray(0.08)})
     assert start.plant is None
     assert start.observer["motor"] == ObserverState(0.4, -0.5)

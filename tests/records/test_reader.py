@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
 from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, real, simulate_log
-from small_study import small
+from small_study import small_study
 
 from jaxbl.errors import InputError
 from jaxbl.records import LogTable, NominalDrive, join_records, read_log_table, read_record
@@ -41,7 +41,7 @@ def test_a_log_in_si_units_is_read_as_it_stands(tmp_path):
 
 def test_what_simulate_leaves_is_a_log(tmp_path):
     changes = {"run.duration": 1.0, "encoders.motor_resolution": 1e-4, "encoders.load_resolution": 1e-5}
-    trial = run(small(changes))
+    trial = run(small_study(changes))
     record = read_record(write_frame(tmp_path, trial.trace), trial.config.log, gear_ratio=5.0)
     np.testing.assert_array_equal(record.torque, trial.trace["u"])
     assert record.statistics.channels["theta_e"].resolution == pytest.approx(1e-4)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
 from jaxbl.report import aggregates
 from jaxbl.report.aggregates import Column, Groups, spread
@@ -64,7 +64,7 @@ def test_groups_are_those_of_pandas():
 
 def stored(folder, data, **columns):
     """A made-up study in parts."""
-    result = made(data, **columns)
+    result = make_result(data, **columns)
     engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"))
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):
@@ -83,7 +83,7 @@ FIGURES = [
     LINE | {"where": {LAMBDA: "least"}},
     LINE | {"where": {LAMBDA: "least", NOISE: 1e-4}, "theory": 0.5},
 ]
-GRID = [listed(NOISE, 1e-4, 1e-3), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 20.0, 5)]
+GRID = [listed_axis(NOISE, 1e-4, 1e-3), spaced_axis(ALPHA, 1.0, 100.0, 7), spaced_axis(LAMBDA, 1.0, 20.0, 5)]
 STUDIES = {
     "grid": {"axes": GRID, "sweep": {"seeds": 4, "chunk": 50}},
     "design": {"axes": [GRID[0], *({k: v for k, v in axis.items() if k != "num"} for axis in GRID[1:])],
@@ -111,7 +111,7 @@ def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
     figures = FIGURES if kind == "grid" else FIGURES[:3]
     result = stored(
         tmp_path / "study",
-        rigid(figures=figures, **STUDIES[kind]),
+        rigid_study(figures=figures, **STUDIES[kind]),
         motor__velocity_rmse=lambda frame: np.sqrt(frame[ALPHA]) * np.exp(rng.normal(size=len(frame))),
         motor__converged=lambda frame: frame[LAMBDA] > rng.uniform(0.0, 20.0, len(frame)),
         motor__f_plus=lambda frame: rng.uniform(1.0, 30.0, len(frame)),
@@ -135,7 +135,7 @@ def test_only_some_points_of_a_large_design_have_dots(monkeypatch):
     from jaxbl.report import maps
 
     monkeypatch.setattr(maps, "_MOST_DOTS", 64)
-    result = made(rigid(figures=FIGURES[:2], **STUDIES["design"]))
+    result = make_result(rigid_study(figures=FIGURES[:2], **STUDIES["design"]))
     for drawing in draw(result):
         # of 256 runs at 64 points
         assert drawing.caption.endswith("The first 16 points of the design are shown.")

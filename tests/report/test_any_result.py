@@ -3,7 +3,7 @@
 import inspect
 
 import pytest
-from small_study import ALPHA, LAMBDA, made, rigid, spaced
+from small_study import ALPHA, LAMBDA, make_result, rigid_study, spaced_axis
 
 import jaxbl
 from jaxbl.report import results
@@ -11,11 +11,11 @@ from jaxbl.report import results
 
 @pytest.fixture(scope="module")
 def study():
-    axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
+    axes = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
     figures = [
         {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": f"motor.{name}"} for name in ("chatter", "velocity_rmse")
     ]
-    return made(rigid(axes=axes, figures=figures))
+    return make_result(rigid_study(axes=axes, figures=figures))
 
 
 def test_a_notebook_shows_figures_with_captions_and_texts(study):

@@ -6,7 +6,7 @@ import json
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from small_study import listed, rigid
+from small_study import listed_axis, rigid_study
 from test_page import Page
 
 from jaxbl.gains.tune import tune
@@ -23,7 +23,7 @@ def chosen(*axes):
     effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
     table = {"observers": KINDS, "trials": 8, "refine": 0, "axes": list(axes)}
     changes = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5}
-    return tune(rigid(changes, title="a <b> choice", effects=effects, tune=table))
+    return tune(rigid_study(changes, title="a <b> choice", effects=effects, tune=table))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def point():
 
 @pytest.fixture(scope="module")
 def mapped():
-    return chosen(listed("encoders.noise", 1e-6, 1e-5, 1e-4), listed("encoders.motor_resolution", 0.0, 1e-4))
+    return chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4), listed_axis("encoders.motor_resolution", 0.0, 1e-4))
 
 
 @pytest.fixture(scope="module", params=["point", "mapped"])
@@ -107,7 +107,7 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped, tmp_path):
 
 
 def test_one_axis_is_drawn_as_lines(mapped):
-    line = chosen(listed("encoders.noise", 1e-6, 1e-5, 1e-4))
+    line = chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
     (drawn,) = draw_choice(line)
     (ax,) = drawn.figure.axes
     assert [point.get_label() for point in ax.lines] == KINDS

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from small_study import ALPHA, LAMBDA, listed, rigid, spaced
+from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, spaced_axis
 
 from jaxbl import cli
 from jaxbl.config import read_config
@@ -27,16 +27,16 @@ def called(monkeypatch, capsys):
     return run
 
 
-AXES = [spaced(ALPHA, 5.0, 20.0, 3), listed(LAMBDA, 4.0, 8.0)]
+AXES = [spaced_axis(ALPHA, 5.0, 20.0, 3), listed_axis(LAMBDA, 4.0, 8.0)]
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     """Two studies, of which the second moves further at more points."""
     place = tmp_path_factory.mktemp("studies")
-    more = [spaced(ALPHA, 5.0, 80.0, 5), AXES[1]]
+    more = [spaced_axis(ALPHA, 5.0, 80.0, 5), AXES[1]]
     for name, axes, amplitude in (("before", AXES, 0.1), ("after", more, 0.4)):
-        study = rigid({"excitation.amplitude": amplitude, "title": name}, axes=axes, sweep={"seeds": 4})
+        study = rigid_study({"excitation.amplitude": amplitude, "title": name}, axes=axes, sweep={"seeds": 4})
         sweep(read_config(study), place / name, backend="scan")
     return place
 

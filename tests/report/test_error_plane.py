@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_study import small
+from small_study import small_study
 
 from jaxbl.report.error_plane import draw_worst_planes, error_plane
 from jaxbl.sweeps.trial import run
@@ -10,7 +10,7 @@ from jaxbl.sweeps.trial import run
 
 def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5}
-    trial = run(small({"observer.motor": gains, "encoders.noise": 0.0, "run.duration": 1.0}))
+    trial = run(small_study({"observer.motor": gains, "encoders.noise": 0.0, "run.duration": 1.0}))
     motor = trial.summary["conditions"]["motor"]
     left, right = error_plane(trial.trace, "motor", motor).figure.axes
     error, majorant = left.get_lines()
@@ -32,7 +32,7 @@ def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
 )
 def test_why_there_is_no_majorant_is_said(changes, said):
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5} | changes
-    trial = run(small({"observer.motor": gains, "run.duration": 1.0}))
+    trial = run(small_study({"observer.motor": gains, "run.duration": 1.0}))
     drawn = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
     assert drawn.caption.endswith(said) and len(drawn.figure.axes[0].get_lines()) == 1
 

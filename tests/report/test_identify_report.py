@@ -7,9 +7,9 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import check, needs_chromium, opened
+from browser import check, needs_chromium, open_pages
 from matplotlib.figure import Figure
-from small_study import rigid, small
+from small_study import rigid_study, small_study
 
 from jaxbl.config import read_config
 from jaxbl.identification.identify import Identification
@@ -30,7 +30,7 @@ DEAD_ZONE = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 
 
 def geared(changes=None, **tables):
-    return small(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
+    return small_study(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
 
 
 def drawn_of(result):
@@ -116,8 +116,8 @@ CASES = {
                                 {"kind": "transmission.eccentricity", "amplitude": 0.01},
                                 {"kind": "motor.inertia", "inertia": 0.01},
                                 {"kind": "actuator.lag", "time_constant": 0.01}]), {}, GEARED),
-    "rigid": (rigid(SHORT | {"identifier.start": None}), {}, RIGID),
-    "linear": (rigid(SHORT | {"identifier.start": None}, effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}]),
+    "rigid": (rigid_study(SHORT | {"identifier.start": None}), {}, RIGID),
+    "linear": (rigid_study(SHORT | {"identifier.start": None}, effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}]),
                {"unit": "m"}, RIGID),
 }  # fmt: skip
 
@@ -169,7 +169,7 @@ def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
 @needs_chromium
 def test_the_page_in_a_browser(tmp_path):
     write_identification_report(make_identification(CASES["dead zone"][0], tmp_path), tmp_path)
-    with opened(tmp_path / "report.html") as (page,):
+    with open_pages(tmp_path / "report.html") as (page,):
         check(page, len(GEARED))
 
 

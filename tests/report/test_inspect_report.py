@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from browser import check, needs_chromium, opened
+from browser import check, needs_chromium, open_pages
 from measured import GEAR_RATIO, SERVO, real, simulate_log
 from test_page import Page
 
@@ -89,7 +89,7 @@ def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
 def test_the_page_in_a_browser(tmp_path):
     simulate_log(gap=0.1).to_parquet(tmp_path / "log.parquet")
     write_inspection_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
-    with opened(tmp_path / "report.html") as (page,):
+    with open_pages(tmp_path / "report.html") as (page,):
         check(page, 4)
 
 

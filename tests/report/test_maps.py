@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
-from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -16,7 +16,7 @@ from jaxbl.report.maps import draw
 from jaxbl.report.sweep import write_sweep_report
 
 RMSE = "motor.velocity_rmse"
-GAINS = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
+GAINS = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
 
 
 def heatmap(**keys):
@@ -33,7 +33,7 @@ def product(frame):
 
 def draw_only_figure(tmp_path, data, **columns):
     """The one figure of a study, drawn to the end."""
-    (drawing,) = draw(made(data, **columns))
+    (drawing,) = draw(make_result(data, **columns))
     assert save(drawing.figure, tmp_path / "a" / f"{drawing.name}.png").stat().st_size > 5000
     assert plt.get_fignums() == []  # nothing is left in pyplot's own list
     return drawing
@@ -54,7 +54,7 @@ def legend(drawing):
 
 
 def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
-    drawing = draw_only_figure(tmp_path, small(axes=GAINS, figures=[heatmap()]), motor__velocity_rmse=product)
+    drawing = draw_only_figure(tmp_path, small_study(axes=GAINS, figures=[heatmap()]), motor__velocity_rmse=product)
     (ax,) = panels(drawing)
     values, corners = mesh(ax).get_array(), mesh(ax).get_coordinates()
     alphas, lambdas = np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
@@ -72,7 +72,7 @@ def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
 
 
 def test_panels_share_one_colour_scale(tmp_path):
-    data = small(axes=[*GAINS, listed(NOISE, 1e-4, 1e-5)], figures=[heatmap(facet=NOISE)])
+    data = small_study(axes=[*GAINS, listed_axis(NOISE, 1e-4, 1e-5)], figures=[heatmap(facet=NOISE)])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame[NOISE] * 1e5)
     low, high = panels(drawing)
     assert low.get_title().startswith("encoders.noise = 1e-05 rad")
@@ -82,11 +82,11 @@ def test_panels_share_one_colour_scale(tmp_path):
 
 
 def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
-    data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap()])
+    data = small_study(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap()])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame["seed"] ** 3.0)
     assert (mesh(panels(drawing)[0]).get_array() == 8.0).all()
     assert drawing.caption.endswith("; median over 5 seeds.")
-    data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap(value="motor.converged")])
+    data = small_study(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap(value="motor.converged")])
     drawing = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame["seed"] < 2)
     np.testing.assert_allclose(mesh(panels(drawing)[0]).get_array(), 0.4)
     assert mesh(panels(drawing)[0]).get_clim() == (0.0, 1.0)
@@ -94,7 +94,7 @@ def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
 
 
 def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
-    data = small(axes=GAINS, figures=[heatmap(value="motor.dead_zone_error")])
+    data = small_study(axes=GAINS, figures=[heatmap(value="motor.dead_zone_error")])
     drawing = draw_only_figure(tmp_path, data, motor__dead_zone_error=lambda frame: -product(frame))
     assert mesh(panels(drawing)[0]).get_array().min() > 0.0
     assert drawing.caption.startswith("motor: |error of the dead zone|")
@@ -102,7 +102,7 @@ def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
 
 @pytest.mark.parametrize("value", [RMSE, "motor.converged"])
 def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
-    data = small(axes=GAINS, figures=[heatmap(value=value)])
+    data = small_study(axes=GAINS, figures=[heatmap(value=value)])
     columns = {"motor__velocity_rmse": product, "motor__converged": lambda frame: frame[ALPHA] < 0.0}
     drawing = draw_only_figure(tmp_path, data, finite=lambda frame: frame[ALPHA] < 40.0, **columns)
     (ax,) = panels(drawing)
@@ -113,7 +113,7 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
 
 
 def test_what_did_not_converge_is_hatched(tmp_path):
-    data = small(axes=GAINS, figures=[heatmap()])
+    data = small_study(axes=GAINS, figures=[heatmap()])
     none = draw_only_figure(tmp_path, data, motor__velocity_rmse=product)
     selection = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0
@@ -126,7 +126,7 @@ def test_what_did_not_converge_is_hatched(tmp_path):
 
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
-    data = small(axes=GAINS, figures=[heatmap(overlays=["davila_fridman", "seeber_horn", "exact"])])
+    data = small_study(axes=GAINS, figures=[heatmap(overlays=["davila_fridman", "seeber_horn", "exact"])])
     drawing = draw_only_figure(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
     (ax,) = panels(drawing)
     assert "f⁺ = 2 rad/s²" in ax.get_title()
@@ -138,25 +138,37 @@ def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
 
 
 ODD = {
-    "all NaN": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan}),
-    "all inf": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.inf}),
-    "all zero": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * 0.0}),
+    "all NaN": (small_study(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan}),
+    "all inf": (small_study(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.inf}),
+    "all zero": (small_study(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * 0.0}),
     "log of zeros": (
-        small(axes=GAINS, figures=[heatmap(scale="log")]),
+        small_study(axes=GAINS, figures=[heatmap(scale="log")]),
         {"motor__velocity_rmse": lambda frame: 1.0 * (frame[ALPHA] > 40.0)},
     ),
-    "one row": (small(axes=[GAINS[0], listed(LAMBDA, 3.0)], figures=[heatmap()]), {"motor__velocity_rmse": product}),
-    "one cell": (small(axes=[listed(ALPHA, 3.0), listed(LAMBDA, 0.0)], figures=[heatmap()]), {}),
+    "one row": (
+        small_study(axes=[GAINS[0], listed_axis(LAMBDA, 3.0)], figures=[heatmap()]),
+        {"motor__velocity_rmse": product},
+    ),
+    "one cell": (small_study(axes=[listed_axis(ALPHA, 3.0), listed_axis(LAMBDA, 0.0)], figures=[heatmap()]), {}),
     "bound above all gains": (
-        small(axes=GAINS, figures=[heatmap(overlays=["exact"])]),
+        small_study(axes=GAINS, figures=[heatmap(overlays=["exact"])]),
         {"motor__f_plus": lambda frame: 99.0 * frame[ALPHA]},
     ),
-    "no bound": (small(axes=GAINS, figures=[heatmap(overlays=["exact"])]), {"motor__f_plus": lambda f: f[ALPHA] * np.nan}),
-    "zipped": (small(axes=[listed(p, 1.0, 2.0, 4.0, zip="g") for p in (ALPHA, LAMBDA)], figures=[heatmap()]), {}),
-    "lines of NaN": (small(axes=GAINS, figures=[line()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan}),
-    "default of three axes": (small(axes=[listed(NOISE, 0.0, 1e-4), *GAINS]), {}),
-    "default of one": (rigid(axes=[listed("observer.discretisation", "implicit", "explicit"), GAINS[0]]), {}),
-    "seven panels": (small(axes=[*GAINS, spaced(NOISE, 1e-5, 1e-3, 7)], figures=[line(facet=NOISE, series=LAMBDA)]), {}),
+    "no bound": (
+        small_study(axes=GAINS, figures=[heatmap(overlays=["exact"])]),
+        {"motor__f_plus": lambda f: f[ALPHA] * np.nan},
+    ),
+    "zipped": (small_study(axes=[listed_axis(p, 1.0, 2.0, 4.0, zip="g") for p in (ALPHA, LAMBDA)], figures=[heatmap()]), {}),
+    "lines of NaN": (
+        small_study(axes=GAINS, figures=[line()]),
+        {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan},
+    ),
+    "default of three axes": (small_study(axes=[listed_axis(NOISE, 0.0, 1e-4), *GAINS]), {}),
+    "default of one": (rigid_study(axes=[listed_axis("observer.discretisation", "implicit", "explicit"), GAINS[0]]), {}),
+    "seven panels": (
+        small_study(axes=[*GAINS, spaced_axis(NOISE, 1e-5, 1e-3, 7)], figures=[line(facet=NOISE, series=LAMBDA)]),
+        {},
+    ),
 }
 
 
@@ -167,12 +179,12 @@ def test_odd_studies_are_drawn(tmp_path, case):
 
 
 def test_a_study_of_words_alone_has_no_default_figure():
-    assert draw(made(rigid(axes=[listed("observer.discretisation", "implicit", "explicit")]))) == []
+    assert draw(make_result(rigid_study(axes=[listed_axis("observer.discretisation", "implicit", "explicit")]))) == []
 
 
 def test_words_as_panels(tmp_path):
-    axes = [*GAINS, listed("observer.discretisation", "implicit", "explicit")]
-    drawing = draw_only_figure(tmp_path, rigid(axes=axes, figures=[heatmap(facet="observer.discretisation")]))
+    axes = [*GAINS, listed_axis("observer.discretisation", "implicit", "explicit")]
+    drawing = draw_only_figure(tmp_path, rigid_study(axes=axes, figures=[heatmap(facet="observer.discretisation")]))
     assert [ax.get_title().split("\n")[0] for ax in panels(drawing)] == [
         "observer.discretisation = explicit",
         "observer.discretisation = implicit",
@@ -180,11 +192,11 @@ def test_words_as_panels(tmp_path):
 
 
 def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
-    axes = [spaced(ALPHA, 1.0, 50.0), spaced(LAMBDA, 1.0, 20.0)]
+    axes = [spaced_axis(ALPHA, 1.0, 50.0), spaced_axis(LAMBDA, 1.0, 20.0)]
     sweep = {"design": "sobol", "points": 32}
     wild = {"finite": lambda frame: frame[ALPHA] < 10.0}
     drawing = draw_only_figure(
-        tmp_path, small(axes=axes, sweep=sweep, figures=[heatmap()]), motor__velocity_rmse=product, **wild
+        tmp_path, small_study(axes=axes, sweep=sweep, figures=[heatmap()]), motor__velocity_rmse=product, **wild
     )
     (ax,) = panels(drawing)
     (dots,) = (c for c in ax.collections if isinstance(c, PathCollection))
@@ -194,13 +206,13 @@ def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
     assert len(dots.get_offsets()) + len(ax.lines[0].get_xdata()) == 32
     assert legend(drawing) == [f"diverged ({len(ax.lines[0].get_xdata())} points)"]
     # over one of its axes a design has no line
-    drawing = draw_only_figure(tmp_path, small(axes=axes, sweep=sweep, figures=[line()]), motor__velocity_rmse=product)
+    drawing = draw_only_figure(tmp_path, small_study(axes=axes, sweep=sweep, figures=[line()]), motor__velocity_rmse=product)
     assert panels(drawing)[0].lines[0].get_linestyle() == "None"
     assert "median" not in drawing.caption
 
 
 def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
-    data = small(axes=GAINS, sweep={"seeds": 3}, figures=[line(series=LAMBDA)])
+    data = small_study(axes=GAINS, sweep={"seeds": 3}, figures=[line(series=LAMBDA)])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: product(frame) * (1.0 + frame["seed"]))
     (ax,) = panels(drawing)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 2.0 * np.geomspace(1.0, 50.0, 5))
@@ -213,15 +225,15 @@ def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
 
 
 def test_where_leaves_the_other_points_out(tmp_path):
-    data = rigid(axes=GAINS, figures=[line(where={LAMBDA: "largest"})])
+    data = rigid_study(axes=GAINS, figures=[line(where={LAMBDA: "largest"})])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product)
     np.testing.assert_allclose(panels(drawing)[0].lines[0].get_ydata(), 20.0 * np.geomspace(1.0, 50.0, 5))
     assert drawing.caption.endswith(f"over {ALPHA} where {LAMBDA} = 20 √rad/s.")
 
 
 def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
-    axes = [spaced(ALPHA, 1.0, 1e4, 9), listed(LAMBDA, 1.0, 2.0)]
-    data = rigid(axes=axes, figures=[line(series=LAMBDA, theory=1.0)])
+    axes = [spaced_axis(ALPHA, 1.0, 1e4, 9), listed_axis(LAMBDA, 1.0, 2.0)]
+    data = rigid_study(axes=axes, figures=[line(series=LAMBDA, theory=1.0)])
     drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * np.maximum(f[ALPHA], 30.0), 0.0)
     )
@@ -238,7 +250,7 @@ def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
     assert ax.get_legend().get_title().get_text() == "slope (theory 1, dashed)"
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     # one panel a value, and nothing to draw in one of them
-    data = rigid(axes=axes, figures=[line(facet=LAMBDA, theory=1.0)])
+    data = rigid_study(axes=axes, figures=[line(facet=LAMBDA, theory=1.0)])
     drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0)
     )
@@ -247,7 +259,7 @@ def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
 
 
 def test_figures_of_one_metric_get_names_of_their_own():
-    names = [d.name for d in draw(made(small(axes=GAINS, figures=[heatmap(), line(), line(series=LAMBDA)])))]
+    names = [d.name for d in draw(make_result(small_study(axes=GAINS, figures=[heatmap(), line(), line(series=LAMBDA)])))]
     assert names == ["heatmap_motor_velocity_rmse", "line_motor_velocity_rmse", "line_motor_velocity_rmse-2"]
 
 
@@ -272,7 +284,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_figure_of_what_is_not_there(case):
     figure, message = BAD[case]
-    result = made(rigid(axes=[*GAINS, listed(WORDS, "implicit", "explicit")], figures=[figure]))
+    result = make_result(rigid_study(axes=[*GAINS, listed_axis(WORDS, "implicit", "explicit")], figures=[figure]))
     with pytest.raises(InputError) as error:
         draw(result)
     assert message in str(error.value)
@@ -282,14 +294,14 @@ def test_figure_of_what_is_not_there(case):
     ("figure", "key", "part"), [(heatmap, "facet", "panel"), (line, "facet", "panel"), (line, "series", "line")]
 )
 def test_more_parts_than_a_figure_can_have(figure, key, part):
-    axes = [*GAINS, spaced(NOISE, 1e-6, 1e-3, 61)]
+    axes = [*GAINS, spaced_axis(NOISE, 1e-6, 1e-3, 61)]
     with pytest.raises(InputError) as error:
-        draw(made(rigid(axes=axes, figures=[figure(**{key: NOISE})])))
+        draw(make_result(rigid_study(axes=axes, figures=[figure(**{key: NOISE})])))
     output = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
     output += "can be drawn; name another axis, or give it fewer values"
     assert str(error.value) == output
     # a study that asks for no figures gets one all the same
-    (drawing,) = draw(made(rigid(axes=axes[::-1])))
+    (drawing,) = draw(make_result(rigid_study(axes=axes[::-1])))
     assert drawing.caption.endswith(f"median over {NOISE}.")
 
 
@@ -309,13 +321,13 @@ def test_more_parts_than_a_figure_can_have(figure, key, part):
 )
 def test_figure_of_what_the_study_does_not_compute(figure, message):
     with pytest.raises(InputError) as error:
-        draw(made(rigid(axes=GAINS, figures=[figure], sweep={"metrics": ["chatter"]})))
+        draw(make_result(rigid_study(axes=GAINS, figures=[figure], sweep={"metrics": ["chatter"]})))
     assert message in str(error.value)
 
 
 @pytest.mark.parametrize("metrics", [["chatter"], ["converged"], ["convergence_time", "margin_exact"]])
 def test_default_figure_and_report_of_some_metrics(tmp_path, metrics):
-    result = made(rigid(axes=GAINS, sweep={"metrics": metrics}))
+    result = make_result(rigid_study(axes=GAINS, sweep={"metrics": metrics}))
     (drawing,) = draw(result)
     assert drawing.name == f"heatmap_motor_{metrics[0]}"
     (line,) = write_sweep_report(result, tmp_path)
@@ -323,6 +335,6 @@ def test_default_figure_and_report_of_some_metrics(tmp_path, metrics):
 
 
 def test_figures_of_a_study_without_axes():
-    config = read_config(rigid(figures=[line()]))
+    config = read_config(rigid_study(figures=[line()]))
     with pytest.raises(InputError, match="the study has no axes"):
         check_figures(config, config.figures, [RMSE])

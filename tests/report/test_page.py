@@ -8,8 +8,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pandas as pd
 import pytest
-from browser import check, needs_chromium, opened
-from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
+from browser import check, needs_chromium, open_pages
+from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
@@ -86,12 +86,14 @@ def test_the_command_is_said_where_it_was_one(words, said, monkeypatch):
 
 def test_page_of_a_sweep(tmp_path):
     axes = [
-        spaced(ALPHA, 1.0, 50.0, 5),
-        spaced(LAMBDA, 1.0, 20.0, 4),
-        listed("observer.discretisation", "implicit", "explicit"),
+        spaced_axis(ALPHA, 1.0, 50.0, 5),
+        spaced_axis(LAMBDA, 1.0, 20.0, 4),
+        listed_axis("observer.discretisation", "implicit", "explicit"),
     ]
-    data = rigid({"title": "a <b> c", "notes": ["first remark"]}, axes=axes)
-    result = made(data, motor__velocity_rmse=lambda frame: frame[ALPHA], motor__converged=lambda frame: frame[ALPHA] > 2.0)
+    data = rigid_study({"title": "a <b> c", "notes": ["first remark"]}, axes=axes)
+    result = make_result(
+        data, motor__velocity_rmse=lambda frame: frame[ALPHA], motor__converged=lambda frame: frame[ALPHA] > 2.0
+    )
     lead = write_sweep_report(result, tmp_path)
     assert lead == [
         "40 runs. The observers converged in 80.0 % (motor) of them.",
@@ -105,7 +107,7 @@ def test_page_of_a_sweep(tmp_path):
 
 
 def test_page_of_a_run_and_its_files(tmp_path):
-    trial = run(small({"title": HOSTILE, "notes": [HOSTILE], "identifier.start": 10.0}))
+    trial = run(small_study({"title": HOSTILE, "notes": [HOSTILE], "identifier.start": 10.0}))
     lines = write_trial_report(trial, tmp_path)
     assert "stiffness: undetermined (motor), undetermined (load); true 1" in lines
     assert sorted(path.name for path in tmp_path.iterdir()) == ["figures", "report.html", "summary.json", "trace.parquet"]
@@ -122,11 +124,11 @@ def test_page_of_a_run_and_its_files(tmp_path):
 @needs_chromium
 @pytest.mark.usefixtures("every_figure_drawn")
 def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
-    axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
-    result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
+    axes = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
+    result = make_result(rigid_study(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
     long = NextStep(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
     write_sweep_report(result, tmp_path, [long])
-    with opened(tmp_path / "report.html", color_scheme="dark") as (page,):
+    with open_pages(tmp_path / "report.html", color_scheme="dark") as (page,):
         check(page, 1)
         view, values = page.locator(".view"), page.locator(".values")
         panel = json.loads(page.locator("figure script").text_content())[0]
@@ -181,7 +183,7 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
     table = PageTable(names[1], names, [names, names])
     text = html(names[2], names, names, [(names[0], picture)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
-    with opened(tmp_path / "page.html") as (page,):
+    with open_pages(tmp_path / "page.html") as (page,):
         check(page, 2)
         page.locator(".view").first.hover()
         for name in names[:3]:
@@ -200,10 +202,10 @@ GONE = {
 def test_pages_of_studies_that_nobody_expects(tmp_path):
     """Markup and letters from right to left in texts, ten thousand values of an axis, nothing but runs that diverged."""
     title = f"{HOSTILE} $\\frac{{$ {{0}} %s \u202e"
-    lambdas = spaced(LAMBDA, 1.0, 20.0, 2)
-    many = spaced(ALPHA, 1.0, 50.0, 10_000)
+    lambdas = spaced_axis(LAMBDA, 1.0, 20.0, 2)
+    many = spaced_axis(ALPHA, 1.0, 50.0, 10_000)
     figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse", "overlays": ["exact"]}
-    few = {"axes": [spaced(ALPHA, 1.0, 50.0, 5), lambdas], "figures": [figure]}
+    few = {"axes": [spaced_axis(ALPHA, 1.0, 50.0, 5), lambdas], "figures": [figure]}
     rising = {"motor__velocity_rmse": lambda frame: frame[ALPHA]}
     studies = {
         "texts": (few | {"title": title, "notes": [title] * 2}, rising),
@@ -212,8 +214,8 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
     }
     for name, (data, columns) in studies.items():
         (tmp_path / name).mkdir()
-        write_sweep_report(made(rigid(**data), **columns), tmp_path / name)
-    with opened(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
+        write_sweep_report(make_result(rigid_study(**data), **columns), tmp_path / name)
+    with open_pages(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
         for page in pages:
             check(page, 1)
         shown = dict(zip(studies, pages, strict=True))

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.collections import QuadMesh
-from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.report.figures import save
@@ -18,13 +18,13 @@ from jaxbl.sweeps.refine import refine_boundary
 from jaxbl.sweeps.sweep import StudyResult
 
 RMSE = "motor.velocity_rmse"
-GAINS = [spaced(LAMBDA, 1.0, 16.0, 5), spaced(ALPHA, 1.0, 9.0, 5, "linear")]
+GAINS = [spaced_axis(LAMBDA, 1.0, 16.0, 5), spaced_axis(ALPHA, 1.0, 9.0, 5, "linear")]
 MAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE}
 
 
 def make_refined_study(function, *axes, figures=(MAP,), depth=3, seeds=1):
     """A refined study without runs: `function` of a frame of points says what converges; the error is lambda."""
-    config = read_config(rigid(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
+    config = read_config(rigid_study(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
     points = Points(config)
 
     def rows(vertices):
@@ -91,7 +91,7 @@ def test_only_what_was_simulated_is_counted_as_missing():
 
 
 def test_panels_medians_and_lines_over_what_is_not_drawn():
-    noise = listed(NOISE, 0.0, 1e-4, 1e-3)
+    noise = listed_axis(NOISE, 0.0, 1e-4, 1e-3)
 
     def shrinking(frame):
         return disc(frame) & (frame[ALPHA] < 7.0 - 2000.0 * frame[NOISE])

@@ -8,10 +8,10 @@ import tomllib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from browser import check, needs_chromium, opened
+from browser import check, needs_chromium, open_pages
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm, to_rgb
-from small_study import small
+from small_study import small_study
 from test_page import Page, place
 
 from jaxbl.config import read_config
@@ -22,7 +22,7 @@ from jaxbl.report.tune import draw_tuning, tune_headline, write_tune_report
 from jaxbl.sweeps.trial import run
 
 SLOW = {"lambda": 1e-3, "alpha": 0.05}
-STUDY = small(
+STUDY = small_study(
     {"title": "two <b> sides", "run.velocity_tolerance": 0.2, "run.position_tolerance": 0.1, "excitation.amplitude": 0.5},
     tune={"num": 4, "refine": 1, "alpha_ratio": {"stop": 20.0}, "lambda_ratio": {"stop": 20.0},
           "compare": [{"name": "slow", "motor": SLOW, "load": SLOW}]},
@@ -49,7 +49,7 @@ def test_gains_can_be_included_and_run(folder, tuning):
     }
     assert "# Objective: worst velocity_rmse (rad/s) over seeds and scenarios; 1 noise seed and 1 drive." in text
     assert "two <b> sides" in text
-    study = small({"include": str(folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
+    study = small_study({"include": str(folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
     config = read_config(study)
     for side, gains in tuning.summary["gains"].items():
         observer = getattr(config.observer, side)
@@ -170,7 +170,7 @@ def test_comparison_draws_what_the_numbers_say(tuning):
 
 @needs_chromium
 def test_bars_have_the_names_beside_them(folder, tuning):
-    with opened(folder / "report.html") as (page,):
+    with open_pages(folder / "report.html") as (page,):
         check(page, 7)
         figure = page.locator("figure[data-name=tuning_holdout]")
         panel = json.loads(figure.locator("script").text_content())[0]

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import tomli_w
-from browser import check, needs_chromium, opened
+from browser import check, needs_chromium, open_pages
 from shared_results import VERIFIED
 
 from jaxbl.report.verify import draw_verdict, write_verify_report
@@ -90,7 +90,7 @@ def test_tuning_rules_in_figure_page_and_lines(checked):
 
 @needs_chromium
 def test_the_page_in_a_browser(checked):
-    with opened(checked[1] / "report.html") as (page,):
+    with open_pages(checked[1] / "report.html") as (page,):
         check(page, 7)
 
 

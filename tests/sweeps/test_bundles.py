@@ -9,7 +9,7 @@ import jax
 import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
-from small_study import ALPHA, LAMBDA, parts, spaced, thirty
+from small_study import ALPHA, LAMBDA, read_parts, spaced_axis, thirty_run_study
 
 from jaxbl import cluster
 from jaxbl.cluster import Cluster, connect
@@ -28,13 +28,13 @@ _submit = Cluster._submit
 
 
 def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path, client, computed):
-    alone = sweep(thirty(), tmp_path / "alone")
+    alone = sweep(thirty_run_study(), tmp_path / "alone")
     count = len(computed)
     computed.clear()
     calls = []
-    result = sweep(thirty(), tmp_path / "cluster", scheduler=client, progress=lambda *done: calls.append(done))
+    result = sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client, progress=lambda *done: calls.append(done))
     assert sorted(computed) == list(range(count)) and count == 8
-    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
     assert result.cost["lanes"] == 30 and result.cost["run_seconds"] > 0.0
     assert calls[-1] == (30, 30) and calls == sorted(calls)
@@ -43,23 +43,23 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
     lost.unlink()
     computed.clear()
     # the last points of the first seed
-    assert sweep(thirty(), tmp_path / "cluster", scheduler=client).cost["lanes"] == 3
+    assert sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client).cost["lanes"] == 3
     assert computed == [3]
-    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     # what is damaged is told by whom it was found
     lost.write_bytes(lost.read_bytes()[:-100])
-    assert len(sweep(thirty(), tmp_path / "cluster", scheduler=client).damaged) == 1
-    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    assert len(sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client).damaged) == 1
+    assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     assert not list(tmp_path.rglob(".*"))
 
 
 def test_processes_of_this_machine_give_the_same_table(tmp_path):
     lanes = {"seeds": 2, "metrics": ["velocity_rmse"]}
-    data = thirty(sweep=lanes | {"chunk": 4})
+    data = thirty_run_study(sweep=lanes | {"chunk": 4})
     sweep(data, tmp_path / "alone")
-    full_frame = sweep(thirty(sweep=lanes | {"chunk": 256}), tmp_path / "whole", devices=jax.devices()[:1]).frame
+    full_frame = sweep(thirty_run_study(sweep=lanes | {"chunk": 256}), tmp_path / "whole", devices=jax.devices()[:1]).frame
     study = sweep(data, tmp_path / "study", scheduler="local:2")
-    assert parts(tmp_path / "study") == parts(tmp_path / "alone")
+    assert read_parts(tmp_path / "study") == read_parts(tmp_path / "alone")
     # in other chunks, on one device
     points = [ALPHA, LAMBDA, "seed"]
     frames = [frame.sort_values(points, ignore_index=True) for frame in (study.frame, full_frame)]
@@ -70,17 +70,17 @@ def test_workers_of_a_client_that_was_lost_are_waited_for(tmp_path, client):
     with ExitStack() as held:
         held.enter_context(lock_folder(tmp_path / "study", shared=True))
         with pytest.raises(FolderInUse):
-            sweep(thirty(), tmp_path / "study")
+            sweep(thirty_run_study(), tmp_path / "study")
         Timer(1.0, held.pop_all().close).start()
-        assert sweep(thirty(), tmp_path / "study", scheduler=client).cost["lanes"] == 30
+        assert sweep(thirty_run_study(), tmp_path / "study", scheduler=client).cost["lanes"] == 30
 
 
 def test_a_refined_study_on_a_cluster(tmp_path, client):
-    axes = [spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)]
-    changed = thirty(axes=axes, sweep={"seeds": 2, "chunk": 16, "refine": 2})
+    axes = [spaced_axis(ALPHA, 5.0, 20.0, 9), spaced_axis(LAMBDA, 0.3, 5.0, 9)]
+    changed = thirty_run_study(axes=axes, sweep={"seeds": 2, "chunk": 16, "refine": 2})
     alone = sweep(changed, tmp_path / "alone")
     sweep(changed, tmp_path / "cluster", scheduler=client)
-    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     # grids of 9 x 9 and 33 x 33
     assert 2 * 9**2 < len(alone.frame) < 2 * 33**2
 
@@ -88,9 +88,9 @@ def test_a_refined_study_on_a_cluster(tmp_path, client):
 def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monkeypatch):
     submitted = []
     monkeypatch.setattr(Cluster, "_submit", lambda self, *inputs: submitted.append(inputs) or _submit(self, *inputs))
-    with open_stages(read_config(thirty()), "verify", tmp_path, client) as stages:
+    with open_stages(read_config(thirty_run_study()), "verify", tmp_path, client) as stages:
         stages.write_manifest()
-        assert len(stages.run(thirty(), "drive").frame) == 30
+        assert len(stages.run(thirty_run_study(), "drive").frame) == 30
         assert stages.cost["lanes"] == 30 and len(computed) == 8
     # the first chunk a worker, then the rest
     assert sum(len(jobs) for _, jobs in submitted) == 8
@@ -99,17 +99,17 @@ def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monk
 
 def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client, computed):
     folder = tmp_path / "study"
-    first = submit(thirty(), folder, client)
+    first = submit(thirty_run_study(), folder, client)
     assert first.parts_in_all == 8 and not first.finished
     latest = time.monotonic() + 60.0
     while not status(folder).complete and time.monotonic() < latest:
         time.sleep(0.1)
     assert sorted(computed) == list(range(8))
     assert not status(folder).finished
-    assert sweep(thirty(), folder).cost["lanes"] == 0
+    assert sweep(thirty_run_study(), folder).cost["lanes"] == 0
     assert status(folder).finished
     # nothing is left to be done
-    assert submit(thirty(), folder, client).complete
+    assert submit(thirty_run_study(), folder, client).complete
     assert sorted(computed) == list(range(8))
 
 
@@ -123,15 +123,17 @@ def test_bundles_take_workers_long_enough_and_are_not_too_many():
 
 def test_bad_input(tmp_path, client, monkeypatch):
     with pytest.raises(InputError, match="--scheduler local:none: local:N needs the number of processes"):
-        sweep(thirty(), tmp_path / "a", scheduler="local:none")
+        sweep(thirty_run_study(), tmp_path / "a", scheduler="local:none")
     monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
     with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:1: no Dask scheduler answers there"):
-        sweep(thirty(), tmp_path / "a", scheduler="tcp://127.0.0.1:1")
+        sweep(thirty_run_study(), tmp_path / "a", scheduler="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="its workers write into a folder; name it with --out"):
-        sweep(thirty(), scheduler=client)
+        sweep(thirty_run_study(), scheduler=client)
     with pytest.raises(InputError, match="--detach: needs the --scheduler of a cluster that stays"):
-        submit(thirty(), tmp_path / "a", None)
-    refined = thirty(axes=[spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2})
+        submit(thirty_run_study(), tmp_path / "a", None)
+    refined = thirty_run_study(
+        axes=[spaced_axis(ALPHA, 5.0, 20.0, 9), spaced_axis(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2}
+    )
     with pytest.raises(InputError, match=r"--detach: sweep.refine makes points depend on one another"):
         submit(refined, tmp_path / "a", client)
     assert not (tmp_path / "a").exists()

@@ -5,18 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy import stats
-from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
 from jaxbl.report.compare import comparison_lines, draw_comparison
 from jaxbl.sweeps.compare import compare
 
 RMSE = "motor.velocity_rmse"
-GAINS = [spaced(ALPHA, 1.0, 16.0, 5), spaced(LAMBDA, 1.0, 8.0, 20)]
+GAINS = [spaced_axis(ALPHA, 1.0, 16.0, 5), spaced_axis(LAMBDA, 1.0, 8.0, 20)]
 
 
 def study(*axes, function=lambda frame: frame[ALPHA], seeds=6, changes=None, **columns):
     """A study whose error is a function of its points and seeds."""
-    return made(rigid(changes, axes=list(axes or GAINS), sweep={"seeds": seeds}), motor__velocity_rmse=function, **columns)
+    return make_result(
+        rigid_study(changes, axes=list(axes or GAINS), sweep={"seeds": seeds}), motor__velocity_rmse=function, **columns
+    )
 
 
 def noisy(shift=lambda frame: 0.0, spread=0.1, seed=0, more=0.01):
@@ -51,7 +53,9 @@ def test_points_beyond_noise_are_named_with_their_place_and_direction():
     frame = compare(first, second).frame(RMSE)
     assert (frame["differs"] == (frame[ALPHA] > 5.0)).all()
     # without pairs this noise hides the change
-    later = made(first.config.to_dict() | {"sweep": {"seeds": 6, "first_seed": 50}}, motor__velocity_rmse=noisy(far, seed=2))
+    later = make_result(
+        first.config.to_dict() | {"sweep": {"seeds": 6, "first_seed": 50}}, motor__velocity_rmse=noisy(far, seed=2)
+    )
     later.source["seed"] += 50
     apart = compare(first, later)
     assert (apart.seeds, apart.paired) == (0, False)
@@ -102,7 +106,10 @@ def test_one_seed_tells_no_noise():
 
 
 def test_different_grids_are_compared_where_both_have_points():
-    other = [spaced(ALPHA, 1.0, 4096.0, 13), listed(LAMBDA, *(np.geomspace(1.0, 8.0, 20)[::2] * (1.0 + 1e-12)).tolist())]
+    other = [
+        spaced_axis(ALPHA, 1.0, 4096.0, 13),
+        listed_axis(LAMBDA, *(np.geomspace(1.0, 8.0, 20)[::2] * (1.0 + 1e-12)).tolist()),
+    ]
     comparison = compare(study(function=noisy()), study(*other, function=noisy(far, seed=2), seeds=9))
     assert comparison.points == (50, 50, 80)
     assert (comparison.seeds, comparison.paired) == (6, True)
@@ -111,14 +118,14 @@ def test_different_grids_are_compared_where_both_have_points():
 
 
 def test_an_axis_of_one_study_is_compared_at_the_others_value():
-    several = study(*GAINS, listed(NOISE, 1e-3, 1e-4, 0.0), function=lambda frame: frame[ALPHA] * (1.0 + frame[NOISE]))
+    several = study(*GAINS, listed_axis(NOISE, 1e-3, 1e-4, 0.0), function=lambda frame: frame[ALPHA] * (1.0 + frame[NOISE]))
     comparison = compare(study(function=lambda frame: frame[ALPHA] * (1.0 + 1e-4)), several)
     assert comparison.points == (100, 0, 200)
     assert next(m for m in comparison.metrics if m.metric == RMSE).changed == 0
     # and where the other does not have the number at all
-    word = listed("effects.motor.coulomb_friction.torque", 0.0, 0.1)
-    with_effect = rigid(axes=[*GAINS, word], effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}])
-    comparison = compare(study(), made(with_effect))
+    word = listed_axis("effects.motor.coulomb_friction.torque", 0.0, 0.1)
+    with_effect = rigid_study(axes=[*GAINS, word], effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}])
+    comparison = compare(study(), make_result(with_effect))
     assert comparison.points == (0, 100, 200)
     assert comparison.metrics == ()
     assert "No point is in both: no metric is compared." in comparison_lines(comparison)
@@ -127,7 +134,9 @@ def test_an_axis_of_one_study_is_compared_at_the_others_value():
 def test_config_by_keys_with_what_decides_nothing_left_out():
     effects = [{"kind": "motor.coulomb_friction", "torque": 0.1}, {"kind": "encoder.delay", "time": 1e-3}]
     first = study(changes={"title": "one"})
-    second = made(rigid({"title": "two", "drive.motor_inertia": 0.06}, axes=GAINS, effects=effects[:1], sweep={"seeds": 2}))
+    second = make_result(
+        rigid_study({"title": "two", "drive.motor_inertia": 0.06}, axes=GAINS, effects=effects[:1], sweep={"seeds": 2})
+    )
     comparison = compare(first, second)
     assert comparison.config["drive.motor_inertia"] == (0.05, 0.06)
     assert comparison.config["sweep.seeds"] == (6, 2)
@@ -149,7 +158,7 @@ def test_what_is_true_or_false_and_what_is_not_defined():
     assert "motor.convergence_time (240 runs)" in text
 
 
-@pytest.mark.parametrize("axes", [GAINS, GAINS[1:], [*GAINS, listed(NOISE, 0.0, 1e-4)], [listed(NOISE, 1e-4)]])
+@pytest.mark.parametrize("axes", [GAINS, GAINS[1:], [*GAINS, listed_axis(NOISE, 0.0, 1e-4)], [listed_axis(NOISE, 1e-4)]])
 def test_text_and_figure(axes):
     def size(shift, seed):
         return lambda frame: noisy(shift, seed=seed)(frame.assign(**{} if ALPHA in frame else {ALPHA: 9.0}))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from small_study import ALPHA, LAMBDA, NOISE, small
+from small_study import ALPHA, LAMBDA, NOISE, small_study
 
 import jaxbl.sweeps.costs as under_test
 from jaxbl.config import read_config
@@ -17,7 +17,7 @@ KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 
 
 def test_counted_work():
-    one, ten = (read_config(small({"run.substeps": n})) for n in (1, 10))
+    one, ten = (read_config(small_study({"run.substeps": n})) for n in (1, 10))
     gains, plants = [LAMBDA, ALPHA], ["transmission.dead_zone"]
     shared, operations = count_operations(ten, gains), count_operations(ten, plants)
     # one and the same step, by all lanes or by each
@@ -30,10 +30,10 @@ def test_counted_work():
         assert 9 * 30 < more < 9 * 100
     # position and velocity of both sides are among what a lane of its own carries
     assert operations.carried - shared.carried >= 4 * 8
-    single = read_config(small({"run.precision": "float32"}))
+    single = read_config(small_study({"run.precision": "float32"}))
     assert count_operations(single, gains).carried == pytest.approx(count_operations(one, gains).carried / 2, rel=0.01)
     # a run that is twice as long does not more a sample
-    longer = read_config(small({"run.duration": 2.0 * one.run.duration, "run.substeps": 1}))
+    longer = read_config(small_study({"run.duration": 2.0 * one.run.duration, "run.substeps": 1}))
     assert count_operations(longer, [NOISE]).lane == pytest.approx(count_operations(one, [NOISE]).lane, rel=0.02)
 
 

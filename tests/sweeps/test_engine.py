@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
@@ -21,7 +21,7 @@ from jaxbl.sweeps.trial import run
 pytestmark = pytest.mark.usefixtures("compiled_once")
 
 # 2 x 3 x 2 = 12 points; with noise and weak gains rounding is amplified, so that equal here is equal anywhere
-AXES = [listed(NOISE, 0.0, 1e-3), spaced(ALPHA, 2.0, 40.0, 3), listed(LAMBDA, 0.3, 5.0)]
+AXES = [listed_axis(NOISE, 0.0, 1e-3), spaced_axis(ALPHA, 2.0, 40.0, 3), listed_axis(LAMBDA, 0.3, 5.0)]
 # the only figure whose rounding depends on whether a chunk holds one seed or several
 BOUND = ["motor.convergence_time_bound", "load.convergence_time_bound"]
 
@@ -36,7 +36,7 @@ def assert_equal(frame, expected, rtol=0.0):
 
 @pytest.fixture(scope="module")
 def study():
-    return read_config(small({"run.substeps": 2}, axes=AXES, sweep={"seeds": 3}))
+    return read_config(small_study({"run.substeps": 2}, axes=AXES, sweep={"seeds": 3}))
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,9 @@ def test_both_backends_give_the_same_figures(study, precision):
 def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     """Axes on an input's numbers make it a lane's: random levels and sums over harmonics are no work for the loop."""
     path = f"excitation.{path}"
-    study = rigid(axes=[listed(path, 0.04, 0.06, 0.09)], sweep={"metrics": ["velocity_rmse"]}) | {"excitation": excitation}
+    study = rigid_study(axes=[listed_axis(path, 0.04, 0.06, 0.09)], sweep={"metrics": ["velocity_rmse"]}) | {
+        "excitation": excitation
+    }
     config = read_config(study)
     assert Engine(config).backend == "fused"
     result = sweep(config)
@@ -122,7 +124,7 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
 
 def test_the_faster_backend_is_chosen():
     def backend(points, seeds):
-        study = rigid({"run.duration": 20.0}, axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"seeds": seeds})
+        study = rigid_study({"run.duration": 20.0}, axes=[spaced_axis(ALPHA, 1.0, 2.0, points)], sweep={"seeds": seeds})
         return Engine(read_config(study), devices=jax.devices()[:1]).backend
 
     assert backend(10_000, 4) == "fused"
@@ -130,7 +132,7 @@ def test_the_faster_backend_is_chosen():
     # seed after seed would pay for each what lanes share
     assert backend(3, 1000) == "scan"
     with pytest.raises(InputError, match="no 'Fused'; it should be one of fused, scan"):
-        sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
+        sweep(rigid_study(axes=[listed_axis(ALPHA, 1.0, 2.0)]), backend="Fused")
 
 
 def test_a_study_goes_on_with_the_backend_of_its_first_chunks(tmp_path, study):
@@ -152,7 +154,7 @@ def test_a_study_goes_on_with_the_backend_of_its_first_chunks(tmp_path, study):
 
 
 def test_seeds_alone_are_scanned():
-    config = read_config(rigid(sweep={"seeds": 4}))
+    config = read_config(rigid_study(sweep={"seeds": 4}))
     assert len(sweep(config).frame) == 4
     # not even tried
     assert [Engine(config, devices=jax.devices()[:count]).backend for count in (1, 2)] == ["scan", "scan"]
@@ -169,7 +171,9 @@ def test_layouts():
     """Whole rows of points first, then seeds; two lanes a device at least; little padding."""
 
     def layout(points, seeds, devices, capacity):
-        config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep={"seeds": seeds}))
+        config = read_config(
+            small_study(axes=[spaced_axis(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep={"seeds": seeds})
+        )
         return tuple(layout_for(config, Points(config), devices, capacity))
 
     assert layout(12288, 1, 2, 8192) == (1, 6144)
@@ -187,7 +191,7 @@ def test_layouts():
 def test_lanes_at_once():
     def lanes(backend, devices, platform="cpu", chunk=None, points=500_000):
         sweep = {"seeds": 1} | ({} if chunk is None else {"chunk": chunk})
-        config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep=sweep))
+        config = read_config(small_study(axes=[spaced_axis(ALPHA, 1.0, 2.0, points)], sweep=sweep))
         engine = Engine(config, devices=[SimpleNamespace(platform=platform)] * devices, backend=backend)
         return math.prod(engine.layout)
 
@@ -200,7 +204,7 @@ def test_lanes_at_once():
 
 
 def test_seeds_of_one_point_share_chunks():
-    config = read_config(rigid(sweep={"seeds": 10, "chunk": 4}))
+    config = read_config(rigid_study(sweep={"seeds": 10, "chunk": 4}))
     engine = Engine(config)
     assert (tuple(engine.layout), len(engine), engine.rows) == ((4, 1), 3, 10)
     frame = pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())])
@@ -217,7 +221,9 @@ def test_a_seed_is_the_same_noise_for_all_points(reference):
 
 def test_memory_grows_neither_with_points_nor_with_duration():
     def memory(points, duration):
-        config = read_config(rigid({"run.duration": duration}, axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"chunk": 64}))
+        config = read_config(
+            rigid_study({"run.duration": duration}, axes=[spaced_axis(ALPHA, 1.0, 2.0, points)], sweep={"chunk": 64})
+        )
         engine = Engine(config, backend="scan")
         assert tuple(engine.layout) == (1, 64)
         return 1e6 * engine._compile(config).megabytes
@@ -229,9 +235,9 @@ def test_memory_grows_neither_with_points_nor_with_duration():
 
 
 def test_dry_run_counts_without_running_the_study():
-    study = rigid(
+    study = rigid_study(
         {"run.duration": 1e4},
-        axes=[spaced(ALPHA, 1.0, 2.0, 50), listed("run.substeps", 1, 2)],
+        axes=[spaced_axis(ALPHA, 1.0, 2.0, 50), listed_axis("run.substeps", 1, 2)],
         sweep={"seeds": 7, "chunk": 100, "metrics": ["velocity_rmse"]},
     )
     cost = dry_run(study)
@@ -258,7 +264,7 @@ def test_an_estimate_runs_every_seed(monkeypatch):
         return program._replace(run=run)
 
     monkeypatch.setattr(engine, "compile_program", compile_and_count)
-    dry_run(rigid(axes=[spaced(ALPHA, 1.0, 2.0, 5)], sweep={"seeds": 3}))
+    dry_run(rigid_study(axes=[spaced_axis(ALPHA, 1.0, 2.0, 5)], sweep={"seeds": 3}))
     assert set(used) == {(3, 5)}
 
 
@@ -270,7 +276,9 @@ VISCOUS = "effects.motor.viscous_friction.viscous"
 def unstable(*values, precision="float64"):
     """Viscous friction as an effect is explicit in time: 1e4 N m s/rad is far beyond its step."""
     effects = [{"kind": "motor.viscous_friction", "viscous": 0.0}]
-    return rigid({"run.precision": precision}, effects=effects, axes=[listed(VISCOUS, *values), listed(ALPHA, 5.0, 9.0)])
+    return rigid_study(
+        {"run.precision": precision}, effects=effects, axes=[listed_axis(VISCOUS, *values), listed_axis(ALPHA, 5.0, 9.0)]
+    )
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -293,16 +301,16 @@ def test_diverging_lanes_are_flagged_and_leave_their_neighbours_alone(precision)
 def test_structural_axes_end_to_end(tmp_path):
     """Sampling period and discretisation: one program each, rows as in runs of their own, and files that keep words."""
     period, kind = "run.sample_period", "observer.discretisation"
-    axes = [listed(ALPHA, 5.0, 9.0), listed(period, 1e-3, 2e-3), listed(kind, "explicit", "implicit")]
-    result = sweep(rigid(axes=axes), tmp_path / "study")
+    axes = [listed_axis(ALPHA, 5.0, 9.0), listed_axis(period, 1e-3, 2e-3), listed_axis(kind, "explicit", "implicit")]
+    result = sweep(rigid_study(axes=axes), tmp_path / "study")
     assert len(result.frame) == 8
     assert list(result.frame.columns[:4]) == [ALPHA, period, kind, "seed"]
     for h, name in ((1e-3, "implicit"), (2e-3, "explicit")):
         group = result.frame.query(f"`{period}` == @h and `{kind}` == @name")
-        alone = sweep(rigid({period: h, kind: name}, axes=axes[:1])).frame
+        alone = sweep(rigid_study({period: h, kind: name}, axes=axes[:1])).frame
         assert_equal(group[alone.columns].reset_index(drop=True), alone)
     assert result.frame.groupby([period, kind])["motor.velocity_rmse"].sum().nunique() == 4
-    again = sweep(rigid(axes=axes), tmp_path / "study")
+    again = sweep(rigid_study(axes=axes), tmp_path / "study")
     assert again.cost["lanes"] == 0
     assert_equal(again.frame, result.frame)
 
@@ -334,7 +342,7 @@ def with_precision(config, precision):
 
 @pytest.mark.parametrize("backend", ["scan", "fused"])
 def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
-    data = rigid({"run.substeps": 2}, axes=AXES)
+    data = rigid_study({"run.substeps": 2}, axes=AXES)
 
     def run(**keys):
         engine = Engine(read_config(data | {"sweep": {"seeds": 3, **keys}}), Layout(3, 12), jax.devices()[:1], backend)

@@ -12,7 +12,7 @@ from importlib import import_module
 
 import dask
 import pytest
-from small_study import parts, spaced, thirty
+from small_study import read_parts, spaced_axis, thirty_run_study
 
 from small_study import ALPHA, LAMBDA  # isort: skip
 
@@ -26,9 +26,9 @@ CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed.cli.dask_work
 
 def study(points=120):
     """Runs in as many chunks, of some milliseconds each, without the metrics that take longest to compile."""
-    axes = [spaced(ALPHA, 5.0, 20.0, points // 10), spaced(LAMBDA, 0.3, 5.0, 10)]
+    axes = [spaced_axis(ALPHA, 5.0, 20.0, points // 10), spaced_axis(LAMBDA, 0.3, 5.0, 10)]
     sweep = {"seeds": 4, "chunk": 4, "metrics": ["converged", "velocity_rmse"]}
-    return thirty(axes=axes, sweep=sweep, run={"duration": 1.0, "substeps": 1})
+    return thirty_run_study(axes=axes, sweep=sweep, run={"duration": 1.0, "substeps": 1})
 
 
 def _sweep(folder, scheduler=None):
@@ -54,7 +54,7 @@ def alone(tmp_path_factory):
         run.join()
         assert run.exitcode == 0
         times.append(time.monotonic() - start)
-        result = parts(folder)
+        result = read_parts(folder)
         for path in (folder / "points").iterdir():
             path.unlink()
     return result, times[1]
@@ -79,7 +79,7 @@ def expected_frame(folder, expected):
 def check(folder, expected):
     """The study goes on to its end, and is what it would have been."""
     sweep(study(), folder)
-    assert parts(folder) == expected
+    assert read_parts(folder) == expected
     assert not list(folder.rglob(".*")) and not (folder / "damaged").exists()
 
 

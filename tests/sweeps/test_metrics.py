@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paper_drive import paper
+from paper_drive import paper_experiment
 
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
 from jaxbl.errors import InputError
@@ -114,7 +114,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_columns_against_numpy_on_the_whole_trace(case):
     # steps that no block length and no quarter divides
-    experiment = paper(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
+    experiment = paper_experiment(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
     figures, (signals, identifier) = run(experiment)
     expected = by_numpy(experiment, signals, identifier)
     figures = add_gain_metrics(figures, observer_gains(experiment))
@@ -136,7 +136,7 @@ def test_columns_against_numpy_on_the_whole_trace(case):
 
 def test_converged_needs_the_whole_last_quarter():
     """A tolerance that the velocity error leaves for the last time within the last quarter."""
-    experiment = paper(time_constant=0.01, start=0.3, steps=1023, noise=1e-4)
+    experiment = paper_experiment(time_constant=0.01, start=0.3, steps=1023, noise=1e-4)
     _, (signals, _) = run(experiment)
     error = np.abs(np.asarray(signals.motor.true.velocity - signals.motor.velocity_estimate))
     peak = 768 + int(np.argmax(error[768:]))
@@ -152,7 +152,7 @@ def test_last_quarter(steps, first):
 
 
 def test_every_column_has_unit_and_meaning():
-    columns = metric_columns(paper())
+    columns = metric_columns(paper_experiment())
     assert len(columns) == 1 + 2 * len(SIDE_METRICS)
     for column in columns:
         assert find_metric(column).doc
@@ -160,7 +160,7 @@ def test_every_column_has_unit_and_meaning():
 
 
 def test_some_metrics_alone():
-    experiment = paper()
+    experiment = paper_experiment()
     assert metric_columns(experiment, ["f_plus", "converged"]) == [
         "finite", "motor.converged", "motor.f_plus", "load.converged", "load.f_plus",
     ]  # fmt: skip
@@ -186,7 +186,7 @@ def test_some_metrics_alone():
     ],
 )
 def test_metrics_that_cannot_be_had(names, message):
-    rigid = paper(**CASES["rigid"])
+    rigid = paper_experiment(**CASES["rigid"])
     with pytest.raises(InputError, match=message):
         metric_columns(rigid, names)
 

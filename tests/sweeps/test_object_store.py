@@ -4,7 +4,7 @@ import boto3
 import pandas as pd
 import pytest
 from moto.server import ThreadedMotoServer
-from small_study import ALPHA, listed, parts, thirty
+from small_study import ALPHA, listed_axis, read_parts, thirty_run_study
 
 from jaxbl.errors import InputError
 from jaxbl.files import create_file, to_path
@@ -38,7 +38,7 @@ def bucket():
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone") / "study"
-    return folder, sweep(thirty(), folder)
+    return folder, sweep(thirty_run_study(), folder)
 
 
 def keys(address):
@@ -52,35 +52,37 @@ def keys(address):
 def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed):
     folder, result = alone
     address = f"{bucket}/a/study"
-    first = share(thirty(), address, (1, 2))
+    first = share(thirty_run_study(), address, (1, 2))
     assert (first.parts, first.finished) == (4, False)
-    study = sweep(thirty(), address)
+    study = sweep(thirty_run_study(), address)
     assert sorted(computed) == list(range(8))
     pd.testing.assert_frame_equal(study.frame, result.frame, check_exact=True)
     stored = keys(address)
     assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
-    assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == parts(folder)
+    assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == read_parts(
+        folder
+    )
     # again: only read
-    assert sweep(thirty(), address).cost["lanes"] == 0
+    assert sweep(thirty_run_study(), address).cost["lanes"] == 0
     assert keys(address) == stored
     assert status(address).finished
     pd.testing.assert_frame_equal(open_study(address).frame, result.frame, check_exact=True)
     with pytest.raises(InputError, match="holds another study"):
-        sweep(thirty(sweep={"seeds": 3, "chunk": 4}), address)
-    sweep(thirty(axes=[listed(ALPHA, 5.0, 9.0)]), address, overwrite=True)
+        sweep(thirty_run_study(sweep={"seeds": 3, "chunk": 4}), address)
+    sweep(thirty_run_study(axes=[listed_axis(ALPHA, 5.0, 9.0)]), address, overwrite=True)
     assert set(keys(address)) == {"manifest.json", "study.toml", *(f"points/part-0000{seed}.parquet" for seed in (0, 1))}
 
 
 def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
     address = f"{bucket}/b"
-    sweep(thirty(), address)
+    sweep(thirty_run_study(), address)
     computed.clear()
     damaged, lost = (to_path(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
     damaged.write_bytes(damaged.read_bytes()[:-1000])
     lost.unlink()
     with pytest.raises(InputError, match=r"part-00002\.parquet: is damaged"):
         _ = open_study(address).frame
-    assert len(sweep(thirty(), address).damaged) == 1
+    assert len(sweep(thirty_run_study(), address).damaged) == 1
     assert sorted(computed) == [2, 5]
     assert "damaged/part-00002.parquet" in keys(address)
     (to_path(address) / "manifest.json").unlink()
@@ -93,7 +95,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
 def test_a_report_in_a_store(bucket):
     address = f"{bucket}/c"
     figure = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
-    write_sweep_report(sweep(thirty(figures=[figure]), address), to_path(address))
+    write_sweep_report(sweep(thirty_run_study(figures=[figure]), address), to_path(address))
     stored = keys(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
     assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
@@ -108,8 +110,8 @@ def test_who_comes_second_does_not_begin(bucket):
 
 def test_bad_addresses(bucket, monkeypatch):
     with pytest.raises(InputError, match=r"s3://none/x: cannot be written to \(.*bucket.*\); name another folder"):
-        sweep(thirty(), "s3://none/x")
+        sweep(thirty_run_study(), "s3://none/x")
     with pytest.raises(InputError, match=r"s3://none/x: holds no study"):
         open_study("s3://none/x")
     with pytest.raises(InputError, match=r"foo://a: is no place for results"):
-        sweep(thirty(), "foo://a")
+        sweep(thirty_run_study(), "foo://a")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import tomli_w
-from small_study import listed, rigid, small
+from small_study import listed_axis, rigid_study, small_study
 
 import jaxbl
 from jaxbl.config import numeric_paths, read_config
@@ -25,12 +25,12 @@ GAINS = {
 
 
 def study(**more):
-    return small(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
+    return small_study(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
 
 
 def over_kinds(kinds, backend):
-    axes = [listed("observer.kind", *kinds), listed("drive.motor_inertia", 0.05, 0.06)]
-    return jaxbl.sweep(rigid(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes), backend=backend).frame
+    axes = [listed_axis("observer.kind", *kinds), listed_axis("drive.motor_inertia", 0.05, 0.06)]
+    return jaxbl.sweep(rigid_study(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes), backend=backend).frame
 
 
 def test_a_sweep_over_the_kind_by_both_loops():
@@ -79,7 +79,7 @@ def test_an_axis_over_gains_needs_kinds_that_have_them():
 )
 def test_wrong_observers_get_one_line(observer, message):
     with pytest.raises(InputError, match=message) as caught:
-        read_config(small() | {"observer": observer})
+        read_config(small_study() | {"observer": observer})
     assert "\n" not in str(caught.value)
 
 

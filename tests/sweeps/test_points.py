@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from small_study import ALPHA, LAMBDA, NOISE, listed, small, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, small_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.sweeps.points import Points
 
 
 def points(*axes, **sweep):
-    return Points(read_config(small(axes=list(axes), sweep=sweep)))
+    return Points(read_config(small_study(axes=list(axes), sweep=sweep)))
 
 
 def columns(study):
@@ -17,7 +17,9 @@ def columns(study):
 
 
 def test_grid_has_the_last_axis_fastest():
-    study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 3), spaced(LAMBDA, 1.0, 2.0, 3, "linear"))
+    study = points(
+        listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 1.0, 100.0, 3), spaced_axis(LAMBDA, 1.0, 2.0, 3, "linear")
+    )
     assert study.paths == [NOISE, ALPHA, LAMBDA]
     assert len(study) == study.group_size == 18
     expected = np.meshgrid([1e-5, 1e-4], [1.0, 10.0, 100.0], [1.0, 1.5, 2.0], indexing="ij")
@@ -26,7 +28,11 @@ def test_grid_has_the_last_axis_fastest():
 
 
 def test_zipped_axes_advance_together_and_may_repeat_a_value():
-    study = points(listed(ALPHA, 1.0, 1.0, 3.0, zip="g"), listed(NOISE, 0.0, 1e-3), listed(LAMBDA, 4.0, 5.0, 5.0, zip="g"))
+    study = points(
+        listed_axis(ALPHA, 1.0, 1.0, 3.0, zip="g"),
+        listed_axis(NOISE, 0.0, 1e-3),
+        listed_axis(LAMBDA, 4.0, 5.0, 5.0, zip="g"),
+    )
     result = columns(study)
     np.testing.assert_array_equal(result[ALPHA], [1.0, 1.0, 1.0, 1.0, 3.0, 3.0])
     np.testing.assert_array_equal(result[LAMBDA], [4.0, 4.0, 5.0, 5.0, 5.0, 5.0])
@@ -34,7 +40,7 @@ def test_zipped_axes_advance_together_and_may_repeat_a_value():
 
 
 def test_slices_are_parts_of_the_whole():
-    study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 2.0, 5))
+    study = points(listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 1.0, 100.0, 7), spaced_axis(LAMBDA, 1.0, 2.0, 5))
     full_columns = columns(study)
     for first in range(0, study.group_size, 11):
         part = study.columns(np.arange(first, min(first + 11, study.group_size)))
@@ -44,7 +50,7 @@ def test_slices_are_parts_of_the_whole():
 
 @pytest.mark.parametrize("design", ["sobol", "latin_hypercube"])
 def test_quasi_random_points_fill_the_ranges_evenly_and_repeat(design):
-    axes = [spaced(ALPHA, 1.0, 100.0), spaced(LAMBDA, 2.0, 4.0, scale="linear")]
+    axes = [spaced_axis(ALPHA, 1.0, 100.0), spaced_axis(LAMBDA, 2.0, 4.0, scale="linear")]
     study = points(*axes, design=design, points=64)
     result = columns(study)
     unit = [np.log(result[ALPHA]) / np.log(100.0), (result[LAMBDA] - 2.0) / 2.0]
@@ -59,13 +65,15 @@ def test_quasi_random_points_fill_the_ranges_evenly_and_repeat(design):
 
 
 def test_fewer_sobol_points_are_the_first_of_more():
-    axis = spaced(ALPHA, 1.0, 100.0)
+    axis = spaced_axis(ALPHA, 1.0, 100.0)
     few, many = (columns(points(axis, design="sobol", points=n)) for n in (11, 16))
     np.testing.assert_array_equal(few[ALPHA], many[ALPHA][:11])
 
 
 def test_a_design_is_crossed_with_the_axes_that_are_listed():
-    study = points(spaced(ALPHA, 1.0, 9.0), listed(NOISE, 0.0, 1e-3), spaced(LAMBDA, 2.0, 4.0), design="sobol", points=5)
+    study = points(
+        spaced_axis(ALPHA, 1.0, 9.0), listed_axis(NOISE, 0.0, 1e-3), spaced_axis(LAMBDA, 2.0, 4.0), design="sobol", points=5
+    )
     result = columns(study)
     assert len(study) == 10
     np.testing.assert_array_equal(result[NOISE], [0.0, 1e-3] * 5)
@@ -76,9 +84,9 @@ def test_a_design_is_crossed_with_the_axes_that_are_listed():
 
 def test_axes_over_structure_are_groups_outside_of_the_lanes():
     study = points(
-        spaced(ALPHA, 1.0, 9.0, 3),
-        listed("run.sample_period", 1e-3, 2e-3),
-        listed("observer.discretisation", "explicit", "implicit"),
+        spaced_axis(ALPHA, 1.0, 9.0, 3),
+        listed_axis("run.sample_period", 1e-3, 2e-3),
+        listed_axis("observer.discretisation", "explicit", "implicit"),
     )
     assert (len(study.groups), study.group_size, len(study)) == (4, 3, 12)
     assert list(columns(study)) == [ALPHA]
@@ -88,13 +96,13 @@ def test_axes_over_structure_are_groups_outside_of_the_lanes():
 
 
 def test_a_leaf_zipped_with_structure_goes_with_its_group():
-    study = points(listed(ALPHA, 1.0, 2.0, zip="g"), spaced("run.substeps", 1, 3, 2, "linear", zip="g"))
+    study = points(listed_axis(ALPHA, 1.0, 2.0, zip="g"), spaced_axis("run.substeps", 1, 3, 2, "linear", zip="g"))
     assert (len(study.groups), study.group_size) == (2, 1)
     assert [(g.config.observer.motor.alpha, g.config.run.substeps) for g in study.groups] == [(1.0, 1), (2.0, 3)]
 
 
 def test_a_number_that_is_left_out_may_be_an_axis():
-    study = points(listed("encoders.load_noise", 0.0, 1e-3))
+    study = points(listed_axis("encoders.load_noise", 0.0, 1e-3))
     assert list(columns(study)) == ["encoders.load_noise"]
     assert study.groups[0].config.encoders.load_noise == 0.0
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, small, spaced
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -252,17 +252,17 @@ def test_true_and_false_disagree_whatever_the_tolerance():
 
 # ---------------------------------------------------------------- points
 
-GAINS = [spaced(LAMBDA, 0.5, 8.0, 5), spaced(ALPHA, 1.0, 9.0, 3, "linear")]
+GAINS = [spaced_axis(LAMBDA, 0.5, 8.0, 5), spaced_axis(ALPHA, 1.0, 9.0, 3, "linear")]
 
 
 def points(*axes, **sweep):
-    return Points(read_config(small(axes=list(axes), sweep={"refine": 2, **sweep})))
+    return Points(read_config(small_study(axes=list(axes), sweep={"refine": 2, **sweep})))
 
 
 def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
     for num, depth in ((33, 5), (7, 4), (2, 9)):
-        axes = [spaced(LAMBDA, 0.1, 37.0, num), spaced(ALPHA, 0.3, 91.7, num, "linear")]
-        plain, fine = (Points(read_config(small(axes=axes, sweep=s))) for s in ({}, {"refine": depth}))
+        axes = [spaced_axis(LAMBDA, 0.1, 37.0, num), spaced_axis(ALPHA, 0.3, 91.7, num, "linear")]
+        plain, fine = (Points(read_config(small_study(axes=axes, sweep=s))) for s in ({}, {"refine": depth}))
         assert fine.coarse_size == plain.group_size
         group_size = np.arange(plain.group_size)
         expected = plain.columns(group_size)
@@ -270,18 +270,18 @@ def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
             np.testing.assert_array_equal(values, expected[path])
         # and all values are those of a grid that is as fine
         axes = [axis | {"num": (num - 1 << depth) + 1} for axis in axes]
-        full_points = Points(read_config(small(axes=axes)))
+        full_points = Points(read_config(small_study(axes=axes)))
         for path in (LAMBDA, ALPHA):
             np.testing.assert_array_equal(fine.axis_values(path), full_points.axis_values(path))
 
 
 def test_what_is_refined():
     study = points(
-        listed(NOISE, 0.0, 1e-4),
+        listed_axis(NOISE, 0.0, 1e-4),
         *GAINS,
-        listed("observer.load.alpha", 0.2, 0.4, zip="g"),
-        spaced("observer.load.lambda", 0.5, 1.0, 2, zip="g"),
-        spaced("run.substeps", 1, 2, 2, "linear"),
+        listed_axis("observer.load.alpha", 0.2, 0.4, zip="g"),
+        spaced_axis("observer.load.lambda", 0.5, 1.0, 2, zip="g"),
+        spaced_axis("run.substeps", 1, 2, 2, "linear"),
     )
     refinement = study.refinement
     assert refinement.paths == [LAMBDA, ALPHA]
@@ -297,10 +297,10 @@ def test_what_is_compared():
     def columns(*axes, **sweep):
         return points(*axes, **sweep).refinement.criterion.columns
 
-    load = spaced("observer.load.alpha", 0.1, 1.0, 3)
+    load = spaced_axis("observer.load.alpha", 0.1, 1.0, 3)
     assert columns(load) == ("load.converged", "finite")
     assert columns(load, GAINS[0]) == ("motor.converged", "load.converged", "finite")
-    assert columns(spaced(NOISE, 1e-5, 1e-3, 3)) == ("motor.converged", "load.converged", "finite")
+    assert columns(spaced_axis(NOISE, 1e-5, 1e-3, 3)) == ("motor.converged", "load.converged", "finite")
     assert columns(load, refine_metric="motor.chatter") == ("motor.chatter", "finite")
     refinement = points(load, refine_metric="motor.chatter", refine_tolerance=0.5).refinement
     assert refinement.criterion.tolerances == (0.5, 0.0)
@@ -336,16 +336,20 @@ BAD = {
     "a metric twice": ({"metrics": ["chatter", "chatter"]}, GAINS, "sweep: metrics names 'chatter' twice"),
     "design": (
         {"refine": 1, "design": "sobol", "points": 4},
-        [spaced(ALPHA, 1.0, 2.0)],
+        [spaced_axis(ALPHA, 1.0, 2.0)],
         "sweep: refine needs design = 'grid'; points of a sobol design have no neighbours",
     ),
     "listed values": (
         {"refine": 1},
-        [listed(ALPHA, 1.0, 2.0)],
+        [listed_axis(ALPHA, 1.0, 2.0)],
         "sweep.refine: no axis can be refined; an axis is needed with start",
     ),
-    "structural": ({"refine": 1}, [spaced("run.substeps", 1, 2, 2, "linear")], "sweep.refine: no axis can be refined"),
-    "zipped": ({"refine": 1}, [spaced(p, 1.0, 2.0, 3, zip="g") for p in (ALPHA, LAMBDA)], "sweep.refine: no axis can be"),
+    "structural": ({"refine": 1}, [spaced_axis("run.substeps", 1, 2, 2, "linear")], "sweep.refine: no axis can be refined"),
+    "zipped": (
+        {"refine": 1},
+        [spaced_axis(p, 1.0, 2.0, 3, zip="g") for p in (ALPHA, LAMBDA)],
+        "sweep.refine: no axis can be",
+    ),
     "no axes": ({"refine": 1}, [], "sweep.refine: no axis can be refined"),
     "too many values": (
         {"refine": 25},
@@ -354,7 +358,7 @@ BAD = {
     ),
     "too many values as it is": (
         {"refine": 1},
-        [spaced(ALPHA, 1.0, 2.0, 9_000_000)],
+        [spaced_axis(ALPHA, 1.0, 2.0, 9_000_000)],
         "it does not fit here: num is too large",
     ),
     "too many runs": (
@@ -370,7 +374,7 @@ BAD = {
 def test_bad_input_is_one_line_that_names_the_key(case):
     table, axes, message = BAD[case]
     with pytest.raises(InputError) as error:
-        Points(read_config(small(axes=axes, sweep=table)))
+        Points(read_config(small_study(axes=axes, sweep=table)))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -383,9 +387,9 @@ def study(changes=None, refine=3, num=5, seeds=1, axes=None, **sweep_keys):
     changes = {
         "observer.discretisation": "explicit", "run.duration": 0.1, "run.velocity_tolerance": 0.1, "encoders.noise": 0.0,
     } | (changes or {})  # fmt: skip
-    axes = axes or [spaced(LAMBDA, 0.5, 40.0, num), spaced(ALPHA, 2.0, 200.0, num)]
+    axes = axes or [spaced_axis(LAMBDA, 0.5, 40.0, num), spaced_axis(ALPHA, 2.0, 200.0, num)]
     table = {"seeds": seeds, "chunk": 64, **({} if refine is None else {"refine": refine}), **sweep_keys}
-    return rigid(changes, axes=axes, sweep=table)
+    return rigid_study(changes, axes=axes, sweep=table)
 
 
 def whole_grid(data):
@@ -421,7 +425,7 @@ def masks(data, frame, whole):
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_the_boundary_of_the_full_grid_at_257(precision):
     changes = {"run.precision": precision, "observer.discretisation": "implicit", "run.velocity_tolerance": 0.05}
-    axes = [spaced(LAMBDA, 3.0, 40.0, 17), spaced(ALPHA, 2.0, 200.0, 17)]  # where the boundary is one line
+    axes = [spaced_axis(LAMBDA, 3.0, 40.0, 17), spaced_axis(ALPHA, 2.0, 200.0, 17)]  # where the boundary is one line
     # all metrics are compared on a smaller grid, below
     data = study(changes, refine=4, axes=axes, chunk=256, metrics=["converged", "velocity_rmse"])
     result, full_grid = sweep(data), whole_grid(data)
@@ -476,15 +480,15 @@ def test_every_point_has_all_seeds_and_one_that_disagrees_is_enough():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_first_seed_shifts_the_noise(backend):
-    axes = [listed(ALPHA, 5.0, 9.0)]
-    four = sweep(rigid(axes=axes, sweep={"seeds": 4}), backend=backend).frame
-    last = sweep(rigid(axes=axes, sweep={"seeds": 2, "first_seed": 2}), backend=backend).frame
+    axes = [listed_axis(ALPHA, 5.0, 9.0)]
+    four = sweep(rigid_study(axes=axes, sweep={"seeds": 4}), backend=backend).frame
+    last = sweep(rigid_study(axes=axes, sweep={"seeds": 2, "first_seed": 2}), backend=backend).frame
     exact = [name for name in four if not name.endswith("convergence_time_bound")]
     pd.testing.assert_frame_equal(four[four["seed"] >= 2].reset_index(drop=True)[exact], last[exact], check_exact=True)
 
 
 def test_a_number_as_metric_and_one_axis():
-    axes = [spaced(ALPHA, 2.0, 200.0, 5)]
+    axes = [spaced_axis(ALPHA, 2.0, 200.0, 5)]
     coarse, fine = (
         sweep(study(axes=axes, refine=5, refine_metric="motor.velocity_rmse", refine_tolerance=t)).frame for t in (0.5, 0.05)
     )
@@ -497,8 +501,8 @@ def test_a_number_as_metric_and_one_axis():
 
 
 def test_groups_and_listed_axes_are_refined_each_by_itself():
-    structure = listed("run.sample_period", 1e-3, 2e-3)
-    noise = listed(NOISE, 0.0, 1e-4)
+    structure = listed_axis("run.sample_period", 1e-3, 2e-3)
+    noise = listed_axis(NOISE, 0.0, 1e-4)
     data = study(refine=2, axes=[structure, *study()["axes"], noise])
     result = sweep(data)
     for period in (1e-3, 2e-3):

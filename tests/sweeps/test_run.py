@@ -2,7 +2,7 @@
 
 import pandas as pd
 import pytest
-from small_study import ALPHA, LAMBDA, parts, spaced, thirty
+from small_study import ALPHA, LAMBDA, read_parts, spaced_axis, thirty_run_study
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -16,46 +16,48 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
 def test_shares_are_the_whole_study(tmp_path, computed):
-    alone = sweep(thirty(), tmp_path / "alone")
+    alone = sweep(thirty_run_study(), tmp_path / "alone")
     computed.clear()
     folder, calls = tmp_path / "shares", []
-    last = share(thirty(), folder, (3, 3), progress=lambda *done: calls.append(done))
+    last = share(thirty_run_study(), folder, (3, 3), progress=lambda *done: calls.append(done))
     assert len(computed) == 2 and not last.complete
     # progress of a share is of its own lanes
     assert calls[-1][0] == calls[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed)
     assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
     with lock_folder(folder, shared=True):
         # another one is at work
-        share(thirty(), folder, (1, 3))
+        share(thirty_run_study(), folder, (1, 3))
         assert status(folder).held_by.startswith("process")
-    done = share(thirty(), folder, (2, 3))
+    done = share(thirty_run_study(), folder, (2, 3))
     assert sorted(computed) == list(range(8))
     assert done.complete and done.remaining_seconds == 0.0 and not done.finished
     # a share that is there, and who collects them, compute nothing
-    share(thirty(), folder, (2, 3))
-    result = sweep(thirty(), folder)
+    share(thirty_run_study(), folder, (2, 3))
+    result = sweep(thirty_run_study(), folder)
     assert sorted(computed) == list(range(8))
-    assert parts(folder) == parts(tmp_path / "alone")
+    assert read_parts(folder) == read_parts(tmp_path / "alone")
     pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
     assert status(folder).finished
     assert not list(folder.rglob(".*"))
     # more shares than chunks
-    assert share(thirty(), folder, (99, 100)).complete
+    assert share(thirty_run_study(), folder, (99, 100)).complete
 
 
 def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypatch):
-    share(thirty(), tmp_path / "study", (1, 2))
-    before = parts(tmp_path / "study")
+    share(thirty_run_study(), tmp_path / "study", (1, 2))
+    before = read_parts(tmp_path / "study")
     with pytest.raises(InputError, match="holds another study"):
-        share(thirty(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
+        share(thirty_run_study(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
     monkeypatch.setattr(run, "_PREPARATION_SECONDS", 0.2)
     with (
         lock_folder(tmp_path / "study"),
         pytest.raises(InputError, match="is writing into it; wait until it has ended"),
     ):
-        share(thirty(), tmp_path / "study", (2, 2))
-    assert parts(tmp_path / "study") == before
-    refined = thirty(axes=[spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2})
+        share(thirty_run_study(), tmp_path / "study", (2, 2))
+    assert read_parts(tmp_path / "study") == before
+    refined = thirty_run_study(
+        axes=[spaced_axis(ALPHA, 5.0, 20.0, 9), spaced_axis(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2}
+    )
     with pytest.raises(InputError, match=r"--share: sweep\.refine makes points depend on one another"):
         share(refined, tmp_path / "other", (1, 2))
     assert not (tmp_path / "other").exists()
@@ -65,14 +67,14 @@ def test_status_of_folders(tmp_path):
     with pytest.raises(InputError, match="holds no study"):
         list_statuses(tmp_path)
     for name in ("verify/drive", "verify/sampled"):
-        sweep(thirty(), tmp_path / name)
+        sweep(thirty_run_study(), tmp_path / name)
     assert [one.folder.name for one in list_statuses(tmp_path)] == ["drive", "sampled"]
 
 
 def test_chunks_cover_the_grid_coarsely_first():
     """Whenever it is stopped, a study has points all over its map."""
-    axes = [spaced(ALPHA, 5.0, 20.0, 32), spaced(LAMBDA, 0.3, 5.0, 32)]
-    engine = Engine(read_config(thirty(axes=axes, sweep={"seeds": 2, "chunk": 8})))
+    axes = [spaced_axis(ALPHA, 5.0, 20.0, 32), spaced_axis(LAMBDA, 0.3, 5.0, 32)]
+    engine = Engine(read_config(thirty_run_study(axes=axes, sweep={"seeds": 2, "chunk": 8})))
     order = engine.chunk_order()
     assert sorted(order) == list(range(len(engine))) and len(engine) == 256
     # the first seed of all points before the second

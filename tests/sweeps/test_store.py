@@ -11,7 +11,7 @@ from random import Random
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from small_study import ALPHA, listed, rigid
+from small_study import ALPHA, listed_axis, rigid_study
 from upath import UPath
 
 from jaxbl.config import read_config
@@ -29,7 +29,7 @@ FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
 def study(changes=None, **tables):
     """Nine runs in three chunks: 3 seeds of 3 points, padded to 4."""
-    return rigid(changes, **{"axes": [listed(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
+    return rigid_study(changes, **{"axes": [listed_axis(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
 
 
 def files(folder):
@@ -124,7 +124,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, compu
 
 OTHER = {
     "other number": {"changes": {"drive.motor_inertia": 0.06}},
-    "other axis": {"axes": [listed(ALPHA, 5.0, 9.0, 21.0)]},
+    "other axis": {"axes": [listed_axis(ALPHA, 5.0, 9.0, 21.0)]},
     "more seeds": {"sweep": {"seeds": 4, "chunk": 2}},
     "other precision": {"changes": {"run.precision": "float32"}},
     "some metrics": {"sweep": {"metrics": ["converged"]}},
@@ -390,7 +390,7 @@ def test_folders_without_a_study_or_without_points(tmp_path, copy):
 def test_a_record_is_known_by_its_content(tmp_path):
     def of(text, name="a.csv"):
         (tmp_path / name).write_text(text)
-        return identity(read_config(rigid(excitation={"kind": "recorded", "file": str(tmp_path / name)})))
+        return identity(read_config(rigid_study(excitation={"kind": "recorded", "file": str(tmp_path / name)})))
 
     first = of("t,u\n0,1\n1,2\n")
     assert of("t,u\n0,1\n1,3\n") != first
@@ -402,7 +402,7 @@ def test_files_of_others_are_never_removed(tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "mine.png").write_bytes(b"x")
     with pytest.raises(InputError, match="not of a study"):
-        claim_folder(tmp_path, read_config(rigid()), overwrite=True)
+        claim_folder(tmp_path, read_config(rigid_study()), overwrite=True)
     assert (tmp_path / "figures" / "mine.png").exists()
 
 
@@ -484,10 +484,10 @@ def test_a_study_in_an_object_store_is_read_alike(finished_study):
 
 def test_the_metrics_asked_for_are_a_sweeps_own():
     def of(command, *names):
-        return identity(read_config(rigid(sweep={"metrics": list(names)} if names else {})), command)
+        return identity(read_config(rigid_study(sweep={"metrics": list(names)} if names else {})), command)
 
     assert of("sweep", "converged", "chatter") == of("sweep", "chatter", "converged") != of("sweep", "converged")
     for command in ("simulate", "verify", "tune"):
         assert of(command, "converged") == of(command)
     # folders that are there stay what they are
-    assert "metrics" not in read_config(rigid()).to_dict()["sweep"]
+    assert "metrics" not in read_config(rigid_study()).to_dict()["sweep"]

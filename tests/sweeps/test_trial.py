@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from small_study import listed, rigid, small
+from small_study import listed_axis, rigid_study, small_study
 
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
@@ -78,7 +78,7 @@ def test_every_dead_zone_comes_with_its_half_gap(law):
         "linear_shaft": ({"stiffness": 1.0}, {"stiffness"}),
     }
     numbers, names = laws[law]
-    trial = run(small(transmission={"law": law, **numbers}))
+    trial = run(small_study(transmission={"law": law, **numbers}))
     assert set(trial.summary["identified"]) == names
     for name, result in trial.summary["identified"].items():
         assert result["true"] == numbers.get(name, 0.08)
@@ -88,7 +88,7 @@ def test_every_dead_zone_comes_with_its_half_gap(law):
 
 
 def test_rigid_run():
-    trial = run(rigid(effects=[{"kind": "motor.constant_torque", "torque": 0.05}]))
+    trial = run(rigid_study(effects=[{"kind": "motor.constant_torque", "torque": 0.05}]))
     assert list(trial.trace.columns) == ["t", "u", "theta_e", "torque", *(f"motor.{name}" for name in SIDE)]
     np.testing.assert_allclose(trial.trace["torque"], 0.05, atol=2e-3)
     assert trial.summary["identified"] == {}
@@ -96,36 +96,36 @@ def test_rigid_run():
 
 
 def test_decimated_trace_is_a_part_of_the_whole_with_the_same_metrics():
-    full_trial, part = run(rigid({"run.duration": 0.203})), run(rigid({"run.duration": 0.203}), every=7)
+    full_trial, part = run(rigid_study({"run.duration": 0.203})), run(rigid_study({"run.duration": 0.203}), every=7)
     assert len(part.trace) == 29
     pd.testing.assert_frame_equal(part.trace, full_trial.trace[::7].reset_index(drop=True), rtol=1e-9)
     assert part.summary["metrics"].keys() == full_trial.summary["metrics"].keys()
     with pytest.raises(InputError, match="every: should be between 1 and the number of samples 203, not 204"):
-        run(rigid({"run.duration": 0.203}), every=204)
+        run(rigid_study({"run.duration": 0.203}), every=204)
 
 
 def test_seed_and_precision():
-    first, second = (run(rigid(), seed=seed).trace["theta_e"] for seed in (0, 1))
+    first, second = (run(rigid_study(), seed=seed).trace["theta_e"] for seed in (0, 1))
     assert 0.5e-4 < (first - second).std() < 2.5e-4
     # the same noise in both precisions
-    single = run(rigid({"run.precision": "float32"})).trace["theta_e"]
+    single = run(rigid_study({"run.precision": "float32"})).trace["theta_e"]
     np.testing.assert_allclose(single, first, atol=1e-6)
 
 
 def test_a_diverged_run_says_so():
-    trial = run(rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
+    trial = run(rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
     assert trial.summary["metrics"]["finite"] is False
     assert trial.summary["metrics"]["motor.velocity_rmse"] is None
     assert trial.summary["remarks"][-1].startswith("The run diverged")
 
 
 def test_axes_are_not_used():
-    config = read_config(rigid(axes=[listed("observer.motor.alpha", 1.0, 2.0)]))
+    config = read_config(rigid_study(axes=[listed_axis("observer.motor.alpha", 1.0, 2.0)]))
     assert run(config).summary["conditions"]["motor"]["alpha"] == 9.0
 
 
 def test_decimation_thins_the_trace_and_nothing_else():
-    study = small({"run.duration": 2.0})
+    study = small_study({"run.duration": 2.0})
     full, thin = (run(study, every=number) for number in (1, 1999))
     assert len(thin.trace) < 5
     assert thin.summary["remarks"] == full.summary["remarks"]
@@ -135,7 +135,7 @@ def test_decimation_thins_the_trace_and_nothing_else():
 
 def test_backends(monkeypatch):
     """Both give the same; one that is asked for is not replaced."""
-    study = rigid({"run.duration": 0.1})
+    study = rigid_study({"run.duration": 0.1})
     trials = [run(study, backend=backend) for backend in ("fused", "scan")]
     pd.testing.assert_frame_equal(trials[0].trace, trials[1].trace, rtol=1e-9)
 

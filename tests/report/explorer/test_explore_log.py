@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from browser import check, needs_chromium, opened
+from browser import check, needs_chromium, open_pages
 
 from jaxbl.errors import InputError
 from jaxbl.files import json_with_checksum
@@ -119,7 +119,7 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
 def test_lines_coordinates_and_moments(tmp_path):
     output = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
     write_page(tmp_path, ("log",), write_log(summary(), trace(), tmp_path) | output)
-    with opened(tmp_path / "index.html") as (page,):
+    with open_pages(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
         assert page.locator("#overhead").inner_text().startswith("Over motor position θe, and over")

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from browser import check, needs_chromium, opened
-from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
+from browser import check, needs_chromium, open_pages
+from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -23,7 +23,7 @@ from jaxbl.sweeps.trial import run
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 HOSTILE = "</script><script>alert(1)</script> <b>a</b> \u202e"
-AXES = [listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 2.0, 50.0, 6), spaced(LAMBDA, 1.0, 20.0, 5)]
+AXES = [listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 2.0, 50.0, 6), spaced_axis(LAMBDA, 1.0, 20.0, 5)]
 
 
 def product(frame):
@@ -31,8 +31,8 @@ def product(frame):
 
 
 def study(**columns):
-    data = rigid({"title": HOSTILE}, axes=AXES, sweep={"seeds": 3})
-    return made(data, motor__velocity_rmse=product, motor__f_plus=lambda frame: 1.0, **columns)
+    data = rigid_study({"title": HOSTILE}, axes=AXES, sweep={"seeds": 3})
+    return make_result(data, motor__velocity_rmse=product, motor__f_plus=lambda frame: 1.0, **columns)
 
 
 def source(result, lead=()):
@@ -69,7 +69,7 @@ def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
 
 def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
     columns = {"motor__stiffness_error": lambda frame: -2.0, "finite": lambda frame: frame["seed"] != 1}
-    result = made(small(axes=AXES, sweep={"seeds": 3}), **columns)
+    result = make_result(small_study(axes=AXES, sweep={"seeds": 3}), **columns)
     write_static(source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
     stiffness_error = table["motor.stiffness_error"]
@@ -80,9 +80,9 @@ def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
 
 
 def test_zipped_axes_are_one(tmp_path):
-    axes = [spaced(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
+    axes = [spaced_axis(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
             {"path": NOISE, "values": [1e-5, 1e-4, 1e-4], "zip": "pair"}]  # fmt: skip
-    result = made(rigid(axes=axes), motor__velocity_rmse=product)
+    result = make_result(rigid_study(axes=axes), motor__velocity_rmse=product)
     write_static(source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert len(table) == 9 and [len(axis["paths"]) for axis in about(tmp_path)["axes"]] == [1, 2, 1]
@@ -114,7 +114,7 @@ def read(values):
 def test_values_regions_cuts_and_a_point_as_config(tmp_path):
     result = study(motor__converged=lambda frame: frame["seed"] > 0)
     page_file = write_static(source(result, [HOSTILE]), tmp_path / "out")
-    with opened(page_file, color_scheme="dark") as (page,):
+    with open_pages(page_file, color_scheme="dark") as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
         plot, values = page.locator("#plot"), page.locator("#values")
@@ -191,14 +191,14 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
 
 @needs_chromium
 def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
-    together = [listed("run.substeps", 1, 2, zip="pair"), listed(NOISE, 1e-5, 1e-4, zip="pair")]
-    axes = [*together, spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
-    axes = [listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4), *axes]
+    together = [listed_axis("run.substeps", 1, 2, zip="pair"), listed_axis(NOISE, 1e-5, 1e-4, zip="pair")]
+    axes = [*together, spaced_axis(ALPHA, 2.0, 50.0, 6), listed_axis(LAMBDA, 20.0, 1.0, 5.0)]
+    axes = [listed_axis("effects.1.torque", 0.25, 0.5), listed_axis("effects.motor.cogging.harmonic", 3, 4), *axes]
     friction = {"kind": "motor.coulomb_friction", "torque": 0.02}
     effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
     columns = {"motor__velocity_rmse": lambda frame: frame[ALPHA] - 10.0, "motor__f_plus": lambda frame: 1.0}
-    result = made(rigid(axes=axes, effects=effects), **columns)
-    with opened(write_static(source(result), tmp_path / "out")) as (page,):
+    result = make_result(rigid_study(axes=axes, effects=effects), **columns)
+    with open_pages(write_static(source(result), tmp_path / "out")) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # from the least to the largest, which no logarithm shows
         assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
@@ -217,8 +217,9 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
     assert [one.get("torque", one.get("harmonic")) for one in drawn] == [0.02, 0.25, 3]
 
 
-SWEPT = rigid(
-    axes=[listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 5.0, 50.0, 3), spaced(LAMBDA, 1.0, 20.0, 2)], sweep={"chunk": 4}
+SWEPT = rigid_study(
+    axes=[listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 5.0, 50.0, 3), spaced_axis(LAMBDA, 1.0, 20.0, 2)],
+    sweep={"chunk": 4},
 )
 
 
@@ -296,7 +297,7 @@ CLICKS = """async () => {
 def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_path):
     with served(study_source(swept)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with opened(server.url) as (page,):
+        with open_pages(server.url) as (page,):
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
             plot = page.locator("#plot")
             plot.click(position={"x": 200, "y": 100})
@@ -368,9 +369,9 @@ def product_of_gains(frame):
 
 def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     axes = [{"path": ALPHA, "start": 2.0, "stop": 50.0, "scale": "log"}, {"path": LAMBDA, "start": 1.0, "stop": 20.0}, WORDS]
-    data = rigid(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
+    data = rigid_study(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
     columns = {"finite": lambda frame: frame["seed"] == 0, "motor__position_rmse": lambda frame: 1e300}
-    result = made(data, motor__velocity_rmse=product_of_gains, **columns)
+    result = make_result(data, motor__velocity_rmse=product_of_gains, **columns)
     write_study(result, tmp_path, ["found"])
     messages, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert (messages["rows"], messages["found"], messages["total"], messages["sampled"]) == (32, 32, 32, True)
@@ -386,9 +387,11 @@ def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
 
 @needs_chromium
 def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
-    result = made(rigid(axes=[spaced(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: 2.0 * frame[ALPHA])
+    result = make_result(
+        rigid_study(axes=[spaced_axis(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: 2.0 * frame[ALPHA]
+    )
     page_file = write_static(source(result), tmp_path / "out")
-    with opened(page_file) as (page,):
+    with open_pages(page_file) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} motor.velocity_rmse']")
         page.select_option("#log", "false")
         plane, values = page.locator("#plot .plane"), page.locator("#plot .values")
