@@ -32,7 +32,7 @@ def _browser():
 
 @contextmanager
 def open_pages(*paths, **options):
-    """Open a page for each file or address in a new profile; assert that none logs an error or asks for anything elsewhere."""
+    """Open a page for each file or address in a new profile; assert that they log no error and ask for nothing elsewhere."""
     browser, loop = _browser()
     # outside, other code of this thread may run loops
     asyncio._set_running_loop(loop)

@@ -19,7 +19,7 @@ def _step_observer(implicit, lambda_, alpha, reading, nominal):
 
 
 def step_errors(system, e, g, noise, mean, moment, nominal):
-    """Advance errors by one sample of the observer's own step on a double integrator: next e and g, and the estimate's error."""
+    """Advance e and g by one sample of the observer's own step on a double integrator; return also the estimate's error."""
     reading, nominal = np.broadcast_arrays(np.asarray(e, float) + noise, nominal)
     count = len(reading)
     # few lengths, as each is compiled

@@ -46,7 +46,10 @@ def simulate_multisine_log(
     torque_noise: float = 0.0,
     felt: bool = False,
 ) -> Log:
-    """Simulate 4 s of the direct drive under a multisine; `torque_noise`: of the recorded input, N m, felt by the drive or not."""
+    """Simulate 4 s of the direct drive under a multisine.
+
+    `torque_noise` (N m) is of the recorded input; the drive has felt it if `felt`.
+    """
     t = 2e-3 * np.arange(2000)
     phases = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
     k = np.arange(1, 7)
@@ -101,7 +104,7 @@ def record_study(study: dict[str, Any], folder: Path) -> Record:
 
 @cache
 def simulate_geared_drive() -> tuple[Log, dict[str, np.ndarray]]:
-    """Simulate 4 s of a drive with a gap and hidden frictions, small beside the transmitted torque: log, true speeds (rad/s)."""
+    """Simulate 4 s of a drive with a gap and small hidden frictions; return the log and the true speeds, rad/s."""
     t = 2e-3 * np.arange(2000)
     torque = 5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0))
     machine = Machine(GEARED, GAP, FRICTIONS)
