@@ -114,13 +114,15 @@ def rounding(folder: Path) -> None:
     print(f"30 cells at a noise of 1e-4 rad, run again by scan: {np.sum(np.array(apart) > 1e-3)} differ by more than 0.1 % "
           f"from the sweep, the largest by {100 * max(apart):.2g} %")  # fmt: skip
     point = with_values(result.config, {NOISE: 1e-4, LAMBDA: 1.512, ALPHA: 5.268})
-    near = [one[ERROR] for one in run_perturbed(point, 0, 20)]
+    near = [metrics[ERROR] for metrics in run_perturbed(point, 0, 20)]
     seeds = [run(point, seed=seed, backend="scan").summary["metrics"][ERROR] for seed in range(20)]
     for name, values in (("numbers that differ in the last digits", near), ("seeds", seeds)):
         print(f"{name}: {np.mean(values):.4f} rad/s, standard deviation {100 * np.std(values) / np.mean(values):.2g} %")
-    one, other = (run(with_values(point, {ALPHA: alpha}), backend="scan").trace for alpha in (5.268, 5.268 * (1 + 1e-14)))
-    difference = (one["motor.velocity_estimate"] - other["motor.velocity_estimate"]).abs()
-    print(f"estimates differ by more than 1 mrad/s from {one['t'][difference > 1e-3].iloc[0]:.2f} s on")
+    trace, neighbour = (
+        run(with_values(point, {ALPHA: alpha}), backend="scan").trace for alpha in (5.268, 5.268 * (1 + 1e-14))
+    )
+    difference = (trace["motor.velocity_estimate"] - neighbour["motor.velocity_estimate"]).abs()
+    print(f"estimates differ by more than 1 mrad/s from {trace['t'][difference > 1e-3].iloc[0]:.2f} s on")
 
 
 if __name__ == "__main__":

@@ -216,7 +216,7 @@ def simulate(study: Config, finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
 def _run_plant(experiment: Experiment) -> tuple[jax.Array, jax.Array]:
     inputs = jax.vmap(experiment.excitation)(jnp.arange(experiment.run.steps) * experiment.run.sample_period)
     states = plant_trajectory(experiment, experiment.plant.init(experiment.initial), inputs)
-    columns = [one[side] for side in experiment.sides for one in (states.position, states.velocity)]
+    columns = [quantity[side] for side in experiment.sides for quantity in (states.position, states.velocity)]
     return inputs, jnp.stack(columns, axis=1)
 
 

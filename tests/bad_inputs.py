@@ -37,7 +37,7 @@ ESC = "\x1b[31mred"
 STUDY = small_study(axes=[listed_axis(ALPHA, 5.0, 9.0)])
 
 
-def study(path: Path) -> str:
+def check_study(path: Path) -> str:
     """Check a study as a command does before it computes; return the line that refuses it, or ""."""
     try:
         config = read_config(path)
@@ -49,7 +49,7 @@ def study(path: Path) -> str:
         return str(error)
 
 
-def log(path: Path, model: Path | None = None) -> str:
+def check_log(path: Path, model: Path | None = None) -> str:
     """Read a log as a command does before it computes; return the line that refuses it, or its remarks."""
     try:
         table = None if model is None else read_log_config(model)[0]
@@ -58,32 +58,32 @@ def log(path: Path, model: Path | None = None) -> str:
         return str(error)
 
 
-def text(data, old="", new="") -> str:
+def format_toml(data, old="", new="") -> str:
     return tomli_w.dumps(data).replace(old, new)
 
 
-def included(folder: Path, count: int, times: int) -> str:
-    """A study behind files that include the next one so many times."""
+def write_include_chain(folder: Path, count: int, times: int) -> str:
+    """Write `count` files that include the next one `times` times, and a study; return what includes the first."""
     for i in range(count):
         (folder / f"{i}.toml").write_text(f"include = {[f'{i + 1}.toml'] * times}\n")
-    (folder / f"{count}.toml").write_text(text(STUDY))
+    (folder / f"{count}.toml").write_text(format_toml(STUDY))
     return 'include = "0.toml"\n'
 
 
-def sine(frequency: float):
+def sine_input(frequency: float):
     return {"kind": "sine", "amplitude": 0.1, "frequency": frequency}
 
 
-def recorded(file: str):
+def recorded_input_study(file: str):
     return small_study(excitation={"kind": "recorded", "file": file})
 
 
-def pipe(folder: Path) -> str:
+def make_pipe(folder: Path) -> str:
     os.mkfifo(folder / "pipe.csv")
     return "pipe.csv"
 
 
-def short(folder: Path) -> str:
+def write_short_record(folder: Path) -> str:
     pd.DataFrame({"t": [0.0, 0.05], "u": [1.0, 2.0]}).to_csv(folder / "short.csv", index=False)
     return "short.csv"
 
@@ -93,34 +93,34 @@ STUDIES = {
     "inertia": lambda folder: small_study({"drive.motor_inertia": 5e-324}),
     "substeps of 1e30": lambda folder: small_study({"run.substeps": 10**30}),
     "substeps of 1e9": lambda folder: small_study({"run.substeps": 10**9}),
-    "nested": lambda folder: f"notes = {'[' * 900}{']' * 900}\n{text(STUDY)}",
-    "nested tables": lambda folder: f"a.{'.'.join(['b'] * 49)} = 1\n{text(STUDY)}",
-    "dotted": lambda folder: f"a.{'.'.join(['b'] * 900)} = 1\n{text(STUDY)}",
-    "nested far": lambda folder: f"notes = {'[' * 100000}{']' * 100000}\n{text(STUDY)}",
+    "nested": lambda folder: f"notes = {'[' * 900}{']' * 900}\n{format_toml(STUDY)}",
+    "nested tables": lambda folder: f"a.{'.'.join(['b'] * 49)} = 1\n{format_toml(STUDY)}",
+    "dotted": lambda folder: f"a.{'.'.join(['b'] * 900)} = 1\n{format_toml(STUDY)}",
+    "nested far": lambda folder: f"notes = {'[' * 100000}{']' * 100000}\n{format_toml(STUDY)}",
     "long kind": lambda folder: small_study(effects=[{"kind": "x" * 5000}]),
     "long key": lambda folder: small_study({f"drive.{'x' * 5000}": 1.0}),
     "long title": lambda folder: small_study(title="x" * 5000),
     "long path": lambda folder: small_study(axes=[listed_axis("o" * 5000, 1.0, 2.0)]),
-    "chained": lambda folder: included(folder, 2000, 1),
-    "doubled": lambda folder: included(folder, 30, 2),
-    "pipe included": lambda folder: f'include = "{pipe(folder)}"\n',
+    "chained": lambda folder: write_include_chain(folder, 2000, 1),
+    "doubled": lambda folder: write_include_chain(folder, 30, 2),
+    "pipe included": lambda folder: f'include = "{make_pipe(folder)}"\n',
     "device included": lambda folder: 'include = "/dev/zero"\n',
-    "pipe recorded": lambda folder: recorded(pipe(folder)),
-    "device recorded": lambda folder: recorded("/dev/zero"),
+    "pipe recorded": lambda folder: recorded_input_study(make_pipe(folder)),
+    "device recorded": lambda folder: recorded_input_study("/dev/zero"),
     "harmonics": lambda folder: small_study(
         excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 1.0, "count": 10**9}
     ),
-    "values": lambda folder: text(STUDY).replace("5.0,\n", ",".join(["5.0"] * 3_000_000) + ","),
-    "fewer values": lambda folder: text(STUDY).replace("5.0,\n", ",".join(["5.0"] * 400_000) + ","),
-    "sine at the rate": lambda folder: small_study(excitation=sine(1000.0)),
+    "values": lambda folder: format_toml(STUDY).replace("5.0,\n", ",".join(["5.0"] * 3_000_000) + ","),
+    "fewer values": lambda folder: format_toml(STUDY).replace("5.0,\n", ",".join(["5.0"] * 400_000) + ","),
+    "sine at the rate": lambda folder: small_study(excitation=sine_input(1000.0)),
     "short steps": lambda folder: small_study(excitation={"kind": "steps", "amplitude": 0.1, "hold": 1e-12}),
-    "short record": lambda folder: recorded(short(folder)),
+    "short record": lambda folder: recorded_input_study(write_short_record(folder)),
     "gear ratio": lambda folder: small_study({"drive.gear_ratio": 1e-12}),
     "escape": lambda folder: small_study(title=ESC),
 }
 
 
-def hdf5(folder: Path, more) -> Path:
+def write_hdf5(folder: Path, more) -> Path:
     path = folder / "log.h5"
     with h5py.File(path, "w") as file:
         for name, values in simulate_log(count=400).items():
@@ -129,7 +129,7 @@ def hdf5(folder: Path, more) -> Path:
     return path
 
 
-def unpacking(name: str, *shape: int, dtype="f8"):
+def compressed_dataset(name: str, *shape: int, dtype="f8"):
     def add(file):
         file.pop(name, None)
         options = {"chunks": (1,) * (len(shape) - 1) + (1_000_000,), "compression": "gzip"}
@@ -138,21 +138,21 @@ def unpacking(name: str, *shape: int, dtype="f8"):
     return add
 
 
-def external(file):
+def store_elsewhere(file):
     del file["theta_s"]
     file.create_dataset("theta_s", shape=(400,), dtype="u1", external=[(__file__, 0, 400)])
 
 
-def linked(file):
+def link_elsewhere(file):
     del file["theta_s"]
     file["theta_s"] = h5py.ExternalLink("other.h5", "x")
 
 
-def looped(file):
+def link_to_itself(file):
     file.create_group("g")["again"] = file["/"]
 
 
-def table(folder: Path, name="log.csv", change=lambda frame: None, **columns) -> Path:
+def write_table(folder: Path, name="log.csv", change=lambda frame: None, **columns) -> Path:
     frame = simulate_log(count=4000)
     for column, function in columns.items():
         frame[column] = function(frame[column])
@@ -162,58 +162,60 @@ def table(folder: Path, name="log.csv", change=lambda frame: None, **columns) ->
     return path
 
 
-def content(folder: Path, name: str, what: str) -> Path:
-    (folder / name).write_text(what)
+def write_text(folder: Path, name: str, text: str) -> Path:
+    (folder / name).write_text(text)
     return folder / name
 
 
-def modelled(folder: Path, model: str) -> tuple[Path, Path]:
-    return table(folder), content(folder, "model.toml", model)
+def write_table_and_model(folder: Path, model: str) -> tuple[Path, Path]:
+    return write_table(folder), write_text(folder, "model.toml", model)
 
 
-def matlab(folder: Path) -> Path:
+def write_complex_matlab(folder: Path) -> Path:
     columns = {name: values.to_numpy() for name, values in simulate_log(count=400).items()}
     savemat(folder / "log.mat", columns | {"theta_s": columns["theta_s"] * (1.0 + 1.0j)})
     return folder / "log.mat"
 
 
-def frozen(values: pd.Series) -> pd.Series:
+def freeze_values(values: pd.Series) -> pd.Series:
     values = values.copy()
     values[1000:3000] = values[1000]
     return values
 
 
 LOGS = {
-    "number": lambda folder: content(folder, "log.json", "3"),
-    "deep array": lambda folder: content(folder, "log.json", "[" * 100_000 + "]" * 100_000),
-    "deep object": lambda folder: content(folder, "log.json", '{"a":' * 50_000 + "1" + "}" * 50_000),
-    "one line": lambda folder: content(folder, "log.csv", "1," * 25_000_000),
-    "one line of text": lambda folder: content(folder, "log.txt", "a " * 25_000_000),
-    "one cell": lambda folder: content(folder, "log.csv", '"' * 50_000_000),
-    "a long row": lambda folder: content(folder, "log.csv", "t,u,theta_e\n" + "1," * 25_000_000),
-    "late stamps": lambda folder: table(folder, t=lambda t: t * 1e300),
-    "early stamps": lambda folder: table(folder, t=lambda t: t * 1e-300),
-    "far positions": lambda folder: table(folder, theta_e=lambda x: x * 1e300),
-    "no motion": lambda folder: table(folder, theta_e=lambda x: x * 1e-300),
-    "no torque": lambda folder: table(folder, u=lambda x: x * 1e-300),
-    "resampled": lambda folder: modelled(folder, "[log]\nresample = 1e-12\n"),
-    "drifting": lambda folder: modelled(folder, "[log]\ntheta_s = { drift = -1e9 }\n"),
-    "unpacks": lambda folder: hdf5(folder, unpacking("junk", 2_000_000_000)),
-    "unpacks twice": lambda folder: hdf5(folder, unpacking("junk", 2, 2_000_000_000)),
-    "unpacks in use": lambda folder: hdf5(folder, unpacking("u", 2_000_000_000)),
-    "unpacks less": lambda folder: hdf5(folder, unpacking("u", 90_000_000)),
-    "unpacks cells": lambda folder: hdf5(folder, unpacking("cells", 2_000_000_000, dtype=h5py.ref_dtype)),
-    "external": lambda folder: hdf5(folder, external),
-    "external link": lambda folder: hdf5(folder, linked),
-    "loop": lambda folder: hdf5(folder, looped),
-    "complex": matlab,
-    "dates": lambda folder: table(
+    "number": lambda folder: write_text(folder, "log.json", "3"),
+    "deep array": lambda folder: write_text(folder, "log.json", "[" * 100_000 + "]" * 100_000),
+    "deep object": lambda folder: write_text(folder, "log.json", '{"a":' * 50_000 + "1" + "}" * 50_000),
+    "one line": lambda folder: write_text(folder, "log.csv", "1," * 25_000_000),
+    "one line of text": lambda folder: write_text(folder, "log.txt", "a " * 25_000_000),
+    "one cell": lambda folder: write_text(folder, "log.csv", '"' * 50_000_000),
+    "a long row": lambda folder: write_text(folder, "log.csv", "t,u,theta_e\n" + "1," * 25_000_000),
+    "late stamps": lambda folder: write_table(folder, t=lambda t: t * 1e300),
+    "early stamps": lambda folder: write_table(folder, t=lambda t: t * 1e-300),
+    "far positions": lambda folder: write_table(folder, theta_e=lambda x: x * 1e300),
+    "no motion": lambda folder: write_table(folder, theta_e=lambda x: x * 1e-300),
+    "no torque": lambda folder: write_table(folder, u=lambda x: x * 1e-300),
+    "resampled": lambda folder: write_table_and_model(folder, "[log]\nresample = 1e-12\n"),
+    "drifting": lambda folder: write_table_and_model(folder, "[log]\ntheta_s = { drift = -1e9 }\n"),
+    "unpacks": lambda folder: write_hdf5(folder, compressed_dataset("junk", 2_000_000_000)),
+    "unpacks twice": lambda folder: write_hdf5(folder, compressed_dataset("junk", 2, 2_000_000_000)),
+    "unpacks in use": lambda folder: write_hdf5(folder, compressed_dataset("u", 2_000_000_000)),
+    "unpacks less": lambda folder: write_hdf5(folder, compressed_dataset("u", 90_000_000)),
+    "unpacks cells": lambda folder: write_hdf5(folder, compressed_dataset("cells", 2_000_000_000, dtype=h5py.ref_dtype)),
+    "external": lambda folder: write_hdf5(folder, store_elsewhere),
+    "external link": lambda folder: write_hdf5(folder, link_elsewhere),
+    "loop": lambda folder: write_hdf5(folder, link_to_itself),
+    "complex": write_complex_matlab,
+    "dates": lambda folder: write_table(
         folder, "log.parquet", t=lambda t: pd.Timestamp("2026-01-01", tz="Europe/Berlin") + pd.to_timedelta(t, unit="s")
     ),
-    "frozen": lambda folder: table(folder, theta_s=frozen),
-    "clipped": lambda folder: table(folder, theta_s=lambda x: x.clip(upper=x.quantile(0.6))),
-    "escape": lambda folder: table(folder, change=lambda frame: frame.rename(columns={"theta_e": ESC, "theta_s": "b"})),
-    "pipe": lambda folder: folder / pipe(folder),
+    "frozen": lambda folder: write_table(folder, theta_s=freeze_values),
+    "clipped": lambda folder: write_table(folder, theta_s=lambda x: x.clip(upper=x.quantile(0.6))),
+    "escape": lambda folder: write_table(
+        folder, change=lambda frame: frame.rename(columns={"theta_e": ESC, "theta_s": "b"})
+    ),
+    "pipe": lambda folder: folder / make_pipe(folder),
     "device": lambda folder: Path("/dev/zero"),
 }
 
@@ -229,7 +231,7 @@ ODD = st.one_of(
     st.recursive(st.just(1.0), lambda inner: st.lists(inner, min_size=1, max_size=2), max_leaves=40),
 )
 NUMBERS = st.one_of(st.sampled_from(FLOATS), st.floats(-30.0, 30.0).map(lambda power: 10.0**power))
-WHOLE = [
+FULL_STUDIES = [
     small_study(
         axes=[spaced_axis(ALPHA, 5.0, 20.0, 3), listed_axis(LAMBDA, 1.0, 2.0)],
         figures=[{"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse"}],
@@ -254,61 +256,60 @@ WHOLE = [
 ]  # fmt: skip
 
 
-def places(data, key=()):
-    """The way to each table, array and value."""
+def list_paths(data, parents=()):
+    """Yield the keys that lead to each table, array and value."""
     pairs = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for name, value in pairs:
-        yield (*key, name)
-        yield from places(value, (*key, name))
+        yield (*parents, name)
+        yield from list_paths(value, (*parents, name))
 
 
-def changed(draw, data):
-    """A study with one to three of its values, keys or tables replaced, removed, or put where they do not belong."""
+def mutate_tables(draw, data):
+    """Replace, remove or misplace one to three values, keys or tables of a study."""
     data = json.loads(json.dumps(data))
     for _ in range(draw(st.integers(1, 3))):
-        *way, last = draw(st.sampled_from(list(places(data))))
-        inner = data
-        for one in way:
-            inner = inner[one]
-        how = draw(st.sampled_from([*["number"] * 8, *["replace"] * 3, "remove", "add"]))
-        if how == "remove":
-            del inner[last]
-        elif how == "add" and isinstance(inner, dict):
-            inner[draw(st.one_of(st.sampled_from([one for one in TEXTS if one]), st.text(min_size=1, max_size=9)))] = (
-                copy.deepcopy(draw(ODD))
-            )
-        elif how == "number" and isinstance(inner[last], str):
-            inner[last] = draw(st.sampled_from(TEXTS))
-        elif how == "number" and isinstance(inner[last], int | float):
-            inner[last] = draw(NUMBERS) if isinstance(inner[last], float) else draw(st.sampled_from(INTEGERS))
-        elif how != "number":
-            inner[last] = copy.deepcopy(draw(ODD))
+        *parents, last = draw(st.sampled_from(list(list_paths(data))))
+        container = data
+        for name in parents:
+            container = container[name]
+        mutation = draw(st.sampled_from([*["number"] * 8, *["replace"] * 3, "remove", "add"]))
+        if mutation == "remove":
+            del container[last]
+        elif mutation == "add" and isinstance(container, dict):
+            key = draw(st.one_of(st.sampled_from([text for text in TEXTS if text]), st.text(min_size=1, max_size=9)))
+            container[key] = copy.deepcopy(draw(ODD))
+        elif mutation == "number" and isinstance(container[last], str):
+            container[last] = draw(st.sampled_from(TEXTS))
+        elif mutation == "number" and isinstance(container[last], int | float):
+            container[last] = draw(NUMBERS) if isinstance(container[last], float) else draw(st.sampled_from(INTEGERS))
+        elif mutation != "number":
+            container[last] = copy.deepcopy(draw(ODD))
         if not data:
             break
     return data
 
 
-def scrambled(draw, content: bytes) -> bytes:
-    """A file cut short, or with bytes that are others."""
-    how = draw(st.sampled_from([*["no"] * 9, "cut", "bytes", "again"]))
-    if how == "cut":
+def scramble_bytes(draw, content: bytes) -> bytes:
+    """Cut a file short, repeat it, or change some of its bytes."""
+    fault = draw(st.sampled_from([*["no"] * 9, "cut", "bytes", "again"]))
+    if fault == "cut":
         return content[: draw(st.integers(0, len(content)))]
-    if how == "again":
+    if fault == "again":
         return content * draw(st.integers(2, 4))
     array = bytearray(content)
-    for _ in range(draw(st.integers(1, 20)) if how == "bytes" and content else 0):
+    for _ in range(draw(st.integers(1, 20)) if fault == "bytes" and content else 0):
         array[draw(st.integers(0, len(content) - 1))] = draw(st.integers(0, 255))
     return bytes(array)
 
 
 @st.composite
 def studies(draw) -> bytes:
-    data = changed(draw, draw(st.sampled_from(WHOLE)))
+    data = mutate_tables(draw, draw(st.sampled_from(FULL_STUDIES)))
     try:
         content = tomli_w.dumps(data).encode()
     except UnicodeEncodeError:
         content = b""
-    return scrambled(draw, content)
+    return scramble_bytes(draw, content)
 
 
 KINDS = ["csv", "csv", "txt", "json", "parquet", "mat", "h5"]
@@ -323,7 +324,7 @@ COLUMNS = {
     "missing": lambda x: np.where(np.arange(len(x)) % 7 == 3, np.nan, x),
     "nothing": lambda x: x * np.nan,
     "endless": lambda x: np.where(np.arange(len(x)) == 99, np.inf, x),
-    "words": lambda x: np.array([f"{one:.3g} V" for one in x], dtype=object),
+    "words": lambda x: np.array([f"{number:.3g} V" for number in x], dtype=object),
     "switch": lambda x: x > np.median(x),
     "counts": lambda x: np.round(x * 1e3).astype(np.int64),
     "unsigned": lambda x: np.round(x * 1e3).astype(np.int64).astype(np.uint16),
@@ -347,7 +348,7 @@ TABLES = [
 ]
 
 
-def written(path: Path, columns: dict) -> None:
+def write_log(path: Path, columns: dict) -> None:
     frame = pd.DataFrame(columns)
     if path.suffix == ".parquet":
         frame.astype({name: str for name, column in columns.items() if column.dtype.kind == "c"}).to_parquet(path)
@@ -382,25 +383,25 @@ def logs(draw, path: Path) -> tuple[Path, bytes]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # names that MATLAB would not take
         try:
-            written(path, columns)
+            write_log(path, columns)
         except UnicodeEncodeError:
             reject()
-    path.write_bytes(scrambled(draw, path.read_bytes()))
+    path.write_bytes(scramble_bytes(draw, path.read_bytes()))
     model = draw(st.sampled_from(TABLES))
     if model and draw(st.booleans()):
-        model = changed(draw, model)
+        model = mutate_tables(draw, model)
     try:
         return path, tomli_w.dumps({"log": model}).encode()
     except UnicodeEncodeError:
         return path, b""
 
 
-def checked(read, *given) -> str:
+def check_output(read, *inputs) -> str:
     """Return the line about an input; raise an error if it is no line, or took too much."""
     # of the processor's time: a crowded machine is no failure; and what waits is ended after a while
     before = sum(os.times()[:2])
     faulthandler.dump_traceback_later(10 * SECONDS, exit=True)
-    output = read(*given)
+    output = read(*inputs)
     faulthandler.cancel_dump_traceback_later()
     assert sum(os.times()[:2]) - before < SECONDS, "took too long"
     assert 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < BYTES, "took too much memory"
@@ -409,41 +410,43 @@ def checked(read, *given) -> str:
     return output
 
 
-def main(what: str, folder: Path) -> None:
+def main(kind: str, folder: Path) -> None:
     output: dict[str, str] = {}
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     # that a failure of this test is no failure of the machine
     resource.setrlimit(resource.RLIMIT_AS, (size + 3 * BYTES, size + 3 * BYTES))
     warnings.simplefilter("error")
-    if what == "listed":
+    if kind == "listed":
         for prefix, cases in (("study", STUDIES), ("log", LOGS)):
             for name, make in cases.items():
-                place = folder / f"{prefix} {name}"
-                place.mkdir()
-                result = make(place)
+                case_folder = folder / f"{prefix} {name}"
+                case_folder.mkdir()
+                case_input = make(case_folder)
                 if prefix == "study":
-                    path = content(place, "study.toml", result if isinstance(result, str) else text(result))
-                    output[f"{prefix} {name}"] = checked(study, path)
+                    text = case_input if isinstance(case_input, str) else format_toml(case_input)
+                    line = check_output(check_study, write_text(case_folder, "study.toml", text))
                 else:
-                    output[f"{prefix} {name}"] = checked(log, *(result if isinstance(result, tuple) else (result,)))
+                    line = check_output(check_log, *(case_input if isinstance(case_input, tuple) else (case_input,)))
+                output[f"{prefix} {name}"] = line
     else:
         path, model = folder / "study.toml", folder / "model.toml"
-        generated = settings(max_examples=int(sys.argv[3]), database=None, derandomize=True, deadline=None,
+        generation = settings(max_examples=int(sys.argv[3]), database=None, derandomize=True, deadline=None,
                              suppress_health_check=list(HealthCheck))  # fmt: skip
 
-        @generated
+        @generation
         @given(studies())
         def try_study(data):
             path.write_bytes(data)
-            output[str(len(output))] = checked(study, path)
+            output[str(len(output))] = check_output(check_study, path)
 
-        @generated
+        @generation
         @given(logs(folder / "log"))
-        def try_log(given):
-            model.write_bytes(given[1])
-            output[str(len(output))] = checked(log, given[0], model)
+        def try_log(log_input):
+            log_path, model_text = log_input
+            model.write_bytes(model_text)
+            output[str(len(output))] = check_output(check_log, log_path, model)
 
-        try_study() if what == "toml" else try_log()
+        try_study() if kind == "toml" else try_log()
     (folder / "said.json").write_text(json.dumps(output))
 
 

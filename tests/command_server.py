@@ -118,32 +118,32 @@ def run_python(*arguments, cwd, timeout=300.0, **environment):
 @functools.cache
 def _server():
     """The connection to this process's server, which ends when it is closed."""
-    own, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    call = [sys.executable, __file__, str(its.fileno())]
+    client_socket, server_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    call = [sys.executable, __file__, str(server_socket.fileno())]
     # one thread of BLAS: matrices are small
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(_paths())}
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             call,
             env=environment,
-            pass_fds=[its.fileno()],
+            pass_fds=[server_socket.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,
         )
-        its.close()
-        ready = own.recv(_MESSAGE)
+        server_socket.close()
+        ready = client_socket.recv(_MESSAGE)
         errors.seek(0)
         # a user would read what an import says at each command
         assert (ready, errors.read().decode()) == (_READY, "")
 
     def end():
         # forks of this process may hold the connection, too
-        own.shutdown(socket.SHUT_RDWR)
+        client_socket.shutdown(socket.SHUT_RDWR)
         process.wait()
 
     atexit.register(end)
-    return own
+    return client_socket
 
 
 def _paths():

@@ -30,7 +30,7 @@ VERIFIED = rigid_study(
 
 
 @pytest.fixture(scope="session")
-def verified(tmp_path_factory):
+def verified_study(tmp_path_factory):
     """The verdict on `VERIFIED`, and its folder."""
     from jaxbl.gains.verify import verify
 

@@ -20,8 +20,8 @@ TORQUE, LENGTH = 0.06, 0.2
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory):
-    """Environment of processes that have the package."""
+def installed_effect(tmp_path_factory):
+    """Environment of processes that have the page's package of an effect."""
     text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     folder, site = tmp_path_factory.mktemp("package"), tmp_path_factory.mktemp("site")
     for name, content in re.findall(r"```(?:python|toml)\n# (\S+)\n(.*?)```", text, re.S):
@@ -31,9 +31,9 @@ def installed(tmp_path_factory):
     return {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
 
 
-def jaxbl(installed, *arguments):
+def jaxbl(environment, *arguments):
     """Run a command in a process of its own."""
-    done = run_command(*arguments, cwd=ROOT, **installed)
+    done = run_command(*arguments, cwd=ROOT, **environment)
     assert done.returncode == 0, done.stderr
     assert "warning" not in done.stderr
     return done.stdout
@@ -59,29 +59,29 @@ def logs(tmp_path_factory):
     return folder / "log.csv", folder / "other.csv"
 
 
-def test_it_is_simulated_and_swept_over(installed, tmp_path):
+def test_it_is_simulated_and_swept_over(installed_effect, tmp_path):
     study = tmp_path / "study.toml"
     study.write_text(tomli_w.dumps(rigid_study()) + study_block(), encoding="utf-8")
-    jaxbl(installed, "simulate", study, "--out", tmp_path / "run")
-    jaxbl(installed, "sweep", study, "--out", tmp_path / "sweep")
+    jaxbl(installed_effect, "simulate", study, "--out", tmp_path / "run")
+    jaxbl(installed_effect, "sweep", study, "--out", tmp_path / "sweep")
     assert (tmp_path / "run" / "report.html").exists()
     assert f"effects.{NAME}.torque" in (tmp_path / "sweep" / "report.html").read_text(encoding="utf-8")
 
 
-def test_its_numbers_are_identified(installed, logs, tmp_path):
-    known = nominal_study(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
-    (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
-    jaxbl(installed, "identify", logs[0], "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
+def test_its_numbers_are_identified(installed_effect, logs, tmp_path):
+    model = nominal_study(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
+    (tmp_path / "model.toml").write_text(tomli_w.dumps(model), encoding="utf-8")
+    jaxbl(installed_effect, "identify", logs[0], "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
     parameters = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
     assert parameters[f"effects.{NAME}.torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
     assert parameters[f"effects.{NAME}.length"]["value"] == pytest.approx(LENGTH, rel=0.05)
 
 
-def test_it_is_named_where_it_is_missing(installed, logs, tmp_path):
+def test_it_is_named_where_it_is_missing(installed_effect, logs, tmp_path):
     log, other = logs
     (tmp_path / "model.toml").write_text(tomli_w.dumps(nominal_study()), encoding="utf-8")
     out = tmp_path / "found"
-    jaxbl(installed, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
+    jaxbl(installed_effect, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
     content = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert content["verdict"] == "explained"
     (finding,) = content["findings"]
@@ -91,8 +91,8 @@ def test_it_is_named_where_it_is_missing(installed, logs, tmp_path):
     assert NAME in (out / "model.toml").read_text(encoding="utf-8")
 
 
-def test_the_reference_lists_it(installed):
+def test_the_reference_lists_it(installed_effect):
     code = "import docs.generate as g; print(g.page())"
-    done = run_python("-c", code, cwd=ROOT, **installed)
+    done = run_python("-c", code, cwd=ROOT, **installed_effect)
     assert done.returncode == 0, done.stderr
     assert f"| `{NAME}` | Friction that builds up over a sliding length" in done.stdout

@@ -19,7 +19,7 @@ from small_study import ALPHA, listed_axis, rigid_study
 HERE = Path(__file__).parent
 
 # said of the inputs that :mod:`bad_inputs` lists; "" where there is nothing to say
-SAID = {
+EXPECTED_LINES = {
     "study inertia": "drive.motor_inertia: should be at least 1e-30, not 4.94066e-324",
     "study substeps of 1e30": "run.substeps: should be a number of 64 bits, not 0xc9f2c9cd04674edea40000000",
     "study substeps of 1e9": "run.substeps: should be less than or equal to 100000, not 1000000000",
@@ -77,33 +77,33 @@ SAID = {
 }
 
 
-def read(what: str, folder: Path, count: int = 0) -> dict[str, str]:
+def read_lines(kind: str, folder: Path, count: int = 0) -> dict[str, str]:
     """Lines about the inputs of a kind, by a process that ends where one takes too much."""
-    done = run_python(HERE / "bad_inputs.py", what, folder, count, cwd=folder, timeout=1500.0)
+    done = run_python(HERE / "bad_inputs.py", kind, folder, count, cwd=folder, timeout=1500.0)
     assert done.returncode == 0, done.stderr[-5000:]
     return json.loads((folder / "said.json").read_text())
 
 
 @pytest.fixture(scope="module")
-def said(tmp_path_factory):
-    return read("listed", tmp_path_factory.mktemp("listed"))
+def lines_by_input(tmp_path_factory):
+    return read_lines("listed", tmp_path_factory.mktemp("listed"))
 
 
-def test_every_listed_input_was_tried(said):
-    assert said.keys() == SAID.keys()
+def test_every_listed_input_was_tried(lines_by_input):
+    assert lines_by_input.keys() == EXPECTED_LINES.keys()
 
 
-@pytest.mark.parametrize("case", SAID)
-def test_what_is_said_of_it(said, case):
-    assert SAID[case] in said[case]
-    assert bool(SAID[case]) == bool(said[case])
+@pytest.mark.parametrize("case", EXPECTED_LINES)
+def test_what_is_said_of_it(lines_by_input, case):
+    assert EXPECTED_LINES[case] in lines_by_input[case]
+    assert bool(EXPECTED_LINES[case]) == bool(lines_by_input[case])
 
 
-@pytest.mark.parametrize("what", ["toml", "logs"])
-def test_generated_ones(what, tmp_path, repeats):
+@pytest.mark.parametrize("kind", ["toml", "logs"])
+def test_generated_ones(kind, tmp_path, repeats):
     """Read, or refused in one line; the process itself ends at an exception, at ten seconds, and at two gigabytes."""
     count = repeats(70, 1000)
-    lines = read(what, tmp_path, count).values()
+    lines = read_lines(kind, tmp_path, count).values()
     assert len(lines) >= count
     # neither all refused nor all read
     refused = sum(str(tmp_path) in line for line in lines)

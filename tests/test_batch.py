@@ -37,11 +37,15 @@ def test_a_batch_is_a_table(tmp_path):
 
 def test_its_table_fits_a_terminal_with_long_names(tmp_path):
     names = [f"transmission.friction_of_{'another_' * i}package" for i in range(1, 5)]
-    many = DIAGNOSIS | {"findings": [{"effect": name, "confidence": 0.5} for name in names]}
+    many_findings = DIAGNOSIS | {"findings": [{"effect": name, "confidence": 0.5} for name in names]}
     rows = [
         make_batch_row(tmp_path / name, result, refused)
         for name in ("a.csv", f"{'machine_' * 6}7.csv")
-        for result, refused in ((many, ""), (DIAGNOSIS, ""), (None, f"a.csv: {'columns should have other names; ' * 9}"))
+        for result, refused in (
+            (many_findings, ""),
+            (DIAGNOSIS, ""),
+            (None, f"a.csv: {'columns should have other names; ' * 9}"),
+        )
     ]
     lines = format_batch(rows)
     assert all(len(line) <= 80 for line in lines) and all(name in " ".join(lines) for name in names)

@@ -1007,39 +1007,45 @@ def test_after_logs_what_is_open_by_what_was_found():
     def commands(steps):
         assert all(len(line) <= 80 for line in format_steps(steps) if line.startswith("    "))
         assert steps[-1].command == "jaxbl explore out"
-        return [one.command for one in steps[:-1]]
+        return [step.command for step in steps[:-1]]
 
-    def identified(rms, done=None, holdout=None, wanted=None, **more):
+    def identify_steps(rms, done=None, holdout=None, planned_file=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
         return commands(
-            after_identification(done or task(1000), summary, again, folder, LogCall(logs, model, holdout, wanted))
+            after_identification(done or task(1000), summary, again, folder, LogCall(logs, model, holdout, planned_file))
         )
 
     diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
     simulate = "jaxbl simulate out/model.toml --out out_run"
-    assert identified(3.0) == [f"{diagnose} --out out_diagnosed"]
+    assert identify_steps(3.0) == [f"{diagnose} --out out_diagnosed"]
     # too short to hold a quarter out, but for another log
-    assert identified(3.0, task(300)) == []
-    assert identified(3.0, task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
-    assert identified(1.0) == [simulate]
+    assert identify_steps(3.0, task(300)) == []
+    assert identify_steps(3.0, task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
+    assert identify_steps(1.0) == [simulate]
     # the input of a log with gaps cannot be played back; that of the study can
-    assert identified(1.0, task(1000, 2)) == [] and identified(1.0, task(1000, 2, ())) == [simulate]
+    assert identify_steps(1.0, task(1000, 2)) == [] and identify_steps(1.0, task(1000, 2, ())) == [simulate]
     unseen = {"backlash": {"shown": False}}
-    assert identified(1.0, **unseen) == [simulate, f"{diagnose} --out out --next-experiment out_next.csv"]
-    assert identified(1.0, wanted=Path("n.csv"), **unseen) == identified(1.0, backlash={"shown": True}) == [simulate]
+    assert identify_steps(1.0, **unseen) == [simulate, f"{diagnose} --out out --next-experiment out_next.csv"]
+    assert (
+        identify_steps(1.0, planned_file=Path("n.csv"), **unseen)
+        == identify_steps(1.0, backlash={"shown": True})
+        == [simulate]
+    )
 
-    def diagnosed(wanted=None, **more):
-        return commands(after_diagnosis(task(1000), DIAGNOSED | more, again, folder, LogCall(logs, model, None, wanted)))
+    def diagnose_steps(planned_file=None, **more):
+        return commands(
+            after_diagnosis(task(1000), DIAGNOSED | more, again, folder, LogCall(logs, model, None, planned_file))
+        )
 
-    assert diagnosed() == [simulate]
+    assert diagnose_steps() == [simulate]
     long = {"effect": "transmission.rotational_friction_of_somebody_elses_package", "confidence": 0.5}
     tied = [DIAGNOSED["findings"][0] | {"alternatives": [long]}]
     experiment = f"{diagnose} --out out --next-experiment out_next.csv"
-    assert diagnosed(findings=tied, rival=long) == [experiment, simulate]
-    assert diagnosed(Path("n.csv"), findings=tied, rival=long) == [simulate]
+    assert diagnose_steps(findings=tied, rival=long) == [experiment, simulate]
+    assert diagnose_steps(Path("n.csv"), findings=tied, rival=long) == [simulate]
     nothing = {"findings": [], "verdict": "no_discrepancy"}
-    assert diagnosed(**nothing) == ["jaxbl identify 'a b.csv' --model m.toml --out out_identified"]
-    assert diagnosed(findings=[], verdict="unknown_effect") == []
+    assert diagnose_steps(**nothing) == ["jaxbl identify 'a b.csv' --model m.toml --out out_identified"]
+    assert diagnose_steps(findings=[], verdict="unknown_effect") == []
 
 
 def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):

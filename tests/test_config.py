@@ -346,7 +346,7 @@ def test_folder_instead_of_a_file(tmp_path):
 # ---------------------------------------------------------------- recorded excitation
 
 
-def recorded(path, **keys):
+def read_recorded_input(path, **keys):
     return read_config(small_study(excitation={"kind": "recorded", "file": str(path), **keys}))
 
 
@@ -383,7 +383,7 @@ def test_bad_record_is_named_with_column_and_row(tmp_path, case):
     if content is not None:
         path.write_text(content)
     with pytest.raises(InputError) as error:
-        recorded(path, **keys).build()
+        read_recorded_input(path, **keys).build()
     assert str(error.value).startswith(f"{path}: ")
     assert message in str(error.value)
     assert "\n" not in str(error.value)
@@ -392,19 +392,19 @@ def test_bad_record_is_named_with_column_and_row(tmp_path, case):
 def test_a_binary_file_is_no_parquet(tmp_path):
     (tmp_path / "record.parquet").write_bytes(b"nothing")
     with pytest.raises(InputError, match="has a header and no rows"):
-        recorded(tmp_path / "record.parquet").build()
+        read_recorded_input(tmp_path / "record.parquet").build()
 
 
 # ---------------------------------------------------------------- generated tables
 
 
-def table(section, tag, name, module):
+def parameter_table(section, tag, name, module):
     """A table with every parameter of a module given."""
     numbers = {}
-    for field, known in parameters(module):
+    for field, parameter in parameters(module):
         default = field.default if isinstance(field.default, int | float | str) else NUMBERS.get(field.name, 0.2)
         numbers[config_key(field.name)] = default
-        assert known.doc
+        assert parameter.doc
     return {tag: name, **numbers}
 
 
@@ -415,7 +415,7 @@ def table(section, tag, name, module):
     + [("excitation", "kind", name, module) for name, module in EXCITATIONS.items() if name != "recorded"],
 )
 def test_every_module_has_the_table_of_its_parameters(section, tag, name, module):
-    inputs = table(section, tag, name, module)
+    inputs = parameter_table(section, tag, name, module)
     data = (rigid_study if name == "rigid" else small_study)(**{section: inputs})
     config = read_config(data)
     built = getattr(config.build(), section)
@@ -430,7 +430,7 @@ def test_every_module_has_the_table_of_its_parameters(section, tag, name, module
 
 
 def parameters_by_name(module):
-    return {field.name: known for field, known in parameters(module)}
+    return {field.name: parameter for field, parameter in parameters(module)}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -476,18 +476,18 @@ def test_a_wrong_table_of_torques_is_refused(change, message):
 def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
     config = read_config(data)
     experiment = config.build()
-    known, leaves = numeric_paths(config), leaf_paths(experiment)
+    numbers, leaves = numeric_paths(config), leaf_paths(experiment)
     if data["drive"]["kind"] == "rigid":  # what one inertia has no use for
         leaves = {path: leaf for path, leaf in leaves.items() if "load" not in path}
-    assert set(leaves) <= set(known)
+    assert set(leaves) <= set(numbers)
     for path, leaf in leaves.items():
-        assert known[path].unit == leaf.unit
-        assert known[path].doc
+        assert numbers[path].unit == leaf.unit
+        assert numbers[path].doc
         moved = with_values(config, {path: 0.625})
         assert get_leaf(moved.build(), path) == 0.625, path
     structural = {"observer.discretisation", "observer.kind", "run.duration", "run.sample_period", "run.substeps"}
     absent = {"encoders.load_noise", "identifier.regressor_filter"} if experiment.identifier else set()
-    assert set(known) - set(leaves) == structural | absent
+    assert set(numbers) - set(leaves) == structural | absent
 
 
 def test_with_values_names_the_nearest_path_and_takes_whole_numbers():

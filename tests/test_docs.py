@@ -44,11 +44,11 @@ def test_tutorial_configs_are_valid():
     text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```toml\n(?!# \w+\.toml)(.*?)```", text, re.S)
     assert len(blocks) == 3
-    whole = tomllib.loads("".join(blocks))
-    assert [axis.num for axis in read_config(whole).axes] == [32, 32]
+    study = tomllib.loads("".join(blocks))
+    assert [axis.num for axis in read_config(study).axes] == [32, 32]
     (certified,) = re.findall(r"```toml\n# certified\.toml\ninclude = \"axis.toml\"\n(.*?)```", text, re.S)
-    whole["tune"]["certificate"] = tomllib.loads(certified)["tune"]["certificate"]
-    tune = read_config(whole).tune
+    study["tune"]["certificate"] = tomllib.loads(certified)["tune"]["certificate"]
+    tune = read_config(study).tune
     assert tune is not None and tune.certificate is not None and tune.certificate.motor.accuracy == 0.5
 
 
@@ -144,9 +144,9 @@ def test_commands_in_text_exist_with_their_options(page):
         command, *words = line.replace("\n", " ").split()
         options = set(chain.from_iterable(option.opts for option in commands[command].params))
         assert {word.strip("[]") for word in words if word.strip("[").startswith("--")} <= options, line
-    for script, rest in re.findall(r"`python (\S+\.py)([^`]*)`", text):
+    for script, arguments in re.findall(r"`python (\S+\.py)([^`]*)`", text):
         source = (ROOT / script).read_text(encoding="utf-8")
-        assert all(f'"{word}"' in source for word in rest.split() if word.startswith("--")), f"{script}{rest}"
+        assert all(f'"{word}"' in source for word in arguments.split() if word.startswith("--")), f"{script}{arguments}"
 
 
 def test_readme_lists_every_command_and_study():

@@ -204,11 +204,11 @@ def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[st
         hidden = [(((effect, level),), PLANTS) for effect in UNKNOWN for level in LEVELS[1:]]
     elif kind == "pairs":
         hidden = []
-        for i, one in enumerate(EFFECTS):
-            for other in EFFECTS[i + 1 :]:
-                if not exclusive(one, other) and not one.split(".")[0] == other.split(".")[0] == "actuator":
+        for i, first in enumerate(EFFECTS):
+            for second in EFFECTS[i + 1 :]:
+                if not exclusive(first, second) and not first.split(".")[0] == second.split(".")[0] == "actuator":
                     levels = [(LEVELS[1], LEVELS[1]), (LEVELS[1], LEVELS[2]), (LEVELS[2], LEVELS[1])][rng.integers(3)]
-                    hidden.append((((one, levels[0]), (other, levels[1])), plants((one, other))))
+                    hidden.append((((first, levels[0]), (second, levels[1])), plants((first, second))))
     else:
         sought = NEW if kind == "new" else EFFECTS
         hidden = [(((effect, level),), plants([effect])) for effect in sought for level in LEVELS]
@@ -398,15 +398,15 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
     full, sizes, clutter = [], [], []
     for plan, trace in zip(plans, plain, strict=True):
         motion = Motion.of(plan.machine, trace)
-        effects, found = [], {}
+        effects, sizes_by_effect = [], {}
         fine = bool(np.isfinite(trace.states).all()) and rms(trace.states[1]) > 0.0
         for name, level in plan.hidden if fine else ():
             drawn, size = draw(name, level, motion, plan.uncertainty, plan.rng)
             effects.extend(drawn)
-            found[str(drawn[0]["kind"])] = size
-        small = _clutter(plan, list(found), motion) if fine and plan.kind == "clutter" else []
+            sizes_by_effect[str(drawn[0]["kind"])] = size
+        small = _clutter(plan, list(sizes_by_effect), motion) if fine and plan.kind == "clutter" else []
         full.append(replace(plan.machine, effects=(*plan.machine.effects, *_order_effects(effects), *small)))
-        sizes.append(found)
+        sizes.append(sizes_by_effect)
         clutter.append(small)
     runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]
     nudges = [_NUDGE * rms(trace.states[1]) for trace in plain]
@@ -415,7 +415,7 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
     result: list[Case | None] = []
     for i, plan in enumerate(plans):
         pair, pair_traces = (runs[2 * i], runs[2 * i + 1]), (traces[2 * i], traces[2 * i + 1])
-        visibility = _seen(pair[0], plain[i], pair_traces[0])
+        visibility = _measure_visibility(pair[0], plain[i], pair_traces[0])
         fit = all(_fit(trace, plain[i], plan.machine) for trace in pair_traces) and (
             not plan.hidden or visibility >= _LEAST_SEEN
         )
@@ -449,7 +449,7 @@ def _nudge(run: Run, nudge: float) -> Run:
     return replace(run, initial=(theta_e, w_e + nudge, theta_s, w_s))
 
 
-def _seen(run: Run, plain: Trace, trace: Trace) -> float:
+def _measure_visibility(run: Run, plain: Trace, trace: Trace) -> float:
     """Change of what the encoders read, over their noise; the larger of both sides."""
     noises = [math.hypot(noise, count / math.sqrt(12.0)) for noise, count in
               ((run.motor_noise, run.motor_resolution), (run.load_noise, run.load_resolution))]  # fmt: skip

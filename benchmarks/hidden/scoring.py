@@ -47,7 +47,7 @@ Oracle = Callable[[Case], Mapping[str, float]]
 """Held-out rmse by channel of the true effects, fitted."""
 
 
-def _one(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome, Mapping[str, Any] | None]:
+def _diagnose(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome, Mapping[str, Any] | None]:
     """Outcome of a case, and the extended model; one that fails is an outcome too."""
     start = time.perf_counter()
     try:
@@ -75,7 +75,7 @@ def run(hidden_cases: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None 
         jobs: processes that share the work; functions must then be importable.
     """
     results = []
-    for i, (result, model) in enumerate(map_jobs(partial(_one, diagnose=diagnose, oracle=oracle), hidden_cases, jobs)):
+    for i, (result, model) in enumerate(map_jobs(partial(_diagnose, diagnose=diagnose, oracle=oracle), hidden_cases, jobs)):
         results.append((result, model))
         judgement = "right" if result.is_right and not result.spurious_effects else "WRONG"
         print(

@@ -506,8 +506,8 @@ def _compile_loop() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         for lane in numba.prange(len(parameters)):
             p = parameters[lane]
-            own = initial[lane]
-            y = (own[0], own[1], own[2], own[3], own[5], 0.0, own[6], own[7])
+            y_start = initial[lane]
+            y = (y_start[0], y_start[1], y_start[2], y_start[3], y_start[5], 0.0, y_start[6], y_start[7])
             modes = first(p, y)
             previous, velocity, lagged = initial[lane, 0], initial[lane, 1], initial[lane, 4]
             for k in range(lengths[lane]):

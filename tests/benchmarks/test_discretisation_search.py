@@ -63,9 +63,9 @@ def test_schemes_without_noise(order):
         still = audit.late_velocity(scheme, order, lipschitz, h, 0.0 * t, [1e-3, *[0.0] * order])
         remainder[name] = np.abs(np.diff(still)).max()
     rounding = 2**order * np.finfo(float).eps * 450.0 / h
-    first, alone, own, exact = audit.SCHEMES
+    first, alone, own_states, exact = audit.SCHEMES
     assert bias[exact] <= 4.0 * rounding
     assert remainder[exact] <= 1e-12 * unit
-    assert bias[own] == pytest.approx(0.5 * h if order >= 2 else 0.0, abs=4.0 * rounding)
-    assert remainder[own] <= 1e-12 * unit
+    assert bias[own_states] == pytest.approx(0.5 * h if order >= 2 else 0.0, abs=4.0 * rounding)
+    assert remainder[own_states] <= 1e-12 * unit
     assert min(remainder[first], remainder[alone]) > 0.1 * unit

@@ -35,7 +35,7 @@ def test_equal_results_do_not_differ(compare):
 
 
 @pytest.mark.parametrize(
-    ("change", "place", "what"),
+    ("change", "place", "difference_text"),
     [
         ({"findings": []}, "findings", "key is new ([])"),
         ({"verdict": "unknown_effect"}, "verdict", "'explained' -> 'unknown_effect'"),
@@ -45,9 +45,9 @@ def test_equal_results_do_not_differ(compare):
         ({"numbers": [1.0, 2.0 + 2e-6, None]}, "numbers[]", "2.0 -> 2.000002 (by 1.0e-06 of it)"),
     ],
 )
-def test_a_changed_key_name_or_number_is_reported(compare, change, place, what):
+def test_a_changed_key_name_or_number_is_reported(compare, change, place, difference_text):
     (difference,) = compare("summary.json", SUMMARY, SUMMARY | change, 1e-9)
-    assert (difference.place, difference.what, difference.is_sentence) == (place, what, False)
+    assert (difference.place, difference.what, difference.is_sentence) == (place, difference_text, False)
 
 
 def test_a_key_that_is_gone_is_reported_once_for_all_elements_of_a_list(compare):

@@ -196,13 +196,13 @@ def runs(samples=SAMPLES):
 WHICH = ["geared", "rigid", "bristles"]
 
 
-@pytest.mark.parametrize("which", WHICH)
-def test_simulator_agrees_with_scipy_through_sticking_play_and_every_effect(truths, which):
-    truth, changes = truths[which]
+@pytest.mark.parametrize("machine_name", WHICH)
+def test_simulator_agrees_with_scipy_through_sticking_play_and_every_effect(truths, machine_name):
+    truth, changes = truths[machine_name]
     assert changes > 5
     # bristles have a kink where their side turns around, which no event marks
-    trace = simulate([runs()[WHICH.index(which)]], 1e-4 if which == "bristles" else 6e-4)[0]
-    rows = [0, 1] if which == "rigid" else [0, 1, 2, 3]
+    trace = simulate([runs()[WHICH.index(machine_name)]], 1e-4 if machine_name == "bristles" else 6e-4)[0]
+    rows = [0, 1] if machine_name == "rigid" else [0, 1, 2, 3]
     error = np.abs(trace.states - truth)[rows].max(1) / np.sqrt(np.mean(truth[rows] ** 2, axis=1))
     assert error.max() < 1e-6, error
 
@@ -272,5 +272,5 @@ def test_random_torque_acts_and_loop_uses_the_noisy_encoder():
 def test_both_engines_agree(monkeypatch):
     compiled = simulate(runs(60))
     monkeypatch.setattr(simulator, "_ENGINE", [simulator._vectorise_loop(), "numpy"])
-    for one, other in zip(compiled, simulate(runs(60)), strict=True):
-        np.testing.assert_allclose(one.states, other.states, rtol=1e-7, atol=1e-9)
+    for compiled_trace, reference_trace in zip(compiled, simulate(runs(60)), strict=True):
+        np.testing.assert_allclose(compiled_trace.states, reference_trace.states, rtol=1e-7, atol=1e-9)

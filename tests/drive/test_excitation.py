@@ -125,7 +125,7 @@ def test_every_signal_scales_with_its_amplitude_as_a_grid_axis(dtype):
     assert set(numbers) | {"recorded"} == set(EXCITATIONS)
 
     def scale(amplitude):
-        signals = (EXCITATIONS[name](amplitude=amplitude, **others) for name, others in numbers.items())
+        signals = (EXCITATIONS[name](amplitude=amplitude, **other_numbers) for name, other_numbers in numbers.items())
         return [as_arrays(signal, dtype)(jnp.asarray(0.37, dtype)) for signal in signals]
 
     for values in jax.jit(jax.vmap(scale))(jnp.asarray([0.0, 1.0, -3.0], dtype)):

@@ -29,7 +29,7 @@ class FunctionBlock:
         self.name, *parts = (node for node in block.named_children if node.type not in ("comment", "empty_statement"))
         for node in parts:
             if node.type in places:
-                places[node.type] += self._declared(node)
+                places[node.type] += self._declare_variables(node)
         self.inputs, self.outputs = places["var_input"], places["var_output"]
         self._temporary = {name: self.types[name](0) for name in places["var_temp"]}
         # names are the same in capitals
@@ -51,7 +51,7 @@ class FunctionBlock:
         assert all(type(self.values[name]) is kind for name, kind in self.types.items())
         return {name: self.values[name] for name in self.outputs}
 
-    def _declared(self, node):
+    def _declare_variables(self, node):
         constant = any(child.type == "var_qualifier_list" for child in node.children)
         names = []
         for child in node.children:
@@ -132,19 +132,19 @@ def _first_fault(node):
     return f"line {node.start_point.row + 1}: {node.text.decode()[:200]}"
 
 
-def _of(kind, value):
+def _require_type(kind, value):
     assert type(value) is kind, (kind, type(value))
     return value
 
 
-def _alike(work, kinds=(np.floating, np.integer)):
+def _require_alike(work, kinds=(np.floating, np.integer)):
     """Make `work` refuse two numbers unless both are of one of these kinds, and of the same type."""
 
-    def worked(a, b):
+    def checked_work(a, b):
         assert type(a) is type(b) and isinstance(a, kinds), (type(a), type(b))
         return work(a, b)
 
-    return worked
+    return checked_work
 
 
 def _divide(a, b):
@@ -163,9 +163,9 @@ def _root(a):
     return np.sqrt(a)
 
 
-def _select(which, no, yes):
-    assert type(which) is np.bool_ and type(no) is type(yes)
-    return yes if which else no
+def _select_branch(condition, no, yes):
+    assert type(condition) is np.bool_ and type(no) is type(yes)
+    return yes if condition else no
 
 
 class _Conversion:
@@ -183,20 +183,20 @@ class _Conversion:
 
 _LOGIC = {"AND": np.logical_and, "OR": np.logical_or, "XOR": np.logical_xor}
 _ORDER = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "=": np.equal, "<>": np.not_equal}
-_WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _alike(np.fmod, np.integer)}
+_WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _require_alike(np.fmod, np.integer)}
 _MEANING = {
-    "of": _of,
+    "of": _require_type,
     **TYPES,
     "negative": _negative,
-    "negated": lambda a: ~_of(np.bool_, a),
-    "binary": {word: _alike(work) for word, work in (_WORK | _ORDER).items()}
-    | {word: _alike(work, np.bool_) for word, work in _LOGIC.items()},
+    "negated": lambda a: ~_require_type(np.bool_, a),
+    "binary": {word: _require_alike(work) for word, work in (_WORK | _ORDER).items()}
+    | {word: _require_alike(work, np.bool_) for word, work in _LOGIC.items()},
     "called": {
         "SQRT": _root,
-        "ABS": lambda a: abs(_alike(lambda a, _: a)(a, a)),
-        "MIN": _alike(np.minimum),
-        "MAX": _alike(np.maximum),
-        "SEL": _select,
+        "ABS": lambda a: abs(_require_alike(lambda a, _: a)(a, a)),
+        "MIN": _require_alike(np.minimum),
+        "MAX": _require_alike(np.maximum),
+        "SEL": _select_branch,
         **{f"{a}_TO_{b}": _Conversion(TYPES[a], TYPES[b]) for a in TYPES for b in TYPES if a != b},
     },
 }

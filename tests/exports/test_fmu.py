@@ -136,10 +136,10 @@ class Instance:
         self._references = {
             model_variable.name: model_variable.valueReference for model_variable in self.about.modelVariables
         }
-        logger = (lambda *inputs: self.said.append(inputs[-1].decode())) if self.two else self._logged
+        logger = (lambda *inputs: self.said.append(inputs[-1].decode())) if self.two else self._collect_message
         self.unit = fmpy.instantiate_fmu(self.folder, self.about, "CoSimulation", logger=logger)
 
-    def _logged(self, environment, status, category, message):
+    def _collect_message(self, environment, status, category, message):
         self.said.append(message.decode())
 
     def begin(self, start=0.0, stop=None):
@@ -517,18 +517,18 @@ def only(monkeypatch, *programs):
 
 
 @pytest.mark.parametrize(
-    ("machine", "fmi", "why"),
+    ("machine", "fmi", "reason"),
     [
         (("Windows", "AMD64"), 2, "no C compiler (x86_64-w64-mingw32-gcc) was found"),
         (("Linux", "aarch64"), 2, "for Linux on aarch64 none is compiled in FMI 2.0"),
         (("Linux", "riscv64"), 3, "for Linux on riscv64 none is compiled in FMI 3.0"),
     ],
 )
-def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, machine, fmi, why):
+def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, machine, fmi, reason):
     only(monkeypatch, "cc")
     for name, value in zip(("system", "machine"), machine, strict=True):
         monkeypatch.setattr(f"jaxbl.exports.fmu.platform.{name}", lambda value=value: value)
-    assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {why}.")
+    assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {reason}.")
 
 
 @pytest.mark.program("x86_64-w64-mingw32-gcc")

@@ -12,26 +12,26 @@ from jaxbl.fused.linear_predictor import LinearPredictor
 def test_errors_follow_the_definition(states, sides, width, machine_code, monkeypatch):
     rng = np.random.default_rng(1)
     step = 0.3 * rng.normal(size=(60, states, states))
-    known, readings = rng.normal(size=(states, 60, width)), rng.normal(size=(60, sides))
-    begun, gains = rng.normal(size=(states, width)), [rng.normal(0.3, 0.1, (sides, 2)) for _ in range(3)]
+    inputs, readings = rng.normal(size=(states, 60, width)), rng.normal(size=(60, sides))
+    start, gains = rng.normal(size=(states, width)), [rng.normal(0.3, 0.1, (sides, 2)) for _ in range(3)]
     recursion = LinearPredictor(states, sides, width)
     assert recursion.loop is not None
     if not machine_code:
         monkeypatch.setattr(recursion, "loop", None)
     # in two parts
-    ends, first = recursion([begun] * 3, gains, step[:25], known[:, :25], readings[:25])
-    ends, last = recursion(ends, gains, step[25:], known[:, 25:], readings[25:])
+    ends, first = recursion([start] * 3, gains, step[:25], inputs[:, :25], readings[:25])
+    ends, last = recursion(ends, gains, step[25:], inputs[:, 25:], readings[25:])
     for gain, end, *parts in zip(gains, ends, first, last, strict=True):
-        errors, change = np.concatenate(parts, axis=1), begun
+        errors, change = np.concatenate(parts, axis=1), start
         full = np.zeros((states, sides))
         for i in range(sides):
             full[i, i], full[sides + i, i] = gain[i]
         for i in range(60):
-            read = np.zeros((sides, width))
-            read[:, 0] = readings[i]
-            left = read - change[:sides]
-            assert errors[:, i] == pytest.approx(left, rel=1e-9, abs=1e-12)
-            change = step[i] @ (change + full @ left) + known[:, i]
+            measured = np.zeros((sides, width))
+            measured[:, 0] = readings[i]
+            residual = measured - change[:sides]
+            assert errors[:, i] == pytest.approx(residual, rel=1e-9, abs=1e-12)
+            change = step[i] @ (change + full @ residual) + inputs[:, i]
         assert end == pytest.approx(change, rel=1e-9, abs=1e-12)
 
 
@@ -45,8 +45,8 @@ def test_one_loop_serves_all_widths():
 def test_what_has_decayed_is_zero():
     """Numbers of less than the smallest normal one would take many times as long."""
     count = 3000
-    step, known = np.tile(0.5 * np.eye(2), (count, 1, 1)), np.zeros((2, count, 3))
-    (end,), (errors,) = LinearPredictor(2, 1, 3)([np.ones((2, 3))], [np.zeros((1, 2))], step, known, np.zeros((count, 1)))
+    step, inputs = np.tile(0.5 * np.eye(2), (count, 1, 1)), np.zeros((2, count, 3))
+    (end,), (errors,) = LinearPredictor(2, 1, 3)([np.ones((2, 3))], [np.zeros((1, 2))], step, inputs, np.zeros((count, 1)))
     assert not end.any()
     small = np.abs(errors[errors != 0.0])
     assert 1e-80 < np.min(small) < 1e-50

@@ -54,7 +54,7 @@ def scan_run():
 
 
 @pytest.mark.parametrize(
-    ("every", "reducers"),
+    ("stride", "reducers"),
     [
         (1, (ALL_METRICS,)),
         (7, (ALL_METRICS,)),  # blocks with a rest, none a multiple of what is kept
@@ -63,14 +63,14 @@ def scan_run():
     ],
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
-def test_figures_and_record_are_those_of_the_scan(scan_run, every, reducers):
+def test_figures_and_record_are_those_of_the_scan(scan_run, stride, reducers):
     full, figures, record = scan_run
-    result, selected = record_run(full, 3, reducers, row, every)
+    result, selected = record_run(full, 3, reducers, row, stride)
     assert list(selected) == ["u", "torque", "moving", "t"]
     assert set(result) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
     for name, column in selected.items():
         assert column.dtype == record[name].dtype
-        np.testing.assert_allclose(column, record[name][::every], rtol=1e-8, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(column, record[name][::stride], rtol=1e-8, atol=1e-12, err_msg=name)
     for name, figure in result.items():
         np.testing.assert_allclose(figure, figures[name], rtol=1e-7, err_msg=name)
 

@@ -65,8 +65,8 @@ def entries(summary, level):
     return level_data
 
 
-def test_normalised_level_counted_again(verified):
-    verdict, _ = verified
+def test_normalised_level_counted_again(verified_study):
+    verdict, _ = verified_study
     level_data, plane = entries(verdict.summary, "normalised"), verdict.error_map
     np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
     np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
@@ -89,9 +89,9 @@ def test_normalised_level_counted_again(verified):
 
 
 @pytest.fixture(scope="module")
-def judged_cells(verified):
+def judged_cells(verified_study):
     """Rows of the frames as dicts by level and bound, each with the lambda that the conditions demand."""
-    verdict, _ = verified
+    verdict, _ = verified_study
     return {
         (level, bound): [
             row | {"demanded": demand_lambda(row[ALPHA], row[column])} for row in verdict.levels[level].to_dict("records")
@@ -102,8 +102,8 @@ def judged_cells(verified):
 
 
 @pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
-def test_levels_of_the_drive_counted_again(level, cells, verified, judged_cells):
-    verdict, _ = verified
+def test_levels_of_the_drive_counted_again(level, cells, verified_study, judged_cells):
+    verdict, _ = verified_study
     level_data = entries(verdict.summary, level)
     rows = judged_cells[level, "true"]
     keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
@@ -149,8 +149,8 @@ def test_levels_of_the_drive_counted_again(level, cells, verified, judged_cells)
     assert level_data["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
 
 
-def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified, judged_cells):
-    verdict, _ = verified
+def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified_study, judged_cells):
+    verdict, _ = verified_study
     listed_ = verdict.counterexamples
     assert set(listed_["side"]) == {"motor"}
     sizes = []
@@ -171,8 +171,8 @@ def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verifie
     assert np.sum(np.array(sizes) > 0) >= 5
 
 
-def test_every_counterexample_carries_its_point_and_a_cause(verified):
-    listed_ = verified[0].counterexamples
+def test_every_counterexample_carries_its_point_and_a_cause(verified_study):
+    listed_ = verified_study[0].counterexamples
     for level, part in listed_.groupby("level"):
         assert part[KEYS[level]].notna().all(axis=None)
     assert listed_.loc[listed_["level"] == "drive", PERIOD].isna().all()
@@ -187,8 +187,8 @@ def test_every_counterexample_carries_its_point_and_a_cause(verified):
     assert (true.groupby(["level", *KEYS["sampled"]], dropna=False)["cause"].nunique() == 1).all()
 
 
-def test_causes_in_the_summary_count_runs(verified):
-    verdict, _ = verified
+def test_causes_in_the_summary_count_runs(verified_study):
+    verdict, _ = verified_study
     for level, keys in KEYS.items():
         part = verdict.counterexamples[verdict.counterexamples["level"] == level]
         counted = entries(verdict.summary, level).get("causes", {})
@@ -198,8 +198,8 @@ def test_causes_in_the_summary_count_runs(verified):
             assert sum(causes.values()) == len(runs)
 
 
-def test_verdict_on_disk(verified):
-    verdict, folder = verified
+def test_verdict_on_disk(verified_study):
+    verdict, folder = verified_study
     level_data = json.loads((folder / "verdict.json").read_text())
     assert level_data == verdict.summary
     assert [level["level"] for level in level_data["levels"]] == ["normalised", "drive", "sampled"]
@@ -225,8 +225,8 @@ def contents(folder):
     return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
-    verdict, folder = verified
+def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeypatch):
+    verdict, folder = verified_study
     results = {path: stored for path, stored in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
@@ -240,8 +240,8 @@ def test_second_call_simulates_nothing_and_says_the_same(verified, monkeypatch):
     assert all(after[path] == stored for path, stored in results.items())
 
 
-def test_another_studys_folder_is_left_as_it_is(verified):
-    _, folder = verified
+def test_another_studys_folder_is_left_as_it_is(verified_study):
+    _, folder = verified_study
     before = contents(folder)
     with pytest.raises(InputError, match="holds another study"):
         verify(rigid_study({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
@@ -279,8 +279,8 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(verified_at_rest, mo
     assert demands | {"name": "the same"} == same
 
 
-def test_a_verification_keeps_to_its_backend(verified):
-    _, folder = verified
+def test_a_verification_keeps_to_its_backend(verified_study):
+    _, folder = verified_study
     with pytest.raises(InputError, match="was begun without --backend; go on without it, or choose another folder"):
         verify(VERIFIED, folder, backend="scan")
 
@@ -350,9 +350,9 @@ def test_without_anything_unknown_there_is_nothing_to_check():
         verify(study)
 
 
-def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verified):
+def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verified_study):
     """Forward Euler chatters with period times alpha: a quarter of 16 ms would do, or no Euler."""
-    verdict, folder = verified
+    verdict, folder = verified_study
     level_data = verdict.counterexamples
     chosen = level_data[(level_data["level"] == "sampled") & (level_data[ALPHA] == 8.0) & (level_data[LAMBDA] == 12.0)]
     assert set(chosen[PERIOD]) == {16e-3}

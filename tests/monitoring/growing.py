@@ -20,23 +20,23 @@ def axis(duration=10.0, **tables):
     return multisine_study(duration, **{"transmission": LAW, "observer": observer} | tables)
 
 
-def log_of(data, gaps, seed=0):
+def simulate_log(data, gaps, seed=0):
     """The log of a study whose half gap is `gaps` (samples) times its own."""
     experiment = prepare(read_config(data))
     size = experiment.transmission.half_gap
     count = len(gaps)
 
     @jax.jit
-    def simulated(gaps):
+    def simulate_gaps(gaps):
         def sample(state, inputs):
             index, gap, noise = inputs
-            own = eqx.tree_at(lambda e: e.transmission.half_gap, experiment, size * gap)
-            state, signals = step(own, state, Sample(index * experiment.run.sample_period, noise=noise))
+            current = eqx.tree_at(lambda e: e.transmission.half_gap, experiment, size * gap)
+            state, signals = step(current, state, Sample(index * experiment.run.sample_period, noise=noise))
             return state, (signals.input, signals.motor.measured, signals.load.measured)
 
         noise = unit_noise(jnp.asarray(seed), jnp.arange(count, dtype=jnp.int32), experiment.sides)
         return jax.lax.scan(sample, initial_state(experiment), (jnp.arange(count) * 1.0, gaps, noise))[1]
 
-    u, motor, load = (np.asarray(one) for one in simulated(jnp.asarray(gaps, float)))
+    u, motor, load = (np.asarray(column) for column in simulate_gaps(jnp.asarray(gaps, float)))
     time = np.arange(count) * float(experiment.run.sample_period)
     return pd.DataFrame({"t": time, "u": u, "theta_e": motor, "theta_s": load})

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from command_server import start_command
-from growing import HALF_GAP, STIFFNESS, axis, log_of
+from growing import HALF_GAP, STIFFNESS, axis, simulate_log
 from hidden_log import FRICTIONS, GAP, simulate_geared_drive
 from mcap_log import write_mcap
 from small_study import multisine_study, rigid_study, small_study
@@ -42,7 +42,7 @@ def logs(tmp_path_factory):
     model.write_text(tomli_w.dumps(axis()))
     with jax.enable_x64(True):
         for name, gaps in (("same", np.ones(10_000)), ("grown", GROWN)):
-            log_of(axis(), gaps).to_csv(folder / f"{name}.csv", index=False)
+            simulate_log(axis(), gaps).to_csv(folder / f"{name}.csv", index=False)
     return folder
 
 

@@ -21,28 +21,30 @@ def free(velocity):
 
 
 @jax.jit
-def observe_block(observer, state, measured, known, h):
+def observe_block(observer, state, measured, accelerations, h):
     """The state after a block, and for each sample the estimate and the state predicted from it."""
 
     def step(state, sample):
         state, estimate = observer.step(state, sample[0], lambda _: sample[1], h)
         return state, (estimate, state)
 
-    return jax.lax.scan(step, state, (measured, known))
+    return jax.lax.scan(step, state, (measured, accelerations))
 
 
 BLOCK = 8000
 """Samples that the one program observes which all signals share: to compile it takes longer than to run it."""
 
 
-def observe(observer, measured, h, known=0.0, velocity=0.0, further=None):
+def observe(observer, measured, h, acceleration=0.0, velocity=0.0, further=None):
     """Estimates, and states predicted from them, along measured positions and known accelerations; `further` states at the
     start."""
     dtype, count = measured.dtype, len(measured)
     further = [0.0] * (observer.order - 1) if further is None else further
     state = ObserverState(*(np.asarray(x, dtype) for x in (measured[0], velocity)), tuple(np.asarray(further, dtype)))
     length = -(-count // BLOCK) * BLOCK
-    signals = (np.resize(np.broadcast_to(x, count).astype(dtype), length).reshape(-1, BLOCK) for x in (measured, known))
+    signals = (
+        np.resize(np.broadcast_to(x, count).astype(dtype), length).reshape(-1, BLOCK) for x in (measured, acceleration)
+    )
     blocks = []
     for signals_of_block in zip(*signals, strict=True):
         state, along = observe_block(observer, state, *signals_of_block, np.asarray(h, dtype))

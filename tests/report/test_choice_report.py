@@ -27,48 +27,48 @@ def chosen(*axes):
 
 
 @pytest.fixture(scope="module")
-def point():
+def point_choice():
     return chosen()
 
 
 @pytest.fixture(scope="module")
-def mapped():
+def mapped_choice():
     return chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4), listed_axis("encoders.motor_resolution", 0.0, 1e-4))
 
 
-@pytest.fixture(scope="module", params=["point", "mapped"])
-def folder(request, tmp_path_factory):
+@pytest.fixture(scope="module", params=["point_choice", "mapped_choice"])
+def report_folder(request, tmp_path_factory):
     path = tmp_path_factory.mktemp(request.param)
     lines = write_choice_report(request.getfixturevalue(request.param), path)
     (path / "lines").write_text("\n".join(lines), encoding="utf-8")
     return path
 
 
-def test_report_holds_lines_numbers_and_figures(folder):
-    summary = json.loads((folder / "tuning.json").read_text(encoding="utf-8"))
+def test_report_holds_lines_numbers_and_figures(report_folder):
+    summary = json.loads((report_folder / "tuning.json").read_text(encoding="utf-8"))
     single = len(summary["points"]) == 1
-    assert (folder / "gains.toml").exists() == single
-    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert (report_folder / "gains.toml").exists() == single
+    page = Page((report_folder / "report.html").read_text(encoding="utf-8"))
     assert "a <b> choice" in page.text
     names = {"observers"} if single else {"observers_motor"}
-    assert {path.stem for path in (folder / "figures").iterdir()} == names
-    lines = (folder / "lines").read_text(encoding="utf-8").splitlines()
+    assert {path.stem for path in (report_folder / "figures").iterdir()} == names
+    lines = (report_folder / "lines").read_text(encoding="utf-8").splitlines()
     assert all(line in page.text for line in lines)
     for line in summary["remarks"]:
         assert line in lines
 
 
-def test_sentences_have_the_numbers_of_the_summary(point):
-    motor = point.summary["points"][0]["sides"]["motor"]
-    line, chosen_line = choice_headline(point.summary)
+def test_sentences_have_the_numbers_of_the_summary(point_choice):
+    motor = point_choice.summary["points"][0]["sides"]["motor"]
+    line, chosen_line = choice_headline(point_choice.summary)
     assert line.startswith(f"motor: {motor['best']} ")
     for kind, errors in list(motor["kinds"].items())[1:]:
         assert f"{kind} {errors['ratio']:.3g} ({errors['low']:.3g} to {errors['high']:.3g})" in line
-    assert point.summary["for_both_sides"] in chosen_line
+    assert point_choice.summary["for_both_sides"] in chosen_line
 
 
-def test_kinds_that_are_alike_are_said_first(point):
-    summary = copy.deepcopy(point.summary)
+def test_kinds_that_are_alike_are_said_first(point_choice):
+    summary = copy.deepcopy(point_choice.summary)
     side = summary["points"][0]["sides"]["motor"]
     best, second = list(side["kinds"])[:2]
     side["not_told_apart"] = [second]
@@ -78,23 +78,23 @@ def test_kinds_that_are_alike_are_said_first(point):
     assert choice_headline(summary)[0] == "motor: all kinds diverged or were too slow."
 
 
-def test_the_point_figure_has_a_dot_at_each_ratio(point):
-    (drawn,) = draw_choice(point)
+def test_the_point_figure_has_a_dot_at_each_ratio(point_choice):
+    (drawn,) = draw_choice(point_choice)
     (ax,) = drawn.figure.axes
-    kinds = point.summary["points"][0]["sides"]["motor"]["kinds"]
+    kinds = point_choice.summary["points"][0]["sides"]["motor"]["kinds"]
     assert [label.get_text() for label in ax.get_yticklabels()] == list(kinds)
     dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
     np.testing.assert_allclose(dots, [kind["ratio"] for kind in kinds.values()])
     assert drawn.name == "observers" and "rad/s" in drawn.caption
 
 
-def test_the_map_names_the_best_kind_in_each_cell(mapped, tmp_path):
-    (drawn,) = draw(mapped, "observers_motor")
+def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
+    (drawn,) = draw(mapped_choice, "observers_motor")
     (ax,) = drawn.figure.axes
     short = short_names(KINDS)
     cells = {text.get_position(): text.get_text() for text in ax.texts}
     assert len(cells) == 6
-    for point in mapped.summary["points"]:
+    for point in mapped_choice.summary["points"]:
         noise, resolution = point["values"].values()
         side = point["sides"]["motor"]
         # x is the last axis; a resolution of zero has no place on a logarithmic scale
@@ -106,7 +106,7 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped, tmp_path):
     plt.close(drawn.figure)
 
 
-def test_one_axis_is_drawn_as_lines(mapped):
+def test_one_axis_is_drawn_as_lines(mapped_choice):
     line = chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
     (drawn,) = draw_choice(line)
     (ax,) = drawn.figure.axes
@@ -115,16 +115,16 @@ def test_one_axis_is_drawn_as_lines(mapped):
     np.testing.assert_allclose(ax.lines[2].get_ydata(), errors)
     # the same points are in the map
     np.testing.assert_allclose(
-        errors, [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in mapped.summary["points"]][::2]
+        errors, [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in mapped_choice.summary["points"]][::2]
     )
 
 
-def test_points_won_are_counted(mapped):
-    first, second = choice_headline(mapped.summary)
-    won = [point["sides"]["motor"]["best"] for point in mapped.summary["points"]]
+def test_points_won_are_counted(mapped_choice):
+    first, second = choice_headline(mapped_choice.summary)
+    won = [point["sides"]["motor"]["best"] for point in mapped_choice.summary["points"]]
     for kind in set(won):
         assert f"{kind} at {won.count(kind)}" in first
-    ratios = [point["sides"]["motor"]["kinds"]["kalman"]["ratio"] for point in mapped.summary["points"]]
+    ratios = [point["sides"]["motor"]["kinds"]["kalman"]["ratio"] for point in mapped_choice.summary["points"]]
     assert f"kalman {min(ratios):.3g} to {max(ratios):.3g}" in second
 
 

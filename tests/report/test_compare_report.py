@@ -13,7 +13,7 @@ from jaxbl.sweeps.sweep import sweep
 
 
 @pytest.fixture
-def called(monkeypatch, capsys):
+def run_command(monkeypatch, capsys):
     """Exit code and output of a command."""
 
     monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
@@ -41,9 +41,9 @@ def folders(tmp_path_factory):
     return place
 
 
-def test_command_writes_text_json_and_figure(folders, called):
+def test_command_writes_text_json_and_figure(folders, run_command):
     words = ["compare", str(folders / "before"), str(folders / "after"), "--out", str(folders / "both")]
-    code, output = called(*words)
+    code, output = run_command(*words)
     assert code == 0, output
     assert "excitation.amplitude: 0.1 -> 0.4" in output
     assert all(len(line) <= 80 for line in output.splitlines() if "/" not in line)
@@ -60,18 +60,18 @@ def test_command_writes_text_json_and_figure(folders, called):
     assert sizes["moved"]["value"] == pytest.approx(4.0, rel=1e-6)
     assert (folders / "both" / "figures" / "comparison.png").stat().st_size > 5000
     # again into the same folder, without a difference now: no figure is left
-    code, output = called("compare", str(folders / "before"), str(folders / "before"), "--out", str(folders / "both"))
+    code, output = run_command("compare", str(folders / "before"), str(folders / "before"), "--out", str(folders / "both"))
     assert code == 0, output
     assert "Config: no difference that decides a number." in output
     assert "metric  " not in output
     assert not (folders / "both" / "figures" / "comparison.png").exists()
 
 
-def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, called):
+def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, run_command):
     shutil.copytree(folders / "before", tmp_path / "part")
     manifest = tmp_path / "part" / "manifest.json"
     manifest.write_text(json_with_checksum(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
-    code, output = called("compare", str(folders / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out"))
+    code, output = run_command("compare", str(folders / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out"))
     assert code == 0, output
     assert "is not finished: 24 of 48 runs are compared." in " ".join(output.split())
 
@@ -83,8 +83,8 @@ def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, c
         ("after", "before", "before: is not empty and holds no comparison; choose another folder with --out"),
     ],
 )
-def test_bad_input(folders, called, second, out, message):
-    code, output = called("compare", str(folders / "before"), str(folders / second), "--out", str(folders / out))
+def test_bad_input(folders, run_command, second, out, message):
+    code, output = run_command("compare", str(folders / "before"), str(folders / second), "--out", str(folders / out))
     assert code == 2
     assert message in output
     assert not (folders / "new").exists()

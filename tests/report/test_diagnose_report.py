@@ -117,7 +117,7 @@ def test_the_observers_residual_is_given_where_they_converge():
     silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
 
     def lines_of(**observed):
-        where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in observed.items()}
+        where = {side: SUMMARY["where"][side] | {"observed": residual} for side, residual in observed.items()}
         return [line for line in diagnosis_lines(change_summary(where=where)) if "observers" in line]
 
     assert lines_of(motor=nothing, load=calls) == [
@@ -187,11 +187,11 @@ def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
     assert "torque_motor below 18 Hz" in diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap))[3]
 
 
-@pytest.mark.parametrize(("relative", "told"), [(-0.98, True), (0.14, False)])
-def test_a_torque_that_is_far_off_comes_first(relative, told):
-    one = SUMMARY["findings"][0] | {"parameters": {"relative": {"value": relative, "standard_error": 0.01, "unit": ""}}}
-    first = diagnosis_lines(change_summary(findings=[one]))[0]
-    assert first.startswith("Doubtful: the torque would be 0.02 times what u says: a unit,") is told
+@pytest.mark.parametrize(("relative", "doubtful"), [(-0.98, True), (0.14, False)])
+def test_a_torque_that_is_far_off_comes_first(relative, doubtful):
+    finding = SUMMARY["findings"][0] | {"parameters": {"relative": {"value": relative, "standard_error": 0.01, "unit": ""}}}
+    first = diagnosis_lines(change_summary(findings=[finding]))[0]
+    assert first.startswith("Doubtful: the torque would be 0.02 times what u says: a unit,") is doubtful
 
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])

@@ -24,17 +24,17 @@ def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "sentence"),
     [
         ({"alpha": 0.01}, "There is no majorant: α is not above f⁺."),
         ({"lambda": 0.0}, "There is no majorant: λ is zero."),
     ],
 )
-def test_why_there_is_no_majorant_is_said(changes, said):
+def test_why_there_is_no_majorant_is_said(changes, sentence):
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5} | changes
     trial = run(small_study({"observer.motor": gains, "run.duration": 1.0}))
     drawn = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
-    assert drawn.caption.endswith(said) and len(drawn.figure.axes[0].get_lines()) == 1
+    assert drawn.caption.endswith(sentence) and len(drawn.figure.axes[0].get_lines()) == 1
 
 
 def test_marked_gains_whose_alpha_is_too_small_have_no_plane():

@@ -235,8 +235,8 @@ def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp
     save(figure, tmp_path / "recursive.png")
 
 
-@pytest.mark.parametrize(("factor", "told"), [(1000.0, True), (1.5, False)])
-def test_an_inertia_far_from_what_is_known_of_it_comes_first(factor, told):
-    one = {"value": 2e-4 * factor, "nominal": 2e-4, "standard_error": 1e-6, "interval": [0.0, 1.0], "unit": "kg m²"}
-    first = _headline({"warnings": [], "residual": {}, "parameters": {"drive.motor_inertia": one}})[0]
-    assert first.startswith("Doubtful: drive.motor_inertia is 1e+03 times its nominal value: a unit,") is told
+@pytest.mark.parametrize(("factor", "doubtful"), [(1000.0, True), (1.5, False)])
+def test_an_inertia_far_from_what_is_known_of_it_comes_first(factor, doubtful):
+    estimate = {"value": 2e-4 * factor, "nominal": 2e-4, "standard_error": 1e-6, "interval": [0.0, 1.0], "unit": "kg m²"}
+    first = _headline({"warnings": [], "residual": {}, "parameters": {"drive.motor_inertia": estimate}})[0]
+    assert first.startswith("Doubtful: drive.motor_inertia is 1e+03 times its nominal value: a unit,") is doubtful

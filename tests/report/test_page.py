@@ -69,7 +69,7 @@ def test_everything_is_escaped_and_in_its_place():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "ending"),
     [
         (["/bin/jaxbl", "plot", "a b"], ", with: jaxbl plot 'a b'<"),
         (["/lib/jaxbl/__main__.py", "plot", "c"], ", with: jaxbl plot c<"),
@@ -78,10 +78,10 @@ def test_everything_is_escaped_and_in_its_place():
         ([""], None),
     ],
 )
-def test_the_command_is_said_where_it_was_one(words, said, monkeypatch):
+def test_the_command_is_said_where_it_was_one(words, ending, monkeypatch):
     monkeypatch.setattr("sys.argv", words)
     text = unescape(html("title", [], [], [], [], ""))
-    assert "Made by jaxbl" in text and (said in text if said else ", with: " not in text)
+    assert "Made by jaxbl" in text and (ending in text if ending else ", with: " not in text)
 
 
 def test_page_of_a_sweep(tmp_path):
@@ -160,8 +160,8 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
         table.get_by_role("button", name="median").click()
         table.get_by_role("button", name="median").click()
         numbers = [float(text.replace("–", "-inf")) for text in table.locator("td:nth-child(3)").all_inner_texts()]
-        known = [number for number in numbers if number > -float("inf")]
-        assert known == sorted(known, reverse=True) == numbers[: len(known)]
+        finite = [number for number in numbers if number > -float("inf")]
+        assert finite == sorted(finite, reverse=True) == numbers[: len(finite)]
 
 
 def place(view, x, y):
@@ -203,13 +203,13 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
     """Markup and letters from right to left in texts, ten thousand values of an axis, nothing but runs that diverged."""
     title = f"{HOSTILE} $\\frac{{$ {{0}} %s \u202e"
     lambdas = spaced_axis(LAMBDA, 1.0, 20.0, 2)
-    many = spaced_axis(ALPHA, 1.0, 50.0, 10_000)
+    long_axis = spaced_axis(ALPHA, 1.0, 50.0, 10_000)
     figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse", "overlays": ["exact"]}
     few = {"axes": [spaced_axis(ALPHA, 1.0, 50.0, 5), lambdas], "figures": [figure]}
     rising = {"motor__velocity_rmse": lambda frame: frame[ALPHA]}
     studies = {
         "texts": (few | {"title": title, "notes": [title] * 2}, rising),
-        "map": ({"axes": [lambdas, many]}, rising),
+        "map": ({"axes": [lambdas, long_axis]}, rising),
         "gone": (few, GONE),
     }
     for name, (data, columns) in studies.items():
@@ -218,11 +218,11 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
     with open_pages(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
         for page in pages:
             check(page, 1)
-        shown = dict(zip(studies, pages, strict=True))
-        assert shown["texts"].locator("h1").text_content() == title
-        assert shown["texts"].get_by_text(title, exact=True).count() == 3
-        assert shown["map"].locator("table").first.locator("td", has_text="10000").count() == 1
-        assert shown["gone"].get_by_text("10 runs diverged").count() == 1
+        page_by_study = dict(zip(studies, pages, strict=True))
+        assert page_by_study["texts"].locator("h1").text_content() == title
+        assert page_by_study["texts"].get_by_text(title, exact=True).count() == 3
+        assert page_by_study["map"].locator("table").first.locator("td", has_text="10000").count() == 1
+        assert page_by_study["gone"].get_by_text("10 runs diverged").count() == 1
 
 
 def test_names_that_are_no_utf8_can_be_written_and_read(tmp_path):

@@ -104,12 +104,12 @@ def test_panels_medians_and_lines_over_what_is_not_drawn():
     ]
     result = make_refined_study(shrinking, noise, figures=figures, seeds=2)
     by_panel, together, of_noise, lines = draw(result)
-    each = np.array([map_values(ax) for ax in panels(by_panel)])
-    assert each.shape == (3, 33, 33)
+    panel_values = np.array([map_values(ax) for ax in panels(by_panel)])
+    assert panel_values.shape == (3, 33, 33)
     # a share over noise levels is one over all of them, also where only one has its boundary
-    np.testing.assert_allclose(map_values(panels(together)[0]), each.mean(axis=0))
+    np.testing.assert_allclose(map_values(panels(together)[0]), panel_values.mean(axis=0))
     assert map_values(panels(of_noise)[0]).shape == (3, 33)
-    np.testing.assert_allclose(map_values(panels(of_noise)[0]), each[:, ::8].mean(axis=1), atol=0.2)
+    np.testing.assert_allclose(map_values(panels(of_noise)[0]), panel_values[:, ::8].mean(axis=1), atol=0.2)
     # one line for each value of the coarse grid
     assert len(panels(lines)[0].lines) == 5
 

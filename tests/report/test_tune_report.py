@@ -183,5 +183,5 @@ def test_bars_have_the_names_beside_them(folder, tuning):
         x, y, wide, tall = panel["place"]
         figure.locator(".view").hover(position=place(figure.locator(".view"), x + index[0] * wide, y + index[1] * tall))
         name, value = figure.locator(".values").inner_text().split("\n")
-        assert name in [one for _, one in panel["y"]["names"]]
+        assert name in [label for _, label in panel["y"]["names"]]
         assert float(value.rpartition(": ")[2]) == pytest.approx(left + width, rel=1e-3)

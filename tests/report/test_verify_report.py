@@ -14,14 +14,14 @@ from jaxbl.sweeps.engine import Engine
 
 
 @pytest.fixture(scope="module")
-def checked(verified, tmp_path_factory):
-    verdict, _ = verified
+def verify_report(verified_study, tmp_path_factory):
+    verdict, _ = verified_study
     folder = tmp_path_factory.mktemp("verdict")
     return verdict, folder, write_verify_report(verdict, folder)
 
 
-def test_figures(checked):
-    verdict, _, _ = checked
+def test_figures(verify_report):
+    verdict, _, _ = verify_report
     drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
     assert list(drawn) == [
         "atlas",
@@ -42,8 +42,8 @@ def test_figures(checked):
     np.testing.assert_array_equal(points.get_ydata(), verdict.error_map.boundary)
 
 
-def test_crosses_are_the_counterexamples_to_the_exact_condition(checked):
-    verdict, _, _ = checked
+def test_crosses_are_the_counterexamples_to_the_exact_condition(verify_report):
+    verdict, _, _ = verify_report
     (levels,) = [d.figure for d in draw_verdict(verdict) if d.name == "levels_motor"]
     for ax, level in zip(levels.axes, ("drive", "sampled"), strict=False):
         crosses = sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() == "x")
@@ -53,8 +53,8 @@ def test_crosses_are_the_counterexamples_to_the_exact_condition(checked):
     assert exact["counterexamples"] > 0
 
 
-def test_page_and_lines(checked):
-    _, folder, lines = checked
+def test_page_and_lines(verify_report):
+    _, folder, lines = verify_report
     page = (folder / "report.html").read_text()
     for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
         assert text in page
@@ -68,8 +68,8 @@ def test_page_and_lines(checked):
     assert len(list((folder / "figures").glob("*.png"))) == 7
 
 
-def test_tuning_rules_in_figure_page_and_lines(checked):
-    verdict, folder, lines = checked
+def test_tuning_rules_in_figure_page_and_lines(verify_report):
+    verdict, folder, lines = verify_report
     rules = verdict.summary["rules"]
     (drawn,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
     good, wrong = drawn.figure.axes
@@ -89,14 +89,14 @@ def test_tuning_rules_in_figure_page_and_lines(checked):
 
 
 @needs_chromium
-def test_the_page_in_a_browser(checked):
-    with open_pages(checked[1] / "report.html") as (page,):
+def test_the_page_in_a_browser(verify_report):
+    with open_pages(verify_report[1] / "report.html") as (page,):
         check(page, 7)
 
 
-def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified, call, tmp_path, monkeypatch):
+def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):
     folder = tmp_path / "results" / "study"
-    shutil.copytree(verified[1], folder)
+    shutil.copytree(verified_study[1], folder)
     for name in ("verdict.json", "counterexamples.parquet"):
         (folder / name).unlink()
     (tmp_path / "study.toml").write_text(tomli_w.dumps(VERIFIED))

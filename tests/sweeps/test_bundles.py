@@ -27,13 +27,13 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 _submit = Cluster._submit
 
 
-def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path, client, computed):
+def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path, client, computed_chunks):
     alone = sweep(thirty_run_study(), tmp_path / "alone")
-    count = len(computed)
-    computed.clear()
+    count = len(computed_chunks)
+    computed_chunks.clear()
     calls = []
     result = sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client, progress=lambda *done: calls.append(done))
-    assert sorted(computed) == list(range(count)) and count == 8
+    assert sorted(computed_chunks) == list(range(count)) and count == 8
     assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
     assert result.cost["lanes"] == 30 and result.cost["run_seconds"] > 0.0
@@ -41,10 +41,10 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
     # what is there is left out
     lost = tmp_path / "cluster" / "points" / "part-00003.parquet"
     lost.unlink()
-    computed.clear()
+    computed_chunks.clear()
     # the last points of the first seed
     assert sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client).cost["lanes"] == 3
-    assert computed == [3]
+    assert computed_chunks == [3]
     assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     # what is damaged is told by whom it was found
     lost.write_bytes(lost.read_bytes()[:-100])
@@ -85,32 +85,32 @@ def test_a_refined_study_on_a_cluster(tmp_path, client):
     assert 2 * 9**2 < len(alone.frame) < 2 * 33**2
 
 
-def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monkeypatch):
+def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed_chunks, monkeypatch):
     submitted = []
     monkeypatch.setattr(Cluster, "_submit", lambda self, *inputs: submitted.append(inputs) or _submit(self, *inputs))
     with open_stages(read_config(thirty_run_study()), "verify", tmp_path, client) as stages:
         stages.write_manifest()
         assert len(stages.run(thirty_run_study(), "drive").frame) == 30
-        assert stages.cost["lanes"] == 30 and len(computed) == 8
+        assert stages.cost["lanes"] == 30 and len(computed_chunks) == 8
     # the first chunk a worker, then the rest
     assert sum(len(jobs) for _, jobs in submitted) == 8
     assert len(list((tmp_path / "verify" / "drive" / "points").iterdir())) == 8
 
 
-def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client, computed):
+def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client, computed_chunks):
     folder = tmp_path / "study"
     first = submit(thirty_run_study(), folder, client)
     assert first.parts_in_all == 8 and not first.finished
     latest = time.monotonic() + 60.0
     while not status(folder).complete and time.monotonic() < latest:
         time.sleep(0.1)
-    assert sorted(computed) == list(range(8))
+    assert sorted(computed_chunks) == list(range(8))
     assert not status(folder).finished
     assert sweep(thirty_run_study(), folder).cost["lanes"] == 0
     assert status(folder).finished
     # nothing is left to be done
     assert submit(thirty_run_study(), folder, client).complete
-    assert sorted(computed) == list(range(8))
+    assert sorted(computed_chunks) == list(range(8))
 
 
 def test_bundles_take_workers_long_enough_and_are_not_too_many():

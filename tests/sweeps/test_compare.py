@@ -21,7 +21,7 @@ def study(*axes, function=lambda frame: frame[ALPHA], seeds=6, changes=None, **c
     )
 
 
-def noisy(shift=lambda frame: 0.0, spread=0.1, seed=0, more=0.01):
+def noisy_error(shift=lambda frame: 0.0, spread=0.1, seed=0, more=0.01):
     """An error under noise that runs of one seed share, and a little that they do not."""
 
     def function(frame):
@@ -32,29 +32,30 @@ def noisy(shift=lambda frame: 0.0, spread=0.1, seed=0, more=0.01):
     return function
 
 
-def change(first, second, metric=RMSE):
-    return next(one for one in compare(first, second).metrics if one.metric == metric)
+def compare_metric(first, second, metric=RMSE):
+    return next(change for change in compare(first, second).metrics if change.metric == metric)
 
 
-def far(frame):
+def far_shift(frame):
     return 0.15 * (frame[ALPHA] > 5.0)
 
 
 def test_points_beyond_noise_are_named_with_their_place_and_direction():
-    first, second = study(function=noisy()), study(function=noisy(far, seed=2))
-    one = change(first, second)
-    assert (one.points, one.differs, one.up, one.better) == (100, 40, 40, "less")
-    assert one.where == {ALPHA: pytest.approx([8.0, 16.0])}
-    assert one.most[ALPHA] > 7.0
-    assert one.most["second"] / one.most["first"] == pytest.approx(1.15, abs=0.05)
+    first, second = study(function=noisy_error()), study(function=noisy_error(far_shift, seed=2))
+    change = compare_metric(first, second)
+    assert (change.points, change.differs, change.up, change.better) == (100, 40, 40, "less")
+    assert change.where == {ALPHA: pytest.approx([8.0, 16.0])}
+    assert change.most[ALPHA] > 7.0
+    assert change.most["second"] / change.most["first"] == pytest.approx(1.15, abs=0.05)
     # 40 % of the points, by 15 % each
-    assert one.moved.low < 1.15**0.4 < one.moved.high
-    assert one.moved.is_sure(1.0)
+    assert change.moved.low < 1.15**0.4 < change.moved.high
+    assert change.moved.is_sure(1.0)
     frame = compare(first, second).frame(RMSE)
     assert (frame["differs"] == (frame[ALPHA] > 5.0)).all()
     # without pairs this noise hides the change
     later = make_result(
-        first.config.to_dict() | {"sweep": {"seeds": 6, "first_seed": 50}}, motor__velocity_rmse=noisy(far, seed=2)
+        first.config.to_dict() | {"sweep": {"seeds": 6, "first_seed": 50}},
+        motor__velocity_rmse=noisy_error(far_shift, seed=2),
     )
     later.source["seed"] += 50
     apart = compare(first, later)
@@ -64,11 +65,11 @@ def test_points_beyond_noise_are_named_with_their_place_and_direction():
 
 @pytest.mark.parametrize("paired", [True, False])
 def test_the_tests_are_those_of_scipy(paired):
-    first = study(function=noisy(more=0.05))
-    second = study(function=noisy(more=0.05, seed=1, shift=lambda frame: 0.1 * frame[LAMBDA] - 0.2))
+    first = study(function=noisy_error(more=0.05))
+    second = study(function=noisy_error(more=0.05, seed=1, shift=lambda frame: 0.1 * frame[LAMBDA] - 0.2))
     if not paired:
         second.source["seed"] += 10
-    a, b = (one.frame.sort_values([ALPHA, LAMBDA, "seed"])[RMSE].to_numpy().reshape(100, 6) for one in (first, second))
+    a, b = (result.frame.sort_values([ALPHA, LAMBDA, "seed"])[RMSE].to_numpy().reshape(100, 6) for result in (first, second))
     p = (stats.ttest_rel(a, b, axis=1) if paired else stats.ttest_ind(a, b, axis=1, equal_var=False)).pvalue
     expected = stats.false_discovery_control(p, method="by") <= 0.05
     differs = compare(first, second).frame(RMSE).sort_values([ALPHA, LAMBDA])["differs"].to_numpy()
@@ -77,9 +78,12 @@ def test_the_tests_are_those_of_scipy(paired):
 
 
 def test_noise_alone_is_no_difference():
-    named = [change(study(function=noisy(seed=i)), study(function=noisy(seed=100 + i))).differs for i in range(20)]
+    differing = [
+        compare_metric(study(function=noisy_error(seed=i)), study(function=noisy_error(seed=100 + i))).differs
+        for i in range(20)
+    ]
     # at most one in twenty comparisons names any point, on average
-    assert sum(count > 0 for count in named) <= 3
+    assert sum(count > 0 for count in differing) <= 3
 
 
 @pytest.mark.parametrize("seeds", [1, 4])
@@ -91,17 +95,17 @@ def test_roundings_are_no_difference(seeds):
     wobble = np.random.default_rng(0).normal(size=100 * seeds)
     first = study(function=size, seeds=seeds)
     second = study(function=lambda frame: size(frame) * (1.0 + 1e-11 * wobble) + 1e-17 * np.abs(wobble), seeds=seeds)
-    assert change(first, second).count == 0
-    assert change(first, study(function=lambda frame: 1.001 * size(frame), seeds=seeds)).changed == 80
+    assert compare_metric(first, second).count == 0
+    assert compare_metric(first, study(function=lambda frame: 1.001 * size(frame), seeds=seeds)).changed == 80
 
 
 def test_one_seed_tells_no_noise():
-    first, second = study(function=noisy(), seeds=1), study(function=noisy(far, seed=2), seeds=1)
+    first, second = study(function=noisy_error(), seeds=1), study(function=noisy_error(far_shift, seed=2), seeds=1)
     comparison = compare(first, second)
     assert not comparison.knows_noise
-    one = next(m for m in comparison.metrics if m.metric == RMSE)
-    assert (one.differs, one.changed, one.count) == (None, 100, 100)
-    assert np.isnan(one.moved.low)
+    change = next(m for m in comparison.metrics if m.metric == RMSE)
+    assert (change.differs, change.changed, change.count) == (None, 100, 100)
+    assert np.isnan(change.moved.low)
     assert any("Noise: not known (one common seed)" in line for line in comparison_lines(comparison))
 
 
@@ -110,7 +114,7 @@ def test_different_grids_are_compared_where_both_have_points():
         spaced_axis(ALPHA, 1.0, 4096.0, 13),
         listed_axis(LAMBDA, *(np.geomspace(1.0, 8.0, 20)[::2] * (1.0 + 1e-12)).tolist()),
     ]
-    comparison = compare(study(function=noisy()), study(*other, function=noisy(far, seed=2), seeds=9))
+    comparison = compare(study(function=noisy_error()), study(*other, function=noisy_error(far_shift, seed=2), seeds=9))
     assert comparison.points == (50, 50, 80)
     assert (comparison.seeds, comparison.paired) == (6, True)
     assert next(m for m in comparison.metrics if m.metric == RMSE).points == 50
@@ -161,9 +165,9 @@ def test_what_is_true_or_false_and_what_is_not_defined():
 @pytest.mark.parametrize("axes", [GAINS, GAINS[1:], [*GAINS, listed_axis(NOISE, 0.0, 1e-4)], [listed_axis(NOISE, 1e-4)]])
 def test_text_and_figure(axes):
     def size(shift, seed):
-        return lambda frame: noisy(shift, seed=seed)(frame.assign(**{} if ALPHA in frame else {ALPHA: 9.0}))
+        return lambda frame: noisy_error(shift, seed=seed)(frame.assign(**{} if ALPHA in frame else {ALPHA: 9.0}))
 
-    first, second = study(*axes, function=size(lambda frame: 0.0, 0)), study(*axes, function=size(far, 2))
+    first, second = study(*axes, function=size(lambda frame: 0.0, 0)), study(*axes, function=size(far_shift, 2))
     comparison = compare(first, second)
     lines = comparison_lines(comparison)
     assert max(len(part) for line in lines for part in line.split("\n")) <= 80

@@ -14,17 +14,17 @@ def test_columns_of_any_length_by_programs_of_two_shapes(count, dtype, monkeypat
     shapes = []
 
     @jax.jit
-    def both(x, y):
+    def add_and_compare(x, y):
         shapes.append(x.shape)
         return {"sum": x + y, "less": x < y}
 
     x, y = np.arange(count, dtype=dtype), np.flip(np.arange(count, dtype=dtype))
-    result = apply_elementwise(both, [x, y])
+    result = apply_elementwise(add_and_compare, [x, y])
     np.testing.assert_array_equal(result["sum"], np.full(count, count - 1.0))
     np.testing.assert_array_equal(result["less"], x < y)
     assert result["sum"].dtype == dtype and set(shapes) == {(1, 2 if count <= 4 else 4)}
     shapes.clear()
-    np.testing.assert_array_equal(apply_elementwise(both, [x, y], largest=5)["sum"], result["sum"])
+    np.testing.assert_array_equal(apply_elementwise(add_and_compare, [x, y], largest=5)["sum"], result["sum"])
     # traced already, where there are more than four
     assert set(shapes) == ({(1, 4)} if count <= 4 else set())
 
@@ -49,12 +49,12 @@ def test_devices_share_pieces(monkeypatch):
 def test_devices_do_not_wait_for_each_other():
     """Two programs whose loops end together, at the same time, may wait for each other forever."""
 
-    def halved(x):
+    def halve_until_small(x):
         return jax.lax.while_loop(lambda x: jnp.any(x > 1.0), lambda x: jnp.where(x > 1.0, x / 2.0, x), x)
 
     devices = tuple(jax.local_devices())
-    program, rows = under_test._map_over_devices(halved, devices)
+    program, rows = under_test._map_over_devices(halve_until_small, devices)
     piece = jax.device_put(np.arange(8.0).reshape(2, 4), rows)
-    assert "all-reduce" in jax.jit(halved).lower(piece).compile().as_text()
+    assert "all-reduce" in jax.jit(halve_until_small).lower(piece).compile().as_text()
     assert "all-reduce" not in program.lower(piece).compile().as_text()
-    np.testing.assert_array_equal(program(piece), halved(np.arange(8.0).reshape(2, 4)))
+    np.testing.assert_array_equal(program(piece), halve_until_small(np.arange(8.0).reshape(2, 4)))

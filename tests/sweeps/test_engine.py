@@ -92,7 +92,7 @@ def test_both_backends_give_the_same_figures(study, precision):
 
 
 @pytest.mark.parametrize(
-    ("excitation", "path", "why"),
+    ("excitation", "path", "reasons"),
     [
         ({"kind": "sine", "amplitude": 0.1, "frequency": 1.0}, "frequency", ()),
         ({"kind": "multisine", "amplitude": 0.1, "frequency": 1.0}, "frequency", ("lanes that read float64[8]",)),
@@ -106,7 +106,7 @@ def test_both_backends_give_the_same_figures(study, precision):
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
-def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
+def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, reasons):
     """Axes on an input's numbers make it a lane's: random levels and sums over harmonics are no work for the loop."""
     path = f"excitation.{path}"
     study = rigid_study(axes=[listed_axis(path, 0.04, 0.06, 0.09)], sweep={"metrics": ["velocity_rmse"]}) | {
@@ -115,9 +115,9 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     config = read_config(study)
     assert Engine(config).backend == "fused"
     result = sweep(config)
-    assert result.fallback_reasons == why
+    assert result.fallback_reasons == reasons
     assert (result.frame["motor.velocity_rmse"] > 0.0).sum() == 3
-    if not why:
+    if not reasons:
         scanned = sweep(config, backend="scan").frame
         np.testing.assert_allclose(result.frame["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
 

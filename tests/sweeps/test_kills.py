@@ -38,8 +38,8 @@ def _sweep(folder, scheduler=None):
         sys.exit(1)
 
 
-def _share(folder, which):
-    share(study(), folder, which)
+def _share(folder, position):
+    share(study(), folder, position)
 
 
 @pytest.fixture(scope="module")

@@ -49,13 +49,13 @@ def keys(address):
     return {name.removeprefix(f"{prefix}/"): client.get_object(Bucket=bucket, Key=name)["Body"].read() for name in names}
 
 
-def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed):
+def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed_chunks):
     folder, result = alone
     address = f"{bucket}/a/study"
     first = share(thirty_run_study(), address, (1, 2))
     assert (first.parts, first.finished) == (4, False)
     study = sweep(thirty_run_study(), address)
-    assert sorted(computed) == list(range(8))
+    assert sorted(computed_chunks) == list(range(8))
     pd.testing.assert_frame_equal(study.frame, result.frame, check_exact=True)
     stored = keys(address)
     assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
@@ -73,17 +73,17 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed):
     assert set(keys(address)) == {"manifest.json", "study.toml", *(f"points/part-0000{seed}.parquet" for seed in (0, 1))}
 
 
-def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
+def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed_chunks):
     address = f"{bucket}/b"
     sweep(thirty_run_study(), address)
-    computed.clear()
+    computed_chunks.clear()
     damaged, lost = (to_path(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
     damaged.write_bytes(damaged.read_bytes()[:-1000])
     lost.unlink()
     with pytest.raises(InputError, match=r"part-00002\.parquet: is damaged"):
         _ = open_study(address).frame
     assert len(sweep(thirty_run_study(), address).damaged) == 1
-    assert sorted(computed) == [2, 5]
+    assert sorted(computed_chunks) == [2, 5]
     assert "damaged/part-00002.parquet" in keys(address)
     (to_path(address) / "manifest.json").unlink()
     with pytest.raises(InputError, match="has lost its manifest"):

@@ -66,8 +66,8 @@ def test_quasi_random_points_fill_the_ranges_evenly_and_repeat(design):
 
 def test_fewer_sobol_points_are_the_first_of_more():
     axis = spaced_axis(ALPHA, 1.0, 100.0)
-    few, many = (columns(points(axis, design="sobol", points=n)) for n in (11, 16))
-    np.testing.assert_array_equal(few[ALPHA], many[ALPHA][:11])
+    first_points, more_points = (columns(points(axis, design="sobol", points=n)) for n in (11, 16))
+    np.testing.assert_array_equal(first_points[ALPHA], more_points[ALPHA][:11])
 
 
 def test_a_design_is_crossed_with_the_axes_that_are_listed():

@@ -57,7 +57,7 @@ def corners(values):
     return np.array([values[corner] for corner in itertools.product(ends, repeat=values.ndim)])
 
 
-def at_boundary(full):
+def find_boundary_cells(full):
     """Cells whose corners disagree."""
     result = corners(full)
     return (result != result[0]).any(axis=0)
@@ -68,7 +68,7 @@ def simulated_cells(mask):
     return corners(mask).all(axis=0)
 
 
-def pieces(full):
+def label_boundary_pieces(full):
     """Label of each cell at the boundary, -1 elsewhere: cells are joined by the edges that disagree and that they share."""
     shape, d = [size - 1 for size in full.shape], full.ndim
     cells = np.arange(np.prod(shape)).reshape(shape)
@@ -76,11 +76,11 @@ def pieces(full):
     for axis in range(d):
         hot = np.diff(full.astype(float), axis=axis) != 0.0
         starts = np.argwhere(hot)
-        others = [a for a in range(d) if a != axis]
+        other_axes = [a for a in range(d) if a != axis]
         around = []
         for offset in itertools.product((0, 1), repeat=d - 1):
             place = starts.copy()
-            place[:, others] -= np.array(offset, int)
+            place[:, other_axes] -= np.array(offset, int)
             inside = ((place >= 0) & (place < shape)).all(axis=1)
             around.append(np.where(inside, cells[tuple(np.clip(place, 0, np.array(shape) - 1).T)], -1))
         for a, b in itertools.combinations(around, 2):
@@ -89,13 +89,13 @@ def pieces(full):
     pairs = np.concatenate([np.zeros((2, 0), int), *links], axis=1)
     graph = coo_matrix((np.ones(pairs.shape[1]), tuple(pairs)), (cells.size, cells.size))
     labels = connected_components(graph, directed=False)[1].reshape(shape)
-    return np.where(at_boundary(full), labels, -1)
+    return np.where(find_boundary_cells(full), labels, -1)
 
 
 def assert_traced(mask, full, depth):
     """Every piece of the boundary that a coarse edge crosses an odd number of times is simulated whole; so is every piece
     of which any cell is."""
-    labels, cells = pieces(full), simulated_cells(mask)
+    labels, cells = label_boundary_pieces(full), simulated_cells(mask)
     touched = np.unique(labels[cells & (labels >= 0)])
     missed = np.isin(labels, touched) & (labels >= 0) & ~cells
     assert not missed.any()
@@ -139,7 +139,7 @@ def test_one_piece_is_found_whole(name):
     """If the coarse grid sees a piece at all, the study has every cell of the full grid's boundary."""
     function, n, depth = SHAPES[name]
     mask, full, _ = trace_boundary(function, square(n, depth))
-    assert not (at_boundary(full) & ~simulated_cells(mask)).any()
+    assert not (find_boundary_cells(full) & ~simulated_cells(mask)).any()
 
 
 def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
@@ -147,7 +147,7 @@ def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
     shares = []
     for depth in (3, 5, 6):
         mask, full, batches = trace_boundary(circle, square(17, depth))
-        shares.append(mask.sum() / at_boundary(full).sum())
+        shares.append(mask.sum() / find_boundary_cells(full).sum())
         assert len(batches) <= 2 * depth + 1
     # about two vertices for each cell of the boundary on the finest level, as many again on all others
     assert max(shares) < 5.0
@@ -392,7 +392,7 @@ def study(changes=None, refine=3, num=5, seeds=1, axes=None, **sweep_keys):
     return rigid_study(changes, axes=axes, sweep=table)
 
 
-def whole_grid(data):
+def simulate_full_grid(data):
     """All points of the fine grid, by the engine that a refined study has."""
     engine = Engine(read_config(data), Layout(read_config(data).sweep.seeds, 2048))
     group_size = np.arange(engine.points.group_size)
@@ -402,24 +402,24 @@ def whole_grid(data):
     )
 
 
-def assert_on_the_whole_grid(result, whole):
+def assert_on_the_whole_grid(result, full_frame):
     """Every row of a refined study is, to the bit, the row of the whole grid."""
     keys = [*(axis.path for axis in result.config.axes), "seed"]
     frame = result.frame.sort_values(keys, ignore_index=True)
     assert not frame.duplicated(keys).any()
-    actual = whole.merge(frame[keys], on=keys).sort_values(keys, ignore_index=True)
+    actual = full_frame.merge(frame[keys], on=keys).sort_values(keys, ignore_index=True)
     exact = [name for name in frame if not name.endswith("convergence_time_bound")]  # rounds differently in other chunks
     pd.testing.assert_frame_equal(actual[exact], frame[exact], check_exact=True)
 
 
-def masks(data, frame, whole):
+def grid_masks(data, frame, full_frame):
     """Simulated points and convergence on the whole grid, two axes."""
     config = Points(read_config(data))
     shape = config.refinement.grid.sizes
     rows = np.ravel_multi_index([np.searchsorted(config.axis_values(p), frame[p]) for p in config.paths], shape)
     mask = np.zeros(shape, bool)
     mask.ravel()[rows] = True
-    return mask, whole.sort_values(config.paths)["motor.converged"].to_numpy().reshape(shape)
+    return mask, full_frame.sort_values(config.paths)["motor.converged"].to_numpy().reshape(shape)
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -428,12 +428,12 @@ def test_the_boundary_of_the_full_grid_at_257(precision):
     axes = [spaced_axis(LAMBDA, 3.0, 40.0, 17), spaced_axis(ALPHA, 2.0, 200.0, 17)]  # where the boundary is one line
     # all metrics are compared on a smaller grid, below
     data = study(changes, refine=4, axes=axes, chunk=256, metrics=["converged", "velocity_rmse"])
-    result, full_grid = sweep(data), whole_grid(data)
+    result, full_grid = sweep(data), simulate_full_grid(data)
     assert len(full_grid) == 257**2
     assert_on_the_whole_grid(result, full_grid)
-    mask, full = masks(data, result.frame, full_grid)
+    mask, full = grid_masks(data, result.frame, full_grid)
     assert_traced(mask, full, 4)
-    boundary = at_boundary(full)
+    boundary = find_boundary_cells(full)
     assert boundary.sum() > 250
     assert not (boundary & ~simulated_cells(mask)).any()
     assert mask.mean() < 0.06
@@ -443,7 +443,7 @@ def test_values_are_those_of_the_whole_grid_and_of_the_plain_study():
     data = study()
     result = sweep(data)
     assert 25 < len(result.frame) < 33**2
-    assert_on_the_whole_grid(result, whole_grid(data))
+    assert_on_the_whole_grid(result, simulate_full_grid(data))
     # a study without refinement has the coarse points, to the bit
     plain = sweep(study(refine=None)).frame
     points = Points(result.config)
@@ -471,11 +471,11 @@ def test_every_point_has_all_seeds_and_one_that_disagrees_is_enough():
     frame = sweep(data).frame
     assert sorted(frame["seed"].unique()) == [7, 8, 9]
     assert (frame.groupby([LAMBDA, ALPHA]).size() == 3).all()
-    one = sweep(study({"encoders.noise": 1e-4}, refine=2, seeds=1, first_seed=8)).frame
+    single_seed = sweep(study({"encoders.noise": 1e-4}, refine=2, seeds=1, first_seed=8)).frame
     keys = [LAMBDA, ALPHA]
-    assert set(map(tuple, one[keys].to_numpy())) < set(map(tuple, frame[keys].to_numpy()))
-    shared = frame[frame["seed"] == 8].merge(one[keys], on=keys)
-    assert shared["motor.velocity_rmse"].sum() == pytest.approx(one["motor.velocity_rmse"].sum(), rel=1e-12)
+    assert set(map(tuple, single_seed[keys].to_numpy())) < set(map(tuple, frame[keys].to_numpy()))
+    shared = frame[frame["seed"] == 8].merge(single_seed[keys], on=keys)
+    assert shared["motor.velocity_rmse"].sum() == pytest.approx(single_seed["motor.velocity_rmse"].sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -518,7 +518,7 @@ def test_groups_and_listed_axes_are_refined_each_by_itself():
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def refined_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("refined") / "study"
     return folder, sweep(study(), folder)
 
@@ -535,17 +535,17 @@ def parts(folder):
     return len(list(folder.glob("points/part-*.parquet")))
 
 
-def test_a_refined_study_in_a_folder(finished, computed):
-    folder, result = finished
+def test_a_refined_study_in_a_folder(refined_study, computed_chunks):
+    folder, result = refined_study
     assert manifest(folder)["finished"]
     assert manifest(folder)["rows"] == len(result.frame)
     assert manifest(folder)["parts"] == parts(folder) > 3
     pd.testing.assert_frame_equal(open_study(folder).frame, result.frame)
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
-    computed.clear()
+    computed_chunks.clear()
     before = files(folder)
     again = sweep(study(), folder)
-    assert (computed, again.cost["lanes"]) == ([], 0)
+    assert (computed_chunks, again.cost["lanes"]) == ([], 0)
     assert files(folder) == before
     lines = headline(open_study(folder))
     share = f"{100 * len(result.frame) / 33**2:.2g}"
@@ -554,7 +554,9 @@ def test_a_refined_study_in_a_folder(finished, computed):
 
 
 @pytest.mark.parametrize("stop", [0, 1, 3, 5])
-def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(tmp_path, finished, computed, stop):
+def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(
+    tmp_path, refined_study, computed_chunks, stop
+):
     calls = []
 
     def interrupt(done, total):
@@ -565,25 +567,25 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(t
     with pytest.raises(KeyboardInterrupt):
         sweep(study(), tmp_path / "study", progress=interrupt)
     # the next one may have been computed while that was written
-    assert computed in (list(range(stop + 1)), list(range(stop + 2)))
+    assert computed_chunks in (list(range(stop + 1)), list(range(stop + 2)))
     assert not manifest(tmp_path / "study")["finished"]
     assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
     calls.clear()
     # with other chunks asked for: those of the folder stay
     result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: calls.append(done))
-    pd.testing.assert_frame_equal(result.frame, finished[1].frame)
-    assert computed == list(range(parts(finished[0])))
+    pd.testing.assert_frame_equal(result.frame, refined_study[1].frame)
+    assert computed_chunks == list(range(parts(refined_study[0])))
     dones, totals = zip(*calls, strict=True)
     assert dones[-1] == totals[-1] == len(result.frame)
     assert list(totals) == sorted(totals) and all(d <= t for d, t in calls)
-    expected = {key: manifest(finished[0])[key] for key in ("parts", "rows", "finished")}
+    expected = {key: manifest(refined_study[0])[key] for key in ("parts", "rows", "finished")}
     assert {key: manifest(tmp_path / "study")[key] for key in expected} == expected
 
 
 @pytest.mark.parametrize("damage", ["truncated", "missing", "other rows", "one too many"])
-def test_a_part_that_is_not_right_is_computed_again(tmp_path, finished, computed, damage):
+def test_a_part_that_is_not_right_is_computed_again(tmp_path, refined_study, computed_chunks, damage):
     folder = tmp_path / "study"
-    for name, content in files(finished[0]).items():
+    for name, content in files(refined_study[0]).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     part = folder / "points" / "part-00002.parquet"
@@ -596,8 +598,8 @@ def test_a_part_that_is_not_right_is_computed_again(tmp_path, finished, computed
     else:
         (folder / "points" / f"part-{parts(folder):05d}.parquet").write_bytes(part.read_bytes())
     result = sweep(study(), folder)
-    assert computed == ([] if damage == "one too many" else [2])
-    pd.testing.assert_frame_equal(result.frame, finished[1].frame)
+    assert computed_chunks == ([] if damage == "one too many" else [2])
+    pd.testing.assert_frame_equal(result.frame, refined_study[1].frame)
 
 
 def test_dry_run_knows_the_coarse_grid():
@@ -605,10 +607,10 @@ def test_dry_run_knows_the_coarse_grid():
     assert (cost.points, cost.rows, cost.max_points) == (25, 50, 1089)
 
 
-def test_as_a_dataset(finished):
+def test_as_a_dataset(refined_study):
     pytest.importorskip("xarray")
-    frame = finished[1].frame
-    dataset = finished[1].to_xarray()
+    frame = refined_study[1].frame
+    dataset = refined_study[1].to_xarray()
     assert dict(dataset.sizes) == {LAMBDA: frame[LAMBDA].nunique(), ALPHA: frame[ALPHA].nunique(), "seed": 1}
     converged = dataset["motor.converged"]
     assert converged.dtype == float

@@ -15,26 +15,26 @@ from jaxbl.sweeps.sweep import share, sweep
 pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
-def test_shares_are_the_whole_study(tmp_path, computed):
+def test_shares_are_the_whole_study(tmp_path, computed_chunks):
     alone = sweep(thirty_run_study(), tmp_path / "alone")
-    computed.clear()
+    computed_chunks.clear()
     folder, calls = tmp_path / "shares", []
     last = share(thirty_run_study(), folder, (3, 3), progress=lambda *done: calls.append(done))
-    assert len(computed) == 2 and not last.complete
+    assert len(computed_chunks) == 2 and not last.complete
     # progress of a share is of its own lanes
-    assert calls[-1][0] == calls[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed)
+    assert calls[-1][0] == calls[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed_chunks)
     assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
     with lock_folder(folder, shared=True):
         # another one is at work
         share(thirty_run_study(), folder, (1, 3))
         assert status(folder).held_by.startswith("process")
     done = share(thirty_run_study(), folder, (2, 3))
-    assert sorted(computed) == list(range(8))
+    assert sorted(computed_chunks) == list(range(8))
     assert done.complete and done.remaining_seconds == 0.0 and not done.finished
     # a share that is there, and who collects them, compute nothing
     share(thirty_run_study(), folder, (2, 3))
     result = sweep(thirty_run_study(), folder)
-    assert sorted(computed) == list(range(8))
+    assert sorted(computed_chunks) == list(range(8))
     assert read_parts(folder) == read_parts(tmp_path / "alone")
     pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
     assert status(folder).finished
@@ -43,7 +43,7 @@ def test_shares_are_the_whole_study(tmp_path, computed):
     assert share(thirty_run_study(), folder, (99, 100)).complete
 
 
-def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypatch):
+def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed_chunks, monkeypatch):
     share(thirty_run_study(), tmp_path / "study", (1, 2))
     before = read_parts(tmp_path / "study")
     with pytest.raises(InputError, match="holds another study"):
@@ -68,7 +68,7 @@ def test_status_of_folders(tmp_path):
         list_statuses(tmp_path)
     for name in ("verify/drive", "verify/sampled"):
         sweep(thirty_run_study(), tmp_path / name)
-    assert [one.folder.name for one in list_statuses(tmp_path)] == ["drive", "sampled"]
+    assert [status.folder.name for status in list_statuses(tmp_path)] == ["drive", "sampled"]
 
 
 def test_chunks_cover_the_grid_coarsely_first():

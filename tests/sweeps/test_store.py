@@ -66,17 +66,17 @@ def test_what_a_study_leaves(finished_study):
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
 
 
-def test_finished_study_is_only_read(copy, finished_study, computed):
+def test_finished_study_is_only_read(copy, finished_study, computed_chunks):
     before = files(copy)
     result = sweep(study(), copy)
-    assert computed == []
+    assert computed_chunks == []
     assert result.cost["lanes"] == 0
     assert files(copy) == before
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
     pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
 
 
-def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, computed):
+def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, computed_chunks):
     def interrupt(done, total):
         assert total == 9
         if done == 3:
@@ -85,18 +85,18 @@ def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, co
     with pytest.raises(KeyboardInterrupt):
         sweep(study(), tmp_path / "study", progress=interrupt)
     # the second one was computed while the first was written, and is kept
-    assert computed == [0, 1]
+    assert computed_chunks == [0, 1]
     calls = []
     # with other chunks asked for: those of the folder stay
     result = sweep(study(sweep={"seeds": 3, "chunk": 100}), tmp_path / "study", progress=lambda *done: calls.append(done))
-    assert computed == [0, 1, 2]
+    assert computed_chunks == [0, 1, 2]
     assert calls == [(3, 9), (6, 9), (9, 9)]
     assert result.cost["lanes"] == 3
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "draft only"])
-def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, computed, damage):
+def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, computed_chunks, damage):
     part = copy / "points" / "part-00001.parquet"
     content = part.read_bytes()
     part.unlink()
@@ -112,7 +112,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, compu
     else:
         assert len(open_study(copy).frame) == 6
     result = sweep(study(), copy)
-    assert computed == [1]
+    assert computed_chunks == [1]
     if damage in ("truncated", "empty"):
         (reason,) = result.damaged
         assert reason.startswith("points/part-00001.parquet") and reason.endswith("it is kept as damaged/part-00001.parquet")
@@ -140,19 +140,19 @@ def test_another_study_in_the_folder_stays_as_it_is(copy, case):
     assert files(copy) == before
 
 
-def test_only_title_notes_and_figures_changed_is_the_same_study(copy, computed):
+def test_only_title_notes_and_figures_changed_is_the_same_study(copy, computed_chunks):
     config = read_config(study({"title": "other", "notes": ["a"]}, figures=[FIGURE]))
     sweep(config, copy)
-    assert computed == []
+    assert computed_chunks == []
     assert open_study(copy).config.to_dict() == config.to_dict()
 
 
-def test_overwriting_is_asked_for(copy, computed):
+def test_overwriting_is_asked_for(copy, computed_chunks):
     result = sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
-    assert computed == [0, 1, 2]
+    assert computed_chunks == [0, 1, 2]
     assert len(open_study(copy).frame) == len(result.frame) == 9
     sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
-    assert computed == [0, 1, 2]
+    assert computed_chunks == [0, 1, 2]
 
 
 MANIFESTS = {
@@ -164,7 +164,9 @@ MANIFESTS = {
 
 
 @pytest.mark.parametrize("case", MANIFESTS)
-def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(copy, finished_study, computed, case):
+def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(
+    copy, finished_study, computed_chunks, case
+):
     file, content = copy / "manifest.json", MANIFESTS[case]
     if content is None:
         file.unlink()
@@ -181,7 +183,7 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
     assert files(copy) == before
     # as many chunks as there were, whatever is asked for now
     result = sweep(study(sweep={"seeds": 3, "chunk": 100}), copy)
-    assert computed == [] and result.damaged == ()
+    assert computed_chunks == [] and result.damaged == ()
     pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
     assert len(list((copy / "points").iterdir())) == 3
 
@@ -230,19 +232,19 @@ def test_flipped_bits_are_noticed_and_healed(copy, finished_study, repeats):
     assert noticed > flips / 2
 
 
-def test_parts_that_changed_places_are_computed_anew(copy, finished_study, computed):
-    one, other = (copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
-    content = one.read_bytes(), other.read_bytes()
-    one.write_bytes(content[1])
-    other.write_bytes(content[0])
+def test_parts_that_changed_places_are_computed_anew(copy, finished_study, computed_chunks):
+    first, third = (copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
+    content = first.read_bytes(), third.read_bytes()
+    first.write_bytes(content[1])
+    third.write_bytes(content[0])
     with pytest.raises(InputError, match=r"part-00000\.parquet: is damaged \(is part 2 of this study\)"):
         _ = open_study(copy).frame
     assert len(sweep(study(), copy).damaged) == 2
-    assert computed == [0, 2]
+    assert computed_chunks == [0, 2]
     pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
 
 
-def test_an_edited_part_is_kept_aside(copy, finished_study, computed):
+def test_an_edited_part_is_kept_aside(copy, finished_study, computed_chunks):
     part = copy / "points" / "part-00001.parquet"
     frame = pd.read_parquet(part)
     frame["motor.velocity_rmse"] *= 1.01
@@ -250,7 +252,7 @@ def test_an_edited_part_is_kept_aside(copy, finished_study, computed):
     with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(has no header"):
         _ = open_study(copy).frame
     sweep(study(), copy)
-    assert computed == [1]
+    assert computed_chunks == [1]
     stored_frame = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
     pd.testing.assert_frame_equal(stored_frame, frame)
 
@@ -271,44 +273,44 @@ def test_a_part_of_another_study_is_refused(copy, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["part-00099.parquet", "part-3.parquet", "part-copy.parquet"])
-def test_a_part_too_many_is_refused(copy, computed, name):
+def test_a_part_too_many_is_refused(copy, computed_chunks, name):
     (copy / "points" / name).write_bytes((copy / "points" / "part-00001.parquet").read_bytes())
     for read in (lambda: open_study(copy).frame, lambda: sweep(study(), copy)):
         with pytest.raises(InputError, match=f"{name}: is no part of this study, which has 3; move it away"):
             read()
-    assert computed == []
+    assert computed_chunks == []
 
 
-def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed):
+def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed_chunks):
     (copy / "manifest.json").unlink()
     (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
     whole_part_count, store = repair(copy)
-    assert whole_part_count == 2 and len(store.damaged) == 1 and computed == []
+    assert whole_part_count == 2 and len(store.damaged) == 1 and computed_chunks == []
     assert not open_study(copy).source.manifest["finished"]
     assert len(open_study(copy).frame) == 6
     sweep(copy / "study.toml", copy)
-    assert computed == [0]
+    assert computed_chunks == [0]
     with pytest.raises(InputError, match=r"holds no study \(no study\.toml\)"):
         repair(copy / "points")
 
 
-def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, computed):
+def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, computed_chunks):
     """Only its parts say how many they are in the end."""
     axes = [{"path": ALPHA, "start": 1.0, "stop": 40.0, "num": 5, "scale": "log"}]
     refined = study(axes=axes, sweep={"seeds": 1, "chunk": 2, "refine": 3})
     result = sweep(refined, tmp_path / "study")
-    parts, points = list(computed), files(tmp_path / "study" / "points")
+    parts, points = list(computed_chunks), files(tmp_path / "study" / "points")
     coarse = len(Engine(read_config(refined)))
     assert len(parts) > coarse
     (tmp_path / "study" / "manifest.json").unlink()
     whole_part_count, store = repair(tmp_path / "study")
     assert (whole_part_count, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
     again = sweep(refined, tmp_path / "study")
-    assert computed == parts and files(tmp_path / "study" / "points") == points
+    assert computed_chunks == parts and files(tmp_path / "study" / "points") == points
     pd.testing.assert_frame_equal(again.frame, result.frame)
 
 
-def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
+def test_all_of_it_is_read_where_it_is_asked_for(copy, computed_chunks):
     """A part that agrees with a manifest that is wrong as well."""
     part = copy / "points" / "part-00001.parquet"
     frame = pd.read_parquet(part)
@@ -318,7 +320,7 @@ def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
     (copy / "manifest.json").write_text(json_with_checksum(manifest))
     assert sweep(study(), copy).damaged == ()
     assert len(sweep(study(), copy, verify_store=True).damaged) == 1
-    assert computed == [1]
+    assert computed_chunks == [1]
 
 
 def test_two_processes_do_not_write_into_one_folder(copy):

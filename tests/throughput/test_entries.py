@@ -161,11 +161,11 @@ def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
 
 
 def test_fewer_lanes_are_the_first_of_more():
-    few, many = (Workload(lanes, STEPS, "float64").values() for lanes in (5, 500))
+    first_lanes, more_lanes = (Workload(lanes, STEPS, "float64").values() for lanes in (5, 500))
     for path, (low, high) in RANGES.items():
-        np.testing.assert_array_equal(few[path], many[path][:5])
-        assert many[path].min() >= low
-        assert many[path].max() <= high
+        np.testing.assert_array_equal(first_lanes[path], more_lanes[path][:5])
+        assert more_lanes[path].min() >= low
+        assert more_lanes[path].max() <= high
         # every tenth of the range has its share of lanes
-        shares = np.histogram(np.log(many[path]), 10, np.log([low, high]))[0]
+        shares = np.histogram(np.log(more_lanes[path]), 10, np.log([low, high]))[0]
         assert shares.min() > 40

@@ -126,7 +126,7 @@ def test_lines_coordinates_and_moments(tmp_path):
 
         def sizes():
             rows = (row.split("\t") for row in page.locator("#sizes tbody tr").all_inner_texts())
-            return {name: [float(one) for one in values] for name, *values in rows}
+            return {name: [float(number) for number in values] for name, *values in rows}
 
         # the moving average leaves what is slow, and takes the fast part away
         ripple = [np.sqrt(np.mean(part**2)) for part in (RIPPLE[100:3000], RIPPLE[3000:])]

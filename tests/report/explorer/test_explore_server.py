@@ -29,10 +29,10 @@ def ask(asked):
 
 @pytest.fixture
 def server():
-    with served(Source("", [], write, {"run": ask}, lambda: None, lambda: None)) as one:
-        threading.Thread(target=one.serve_forever, daemon=True).start()
-        yield one
-        one.shutdown()
+    with served(Source("", [], write, {"run": ask}, lambda: None, lambda: None)) as explorer:
+        threading.Thread(target=explorer.serve_forever, daemon=True).start()
+        yield explorer
+        explorer.shutdown()
 
 
 def call(server, path, method="GET", body=None, **headers):
@@ -71,15 +71,15 @@ def test_nothing_else_is_read(server, path):
 def test_only_this_machine_with_the_token(server):
     assert server.server_address[0] == "127.0.0.1"
     call(server, "")
-    own = f"127.0.0.1:{server.server_port}"
+    address = f"127.0.0.1:{server.server_port}"
     for path in ("/", "/1/index.html", "/wrong/1/index.html", "/%ff/"):
         status, _, content = call(server, path)
         assert status == 403 and json.loads(content) == {"error": "open the address that jaxbl explore printed"}
     assert call(server, "1/index.html", Host="evil.example")[0] == 403
     assert call(server, "1/index.html", Origin="http://evil.example")[0] == 403
     assert call(server, "1/index.html", Origin="null")[0] == 403
-    assert call(server, "1/index.html", Origin=f"https://{own}")[0] == 403
-    assert call(server, "1/index.html", Origin=f"http://{own}")[0] == 200
+    assert call(server, "1/index.html", Origin=f"https://{address}")[0] == 403
+    assert call(server, "1/index.html", Origin=f"http://{address}")[0] == 200
 
 
 def test_questions(server):
@@ -120,8 +120,8 @@ def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
     with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         server.newest()
-        own = f"127.0.0.1:{server.server_port}"
-        request = f"GET {server.url.partition(own)[2]}1/index.html HTTP/1.1\r\nHost: {own}\r\n\r\n"
+        address = f"127.0.0.1:{server.server_port}"
+        request = f"GET {server.url.partition(address)[2]}1/index.html HTTP/1.1\r\nHost: {address}\r\n\r\n"
         ended, close = threading.Event(), server.shutdown_request
         monkeypatch.setattr(server, "shutdown_request", lambda request: (close(request), ended.set()))
         with socket.create_connection(("127.0.0.1", server.server_port)) as connection:

@@ -46,7 +46,7 @@ def source(result, lead=()):
     )
 
 
-def about(folder):
+def read_data(folder):
     return json.loads((folder / "data.js").read_text().removeprefix("jaxblData(").rstrip().removesuffix(");"))
 
 
@@ -54,17 +54,17 @@ def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
     result = study(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
     shuffled = result.frame.sample(frac=1.0, random_state=0).iloc[5:]
     write_static(source(result.__class__(result.config, shuffled), ["found"]), tmp_path / "out")
-    messages, table = about(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
-    assert (messages["rows"], messages["found"], messages["title"]) == (180, 175, HOSTILE)
-    paths = [path["path"] for axis in messages["axes"] for path in axis["paths"]]
-    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in messages["axes"]], names=paths)
+    data, table = read_data(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
+    assert (data["rows"], data["found"], data["title"]) == (180, 175, HOSTILE)
+    paths = [path["path"] for axis in data["axes"] for path in axis["paths"]]
+    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in data["axes"]], names=paths)
     expected = shuffled.set_index(paths)["motor.velocity_rmse"].reindex(grid).to_numpy()
     np.testing.assert_allclose(table["motor.velocity_rmse"], expected, rtol=1e-6)
     # what is infinite is not there
     assert table["motor.convergence_time"].isna().sum() > 100
     # the same bytes in scripts, for pages from disk
     scripts = "".join(file.read_text() for file in sorted((tmp_path / "out").glob("points.*.js")))
-    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * messages["bytes"] / 3
+    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * data["bytes"] / 3
 
 
 def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
@@ -75,8 +75,8 @@ def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
     stiffness_error = table["motor.stiffness_error"]
     assert stiffness_error.isna().mean() == pytest.approx(1.0 / 3.0) and set(stiffness_error.dropna()) == {2.0}
     assert set(table["finite"]) == {0.0, 1.0}
-    (messages,) = [metric for metric in about(tmp_path)["metrics"] if metric["name"] == "motor.stiffness_error"]
-    assert messages["label"].startswith("motor: |")
+    (shown_metric,) = [metric for metric in read_data(tmp_path)["metrics"] if metric["name"] == "motor.stiffness_error"]
+    assert shown_metric["label"].startswith("motor: |")
 
 
 def test_zipped_axes_are_one(tmp_path):
@@ -85,7 +85,7 @@ def test_zipped_axes_are_one(tmp_path):
     result = make_result(rigid_study(axes=axes), motor__velocity_rmse=product)
     write_static(source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
-    assert len(table) == 9 and [len(axis["paths"]) for axis in about(tmp_path)["axes"]] == [1, 2, 1]
+    assert len(table) == 9 and [len(axis["paths"]) for axis in read_data(tmp_path)["axes"]] == [1, 2, 1]
     np.testing.assert_allclose(table["motor.velocity_rmse"], result.frame["motor.velocity_rmse"], rtol=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_folders_of_others_are_refused(tmp_path):
         write_static(other, tmp_path / "again")
 
 
-def read(values):
+def read_pointer_values(values):
     """The numbers beside the pointer: of the cell, of x, of y."""
     return [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")]
 
@@ -126,13 +126,15 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         # a cell: the median over seeds, at the first noise
         plot.hover(position=place(0.5, 0.25))
         alphas, lambdas = np.geomspace(2.0, 50.0, 6), np.geomspace(1.0, 20.0, 5)
-        assert read(values) == pytest.approx([alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3)
+        assert read_pointer_values(values) == pytest.approx(
+            [alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3
+        )
         check(page, 0)
         # of what is true or false, the share
         page.select_option("#metric", "motor.converged")
         page.wait_for_selector("body[data-drawn^='motor.converged ']")
         plot.hover(position=place(0.5, 0.26))
-        assert read(values)[0] == pytest.approx(2.0 / 3.0, rel=1e-3)
+        assert read_pointer_values(values)[0] == pytest.approx(2.0 / 3.0, rel=1e-3)
         page.select_option("#metric", "motor.velocity_rmse")
         page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
         # other noise, the largest seed
@@ -155,7 +157,7 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         page.mouse.move(bounding_box["x"] + end["x"], bounding_box["y"] + end["y"], steps=3)
         page.mouse.up()
         plot.hover(position=place(0.01, 0.01))
-        assert read(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
+        assert read_pointer_values(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
         plot.focus()
         for key in ("ArrowRight", "Enter"):
             page.keyboard.press(key)
@@ -213,8 +215,8 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
         assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
     config = read_config(tmp_path / "out" / "point.toml")
     assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
-    drawn = config.to_dict()["effects"]
-    assert [one.get("torque", one.get("harmonic")) for one in drawn] == [0.02, 0.25, 3]
+    effects_of_point = config.to_dict()["effects"]
+    assert [effect.get("torque", effect.get("harmonic")) for effect in effects_of_point] == [0.02, 0.25, 3]
 
 
 SWEPT = rigid_study(
@@ -224,15 +226,15 @@ SWEPT = rigid_study(
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory):
+def swept_folder(tmp_path_factory):
     """A sweep of twelve runs, stored."""
     folder = tmp_path_factory.mktemp("swept")
     sweep(SWEPT, folder)
     return folder
 
 
-def test_a_run_simulated_anew_is_that_of_its_config(swept):
-    result = study_source(swept).answers["simulated"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
+def test_a_run_simulated_anew_is_that_of_its_config(swept_folder):
+    result = study_source(swept_folder).answers["simulated"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
     trial = run(tomllib.loads(result["config"]))
     assert trial.config.encoders.noise == 1e-4 and trial.config.observer.motor.alpha == pytest.approx(50.0)
     assert set(result["metrics"]) == set(trial.summary["metrics"])
@@ -243,9 +245,9 @@ def test_a_run_simulated_anew_is_that_of_its_config(swept):
     # its phase plane shows the error, though the majorant goes far beyond it
     plane = result["planes"]["motor"]
     error, slope = (np.frombuffer(base64.b64decode(plane[name]), "<f4") for name in ("error", "slope"))
-    assert plane["reach"] == pytest.approx([1.32 * np.abs(one).max() for one in (error, slope)], rel=1e-5)
+    assert plane["reach"] == pytest.approx([1.32 * np.abs(signal).max() for signal in (error, slope)], rel=1e-5)
     # the sweep stored the same
-    frame = open_study(swept).frame
+    frame = open_study(swept_folder).frame
     row = frame[(frame[NOISE] == 1e-4) & (frame[ALPHA] > 49.0) & (frame[LAMBDA] < 2.0)]
     assert row["motor.velocity_rmse"].item() == pytest.approx(result["metrics"]["motor.velocity_rmse"], rel=1e-6)
 
@@ -254,7 +256,7 @@ VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("question", "message"),
     [
         (7, f"values: should have a value of each axis: {NOISE}, {ALPHA}, {LAMBDA}"),
         ({"seed": 0}, "values: should have a value of each axis"),
@@ -265,9 +267,9 @@ VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
         ({"values": VALUES}, "seed: should be a whole number"),
     ],
 )
-def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
-    with pytest.raises(InputError, match=why):
-        study_source(swept).answers["simulated"](asked)
+def test_points_that_the_study_may_not_have_are_refused(swept_folder, question, message):
+    with pytest.raises(InputError, match=message):
+        study_source(swept_folder).answers["simulated"](question)
 
 
 def test_numbers_that_differ_in_the_last_digit_of_their_precision_give_nearly_the_same():
@@ -294,8 +296,8 @@ CLICKS = """async () => {
 
 
 @needs_chromium
-def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_path):
-    with served(study_source(swept)) as server:
+def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folder, tmp_path):
+    with served(study_source(swept_folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with open_pages(server.url) as (page,):
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
@@ -320,15 +322,15 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             coloured = (
                 "getImageData(85, 15, 300, 150).data.some((byte, i, all) => i % 4 === 0 && Math.abs(byte - all[i + 2]) > 60)"
             )
-            drawn = f"[...document.querySelectorAll('#traces canvas')].map((one) => one.getContext('2d').{coloured})"
+            drawn = f"[...document.querySelectorAll('#traces canvas')].map((canvas) => canvas.getContext('2d').{coloured})"
             assert all(page.evaluate(drawn))
             figures.first.locator(".plane").focus()
             page.keyboard.press("ArrowRight")
             assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
             check(page, 0)
             # a run that the sweep has no figures of
-            one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
-            reply = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
+            missing_metric = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
+            reply = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {missing_metric})")
             assert reply == "error: 2. The sweep has none: its run diverged, or is not there yet."
             # of clicks while one is simulated the last one counts
             assert page.evaluate(CLICKS) == [1, 3]
@@ -348,16 +350,16 @@ def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path)
     share(SWEPT, tmp_path / "out", (1, 2))
     with served(study_source(tmp_path / "out")) as server:
 
-        def told(version):
+        def read_version(version):
             file = server.file(version, "data.js")
             assert file is not None
-            return about(file.parent)
+            return read_data(file.parent)
 
         versions = server.newest(), server.newest()
-        assert [told(one)["found"] for one in versions] == [8, 8] and told(versions[0])["served"]
+        assert [read_version(version)["found"] for version in versions] == [8, 8] and read_version(versions[0])["served"]
         sweep(SWEPT, tmp_path / "out")
         last = server.newest()
-        assert told(last)["found"] == 12 and server.newest() == last
+        assert read_version(last)["found"] == 12 and server.newest() == last
 
 
 WORDS = {"path": "observer.discretisation", "values": ["implicit", "explicit"]}
@@ -373,9 +375,9 @@ def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     columns = {"finite": lambda frame: frame["seed"] == 0, "motor__position_rmse": lambda frame: 1e300}
     result = make_result(data, motor__velocity_rmse=product_of_gains, **columns)
     write_study(result, tmp_path, ["found"])
-    messages, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
-    assert (messages["rows"], messages["found"], messages["total"], messages["sampled"]) == (32, 32, 32, True)
-    assert [(axis["path"], axis["words"], axis["log"]) for axis in messages["axes"]] == [
+    description, table = read_data(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert (description["rows"], description["found"], description["total"], description["sampled"]) == (32, 32, 32, True)
+    assert [(axis["path"], axis["words"], axis["log"]) for axis in description["axes"]] == [
         (ALPHA, None, True), (LAMBDA, None, False), (WORDS["path"], WORDS["values"], False)
     ]  # fmt: skip
     np.testing.assert_array_equal(table[ALPHA], result.frame[ALPHA])
