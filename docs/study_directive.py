@@ -1,4 +1,4 @@
-"""A directive for the gallery: a study as it is written, and the figures that its report draws of it.
+"""A directive for the gallery: a study as it is written, and figures of its report.
 
     ```{study} name
     :command: sweep
@@ -6,19 +6,23 @@
     title = "..."
     ```
 
-`command` is that of jaxbl which runs it; `figures` are those shown, by their names, all if left out. Results are kept in
+`command` is that of jaxbl which runs it, here by its function in Python: a process of its own would begin by importing and
+compiling, and would draw the whole report. `figures` are those shown, by their names, all if left out. They are kept in
 `.cache/gallery/NAME`, and drawn anew once the study or the package has changed.
 """
 
 import hashlib
 import os
-import subprocess
-import sys
+import shutil
+import tomllib
 from pathlib import Path
 
 from docutils import nodes
 from docutils.parsers.rst import directives
 from sphinx.util.docutils import SphinxDirective
+
+import jaxbl
+from jaxbl.report.figures import save
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "gallery"
@@ -29,23 +33,23 @@ def read_package() -> bytes:
     return b"".join(file.read_bytes() for file in sorted((ROOT / "jaxbl").rglob("*.py")))
 
 
-def draw_study(name: str, command: str, text: str) -> list[Path]:
-    """Return figures of a study's report, and draw them if they are not there.
+def draw_study(name: str, command: str, figures: list[str], text: str) -> list[Path]:
+    """Return files of a study's figures, and draw them if they are not there.
 
     Raises:
-        RuntimeError: the command failed.
+        InputError: the study is wrong, or it has no figure of that name.
+        NoResult: the command found nothing.
     """
-    out, study, known = CACHE / name, CACHE / f"{name}.toml", CACHE / f"{name}.txt"
-    state = hashlib.sha256(read_package() + text.encode() + command.encode()).hexdigest()
+    folder, known = CACHE / name, CACHE / f"{name}.txt"
+    state = hashlib.sha256(read_package() + repr((command, figures, text)).encode()).hexdigest()
     if not known.exists() or known.read_text(encoding="utf-8") != state:
-        CACHE.mkdir(parents=True, exist_ok=True)
-        study.write_text(text, encoding="utf-8")
-        words = [sys.executable, "-m", "jaxbl", command, str(study), "--out", str(out), "--overwrite"]
-        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"{name}: {done.stderr.strip()}")
+        run = jaxbl.run if command == "simulate" else getattr(jaxbl, command)
+        drawings = jaxbl.draw(run(tomllib.loads(text)), *figures)
+        shutil.rmtree(folder, ignore_errors=True)
+        for i, drawn in enumerate(drawings):
+            save(drawn.figure, folder / f"{i}_{drawn.name}.png")
         known.write_text(state, encoding="utf-8")
-    return sorted((out / "figures").glob("*.png"))
+    return sorted(folder.glob("*.png"))
 
 
 class Study(SphinxDirective):
@@ -58,18 +62,13 @@ class Study(SphinxDirective):
     def run(self):
         """The figures, and the study below them."""
         self.env.note_reread()  # figures follow from the package, too
-        name, command, text = self.arguments[0], self.options["command"], "\n".join(self.content) + "\n"
+        (name,), text = self.arguments, "\n".join(self.content) + "\n"
         try:
-            files = draw_study(name, command, text)
-        except RuntimeError as error:
-            return [self.state.document.reporter.warning(str(error), line=self.lineno)]
-        wanted = self.options.get("figures", "").split() or [file.stem for file in files]
-        shown = [file for stem in wanted for file in files if file.stem == stem]
-        if len(shown) != len(wanted):
-            text = f"{name}: not all of {wanted} are figures: {[file.stem for file in files]}"
-            return [self.state.document.reporter.warning(text, line=self.lineno)]
+            files = draw_study(name, self.options["command"], self.options.get("figures", "").split(), text)
+        except (jaxbl.InputError, jaxbl.NoResult) as error:
+            return [self.state.document.reporter.warning(f"{name}: {error}", line=self.lineno)]
         page = Path(self.env.doc2path(self.env.docname)).parent
-        images = [nodes.image(uri=os.path.relpath(file, page), alt=f"{name}, {file.stem}") for file in shown]
+        images = [nodes.image(uri=os.path.relpath(file, page), alt=f"{name}, {file.stem[2:]}") for file in files]
         return [*images, nodes.literal_block(text, text, language="toml")]
 
 
