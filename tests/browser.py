@@ -60,7 +60,7 @@ def _note_elsewhere(errors, origin, request):
         errors.append(request.url)
 
 
-def check(page, figures):
+def check_figures(page, figures):
     """So many figures have loaded and have a text; nothing serious is in the way of a screen reader or keyboard."""
     images = page.evaluate("[...document.images].map((image) => [image.complete && image.naturalWidth > 0, image.alt])")
     assert len(images) == figures

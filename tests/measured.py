@@ -14,13 +14,13 @@ from jaxbl.records import NominalDrive, Record, read_record
 GEAR_RATIO, INERTIA, VISCOUS, COULOMB = 20.0, 0.01, 0.05, 0.1
 
 
-def play(positions: np.ndarray, width: float) -> np.ndarray:
+def follow_with_play(positions: np.ndarray, width: float) -> np.ndarray:
     """Positions behind a gap."""
-    behind, place = np.empty_like(positions), positions[0]
+    load_positions, load_position = np.empty_like(positions), positions[0]
     for i, position in enumerate(positions):
-        place = min(max(place, position - 0.5 * width), position + 0.5 * width)
-        behind[i] = place
-    return behind
+        load_position = min(max(load_position, position - 0.5 * width), position + 0.5 * width)
+        load_positions[i] = load_position
+    return load_positions
 
 
 def simulate_log(
@@ -59,7 +59,7 @@ def simulate_log(
     middle = t + 0.5 * period
     u = INERTIA * motion(middle, 2) + VISCOUS * motion(middle, 1) + COULOMB * np.tanh(motion(middle, 1) / 0.5)
     motor = motion(t, 0) + noise * random.standard_normal(len(t))
-    load = play(motion(t - skew, 0), gap) + noise * random.standard_normal(len(t))
+    load = follow_with_play(motion(t - skew, 0), gap) + noise * random.standard_normal(len(t))
     if resolution:
         motor, load = (np.round(x / resolution) * resolution for x in (motor, load))
     return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load / GEAR_RATIO})
@@ -70,7 +70,9 @@ NOMINAL = NominalDrive(
 )
 
 
-def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000, drift=0.0, seed=0):
+def simulate_axis(
+    skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000, drift=0.0, seed=0
+):
     """A geared axis with dry friction at the load in multisine motion: its equations of motion, both encoders with noise."""
     random, t = np.random.default_rng(seed), 1e-3 * np.arange(count)
     frequency, size, phase = np.array([0.5, 0.83, 1.27, 2.1]), np.array([1.0, 0.5, 0.4, 0.2]), random.uniform(0.0, 6.3, 4)
@@ -91,7 +93,7 @@ def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiff
     return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load})
 
 
-def real(name: str) -> Path:
+def find_recording(name: str) -> Path:
     """A real recording; the test skips where the folder with them is absent."""
     folder = Path(os.environ.get("JAXBL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
     if not (folder / name).exists():
@@ -101,7 +103,7 @@ def real(name: str) -> Path:
 
 def read_stretch(name: str, table: dict[str, Any], seconds: float) -> Record:
     """Read the first seconds of a real recording."""
-    record = read_record(real(name), table)
+    record = read_record(find_recording(name), table)
     count = round(seconds / record.sample_period)
     positions = {side: values[:count] for side, values in record.positions.items()}
     torque = None if record.torque is None else record.torque[:count]

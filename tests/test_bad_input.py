@@ -142,8 +142,8 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     call = [*before, sys.executable, "-m", "jaxbl", "plot", folder]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     folder.chmod(0o755)
-    output = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
-    assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {output}\n")
+    message = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
+    assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {message}\n")
 
 
 @pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])
@@ -160,6 +160,6 @@ def test_an_interrupt_before_work_begins(tmp_path, default_interrupt, wait):
         process.send_signal(signal.SIGINT)
         content = process.stderr.read()
         process.wait(300)
-    output = [line for line in content.splitlines() if not line.startswith("import time:")]
+    lines_left = [line for line in content.splitlines() if not line.startswith("import time:")]
     assert process.returncode == 130
-    assert len(output) == 1 and output[0].startswith("interrupted")
+    assert len(lines_left) == 1 and lines_left[0].startswith("interrupted")

@@ -22,7 +22,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from command_server import run_command, run_python, start_command
-from measured import EMPS, real, simulate_log
+from measured import EMPS, find_recording, simulate_log
 from passed import PASSED
 from progress_lines import without_progress
 from shared_results import ATLAS
@@ -379,8 +379,8 @@ def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypat
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
     assert code == 130
-    again = "jaxbl verify study.toml --backend scan --out out"
-    assert errors == [f"interrupted; what is finished is kept. Go on with: {again}"]
+    command = "jaxbl verify study.toml --backend scan --out out"
+    assert errors == [f"interrupted; what is finished is kept. Go on with: {command}"]
 
 
 TUNE = {"num": 3, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lambda_ratio": {"start": 0.5, "stop": 10.0}}
@@ -557,10 +557,10 @@ def shorten_study(study):
         study["sweep"]["refine"] = 1
     if "verify" in study:
         # shapes of the verified study that other tests read, which share its programs
-        checked = study["verify"]
-        checked |= {"damping": checked["damping"][:1], "marks": checked["marks"][:2]}
+        verify = study["verify"]
+        verify |= {"damping": verify["damping"][:1], "marks": verify["marks"][:2]}
         for ratio in ("alpha_ratio", "lambda_ratio"):
-            checked[ratio]["num"] = ATLAS[ratio]["num"]
+            verify[ratio]["num"] = ATLAS[ratio]["num"]
     for axis in study.get("axes", []):
         axis |= {"num": 2} if "num" in axis else {"values": axis["values"][:2]}
 
@@ -573,9 +573,9 @@ def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
         write(tmp_path, study, f"{name}.toml")
     done = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
-    ended = json.loads(done.stdout.splitlines()[-1])
-    output = {name: (code, without_progress(errors)) for name, (code, errors) in ended.items()}
-    assert output == dict.fromkeys(SHIPPED, (0, ""))
+    results = json.loads(done.stdout.splitlines()[-1])
+    outcomes = {name: (code, without_progress(errors)) for name, (code, errors) in results.items()}
+    assert outcomes == dict.fromkeys(SHIPPED, (0, ""))
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
@@ -665,7 +665,9 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
 
 def test_inspect_runs_without_a_word_on_stderr(tmp_path):
     (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
-    done = run_command("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)
+    done = run_command(
+        "inspect", str(find_recording("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path
+    )
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     assert "motion up to" in done.stdout
 
@@ -729,7 +731,7 @@ IDENTIFY = ["identify", "an axis.csv", "--model", "axis.toml"]
 
 
 @pytest.fixture
-def axis(tmp_path):
+def axis_log(tmp_path):
     """A log and its study."""
     write(tmp_path, AXIS, "axis.toml")
     time = np.arange(600) * 1e-3
@@ -742,14 +744,14 @@ def axis(tmp_path):
 AGAIN = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
 
 
-def test_an_interrupted_identification_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
+def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
     more = ["--holdout", "an axis.csv", "--profile"]
     assert call(*IDENTIFY, *more) == (130, [], [f"{AGAIN} {shlex.join(more)} --out 'results/an axis'"])
     assert left(tmp_path / "results") == []
 
 
-def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis, call, tmp_path, monkeypatch):
+def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log, call, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("jaxbl.report.page.html", interrupt)
         assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
@@ -762,7 +764,7 @@ def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis, cal
     assert {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")} == before
 
 
-def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
+def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
     """SIGINT from outside, as soon as the folder is there."""
     folder = tmp_path / "results" / "an axis"
     with start_command(*IDENTIFY, cwd=tmp_path) as process:
@@ -774,8 +776,8 @@ def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
-    again = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
-    assert without_progress(errors) == f"interrupted; nothing was written. Start again with: {again}\n"
+    command = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
+    assert without_progress(errors) == f"interrupted; nothing was written. Start again with: {command}\n"
     assert not folder.exists()
 
 
@@ -818,7 +820,7 @@ class _Found:
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick_tasks(monkeypatch):
     """Diagnoses without the computation; returns the tasks that were run."""
     tasks = []
 
@@ -841,7 +843,7 @@ def quick(monkeypatch):
 DIAGNOSE = ["diagnose", "an axis.csv", "--model", "axis.toml"]
 
 
-def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
+def test_a_log_is_diagnosed_once(axis_log, quick_tasks, call, tmp_path):
     code, lines, _ = call(*DIAGNOSE, "--next-experiment", "next.csv")
     assert code == 0
     assert lines[0] == (
@@ -859,7 +861,7 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
     assert [command for command, _ in steps_in(lines)] == [run, "jaxbl explore 'results/an axis'"]
     assert lines[-1] == "results/an axis/report.html"
     assert call(*DIAGNOSE) == (0, [*lines[: index - 1], *lines[index:]], [])
-    assert len(quick) == 1
+    assert len(quick_tasks) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
         call("diagnose", "other.csv", "--model", "axis.toml", "--out", "results/an axis")
@@ -881,29 +883,29 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         (["diagnose", "--batch", "."], r"an axis\.csv: no model; give --model TOML, or an axis\.toml beside it"),
     ],
 )
-def test_what_cannot_be_diagnosed_is_told(arguments, message, axis, quick, call, tmp_path):
+def test_what_cannot_be_diagnosed_is_told(arguments, message, axis_log, quick_tasks, call, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=message) as error:
         call(*arguments)
     assert "\n" not in str(error.value)
-    assert not quick and not (tmp_path / "new").exists()
+    assert not quick_tasks and not (tmp_path / "new").exists()
 
 
-def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
+def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", interrupt)
-    messages = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
-    assert call(*DIAGNOSE, "--out", "out") == (130, [], [messages])
+    message = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
+    assert call(*DIAGNOSE, "--out", "out") == (130, [], [message])
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick, call, tmp_path):
+def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis_log, quick_tasks, call, tmp_path):
     (tmp_path / "logs").mkdir()
     for name in ("a.csv", "b.csv"):
         shutil.copy("an axis.csv", tmp_path / "logs" / name)
     (tmp_path / "logs" / "broken.csv").write_text("t,u\n0,1\n")
     # in this process: another one knows nothing of `quick`
-    again = "diagnose", "--batch", "logs", "--model", "axis.toml", "--jobs", "1", "--out"
-    code, lines, _ = call(*again, "out")
+    command = "diagnose", "--batch", "logs", "--model", "axis.toml", "--jobs", "1", "--out"
+    code, lines, _ = call(*command, "out")
     assert code == 0
     # what is found may go on below
     assert [line.split()[:2] for line in lines if not line.startswith(" ")][:3] == [
@@ -916,14 +918,14 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick,
     assert list(table["log"]) == ["a.csv", "b.csv", "broken.csv"] and "broken.csv" in table["refused"][2]
     assert not (tmp_path / "out" / "broken").exists()
     shutil.rmtree(tmp_path / "out" / "b")
-    assert call(*again, "out") == (0, lines, [])
-    assert len(quick) == 3
+    assert call(*command, "out") == (0, lines, [])
+    assert len(quick_tasks) == 3
     # a model of its own, and a hold-out log
     shutil.copy("axis.toml", tmp_path / "logs" / "a.toml")
     (tmp_path / "logs" / "b.csv").unlink()
     (tmp_path / "logs" / "broken.csv").rename(tmp_path / "logs" / "a2.csv")
     (tmp_path / "logs" / "a.csv").write_text("t,u\n0,1\n")
-    assert call(*again, "again")[0] == 2
+    assert call(*command, "again")[0] == 2
 
 
 def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, monkeypatch, capsys):
@@ -940,15 +942,15 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     with pytest.raises(SystemExit) as end:
         cli.main()
     out, errors = capsys.readouterr()
-    output = "none.toml: no such file; here are study.toml"
-    assert (end.value.code, errors) == (2, f"jaxbl: {output}\n")
-    assert json.loads(out) == {"command": "sweep", "exit": 2, "error": output}
+    message = "none.toml: no such file; here are study.toml"
+    assert (end.value.code, errors) == (2, f"jaxbl: {message}\n")
+    assert json.loads(out) == {"command": "sweep", "exit": 2, "error": message}
 
 
 def test_completion_knows_the_commands(tmp_path):
-    asked = {"_JAXBL_COMPLETE": "complete_bash", "COMP_WORDS": "jaxbl swee", "COMP_CWORD": "1"}
+    environment = {"_JAXBL_COMPLETE": "complete_bash", "COMP_WORDS": "jaxbl swee", "COMP_CWORD": "1"}
     code = "import sys; sys.argv = ['jaxbl']; from jaxbl.__main__ import program; program()"
-    result = run_python("-c", code, cwd=tmp_path, **asked)
+    result = run_python("-c", code, cwd=tmp_path, **environment)
     assert result.stdout.split() == ["sweep"]
 
 
@@ -998,7 +1000,7 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
 
 def test_after_logs_what_is_open_by_what_was_found():
     logs, model, folder = [Path("a b.csv")], Path("m.toml"), Path("out")
-    again = ["diagnose", "a b.csv", "--model", "m.toml", "--out", "out"]
+    command = ["diagnose", "a b.csv", "--model", "m.toml", "--out", "out"]
 
     def task(samples, parts=1, missing=("excitation",)):
         cut = tuple(slice(i * samples // parts, (i + 1) * samples // parts) for i in range(parts))
@@ -1012,7 +1014,7 @@ def test_after_logs_what_is_open_by_what_was_found():
     def identify_steps(rms, done=None, holdout=None, planned_file=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
         return commands(
-            after_identification(done or task(1000), summary, again, folder, LogCall(logs, model, holdout, planned_file))
+            after_identification(done or task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file))
         )
 
     diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
@@ -1034,7 +1036,7 @@ def test_after_logs_what_is_open_by_what_was_found():
 
     def diagnose_steps(planned_file=None, **more):
         return commands(
-            after_diagnosis(task(1000), DIAGNOSED | more, again, folder, LogCall(logs, model, None, planned_file))
+            after_diagnosis(task(1000), DIAGNOSED | more, command, folder, LogCall(logs, model, None, planned_file))
         )
 
     assert diagnose_steps() == [simulate]

@@ -116,8 +116,8 @@ def test_the_example_of_the_design_is_valid_and_comes_back_from_toml(tmp_path):
     assert config.observer.motor.lambda_ == 4.0
     assert config.effects[0].torque == 0.02
     (tmp_path / "b.toml").write_text(config.to_toml())
-    again = read_config(tmp_path / "b.toml")
-    assert again.to_dict() == config.to_dict()
+    second = read_config(tmp_path / "b.toml")
+    assert second.to_dict() == config.to_dict()
     # defaults are filled in
     assert tomllib.loads(config.to_toml())["run"]["position_tolerance"] == 1e-3
 
@@ -415,18 +415,18 @@ def parameter_table(section, tag, name, module):
     + [("excitation", "kind", name, module) for name, module in EXCITATIONS.items() if name != "recorded"],
 )
 def test_every_module_has_the_table_of_its_parameters(section, tag, name, module):
-    inputs = parameter_table(section, tag, name, module)
-    data = (rigid_study if name == "rigid" else small_study)(**{section: inputs})
+    numbers = parameter_table(section, tag, name, module)
+    data = (rigid_study if name == "rigid" else small_study)(**{section: numbers})
     config = read_config(data)
-    built = getattr(config.build(), section)
-    assert type(built) is module
+    part = getattr(config.build(), section)
+    assert type(part) is module
     for field, _ in parameters(module):
-        assert getattr(built, field.name) == inputs[config_key(field.name)]
-        low = parameters_by_name(module)[field.name]
-        if low.above is not None or low.minimum is not None:
-            wrong = low.above if low.above is not None else low.minimum - 1
+        assert getattr(part, field.name) == numbers[config_key(field.name)]
+        parameter = parameters_by_name(module)[field.name]
+        if parameter.above is not None or parameter.minimum is not None:
+            bad_number = parameter.above if parameter.above is not None else parameter.minimum - 1
             with pytest.raises(InputError, match=f"{section}.{config_key(field.name)}: should be"):
-                read_config(data | {section: inputs | {config_key(field.name): wrong}})
+                read_config(data | {section: numbers | {config_key(field.name): bad_number}})
 
 
 def parameters_by_name(module):
@@ -443,8 +443,8 @@ def test_every_effect_is_built_with_its_numbers_and_its_name(name):
         if key != "kind":
             assert getattr(effect, key) == value
             new = 0.5 * value if key == "delay" else 0.7
-            moved = with_values(config, {f"effects.{name}.{key}": new})
-            assert getattr(moved.build().effects[0], key) == new
+            changed_config = with_values(config, {f"effects.{name}.{key}": new})
+            assert getattr(changed_config.build().effects[0], key) == new
 
 
 TABULATED = {"kind": "motor.tabulated", "positions": [0.0, 1.0], "position_torques": [0.1, 0.2], "turn": True}
@@ -483,8 +483,8 @@ def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
     for path, leaf in leaves.items():
         assert numbers[path].unit == leaf.unit
         assert numbers[path].doc
-        moved = with_values(config, {path: 0.625})
-        assert get_leaf(moved.build(), path) == 0.625, path
+        changed_config = with_values(config, {path: 0.625})
+        assert get_leaf(changed_config.build(), path) == 0.625, path
     structural = {"observer.discretisation", "observer.kind", "run.duration", "run.sample_period", "run.substeps"}
     absent = {"encoders.load_noise", "identifier.regressor_filter"} if experiment.identifier else set()
     assert set(numbers) - set(leaves) == structural | absent

@@ -13,8 +13,8 @@ from jaxbl.datasheet import KINDS, Answer, items_by_name, write_first_study
 from jaxbl.errors import InputError
 from jaxbl.gains.gain_search import usual_rule
 
-ITEMS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
-BY_NAME = ITEMS["geared"]
+QUESTIONS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
+BY_NAME = QUESTIONS["geared"]
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_numbers_become_si(name, text, value):
     ],
 )
 def test_numbers_of_linear_axes_become_si(kind, name, text, value):
-    assert ITEMS[kind][name].read(text).value == pytest.approx(value, rel=1e-14)
+    assert QUESTIONS[kind][name].read(text).value == pytest.approx(value, rel=1e-14)
 
 
 def test_examples_and_defaults_can_be_read():
@@ -127,17 +127,17 @@ def test_without_a_terminal_what_is_missing_is_said_in_one_line(call, tmp_path):
 
 def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypatch, capsys):
     monkeypatch.setattr(setup, "can_ask_user", lambda: True)
-    asked = []
+    questions = []
     answers = iter(["light", "0.5 kg cm²", ""])
 
     def prompt(text, default, err):
-        asked.append((text, default))
+        questions.append((text, default))
         return next(answers) or default
 
     monkeypatch.setattr("typer.prompt", prompt)
     assert setup._ask_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
     assert setup._ask_number(BY_NAME["sample_period"]).text == "not given"
-    assert asked[0] == asked[1] and asked[2][1] == "1 ms"
+    assert questions[0] == questions[1] and questions[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
 
@@ -161,24 +161,25 @@ NO_STUDY = "these numbers make no study; look at their units"
 SHORT = {"frequency": "20 Hz"}
 
 
-def words(kind, numbers):
+def option_words(kind, numbers):
     return ["--kind", kind, *chain.from_iterable((f"--{name.replace('_', '-')}", text) for name, text in numbers.items())]
 
 
-def given(kind, numbers):
+def read_answers(kind, numbers):
     return {
-        name: item.read(numbers[name]) if name in numbers else item.default_answer() for name, item in ITEMS[kind].items()
+        name: item.read(numbers[name]) if name in numbers else item.default_answer()
+        for name, item in QUESTIONS[kind].items()
     }
 
 
 def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     """Without a gear, its load has the inertia m / N², N in rad/m, and so has the rest of it."""
-    ratio, screw = 200.0 * math.pi, given("screw", SCREW | SHORT)
+    ratio, screw = 200.0 * math.pi, read_answers("screw", SCREW | SHORT)
     at_motor = {
         "gear_ratio": 1.0, "stiffness": 1.2e8 / ratio**2, "backlash": 2e-5 * ratio, "load_inertia": 60.0 / ratio**2,
         "load_viscous": 200.0 / ratio**2, "load_encoder": 0.0,
     }  # fmt: skip
-    turning = {name: screw[name] for name in ITEMS["geared"] if name in screw}
+    turning = {name: screw[name] for name in QUESTIONS["geared"] if name in screw}
     turning |= {name: Answer(value, "given: by hand") for name, value in at_motor.items()}
     text, result = write_first_study(KINDS["screw"], screw, "")
     _, other = write_first_study(KINDS["geared"], turning, "")
@@ -222,7 +223,7 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     ],
 )
 def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_path):
-    code, output, _ = call("init", "axis.toml", *words(kind, numbers | SHORT))
+    code, output, _ = call("init", "axis.toml", *option_words(kind, numbers | SHORT))
     assert code == 0 and ("m/s² (motor)." in output[0]) == (kind == "linear") and "load" not in output[0]
     text = (tmp_path / "axis.toml").read_text()
     assert all(f"\n{line}\n" in text for line in lines)
@@ -237,7 +238,7 @@ def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_p
 
 
 def test_the_usual_rule_in_a_study_is_that_of_tune():
-    text, _ = write_first_study(KINDS["linear"], given("linear", LINEAR | SHORT), "")
+    text, _ = write_first_study(KINDS["linear"], read_answers("linear", LINEAR | SHORT), "")
     lambda_, alpha = usual_rule(1.0)
     assert f"usual rule, lambda = {lambda_:g} sqrt(f+) and alpha = {alpha:g} f+;" in text
 
@@ -247,21 +248,33 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
     [
         (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; see jaxbl init"),
         (
-            [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
+            [*option_words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
             "--gear-ratio, --mass: --kind direct has no such option; it has: --motor-inertia, --motor-viscous, ",
         ),
-        (words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}), f"{NO_STUDY}: the motor does not move: --torque "),
-        (words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}), f"{NO_STUDY}: the motor does not move: --force "),
-        (words("screw", SCREW | SHORT | {"backlash": "1 m"}), f"{NO_STUDY}: the load does not move: --backlash should be"),
-        (words("screw", SCREW | {"lead": "1e-7 mm"}), f"{NO_STUDY}: drive.gear_ratio: should be less than or equal to 1"),
+        (
+            option_words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}),
+            f"{NO_STUDY}: the motor does not move: --torque ",
+        ),
+        (
+            option_words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}),
+            f"{NO_STUDY}: the motor does not move: --force ",
+        ),
+        (
+            option_words("screw", SCREW | SHORT | {"backlash": "1 m"}),
+            f"{NO_STUDY}: the load does not move: --backlash should be",
+        ),
+        (
+            option_words("screw", SCREW | {"lead": "1e-7 mm"}),
+            f"{NO_STUDY}: drive.gear_ratio: should be less than or equal to 1",
+        ),
         (["--lead", "10 mm"], "--lead: --kind geared has no such option; it has: --motor-inertia, "),
         (
-            words("linear", LINEAR | {"motor_friction": "0 N"}),
+            option_words("linear", LINEAR | {"motor_friction": "0 N"}),
             "--motor-friction '0 N': should be more than 0 N, such as '6 N'",
         ),
-        (words("screw", SCREW | {"lead": "0 mm"}), "--lead '0 mm': should be more than 0 m, such as '10 mm'"),
+        (option_words("screw", SCREW | {"lead": "0 mm"}), "--lead '0 mm': should be more than 0 m, such as '10 mm'"),
         (
-            words("screw", SCREW | {"mass": "60 kg m²"}),
+            option_words("screw", SCREW | {"mass": "60 kg m²"}),
             "--mass '60 kg m²': the unit 'kg m²' is not known here; known: kg, g, t",
         ),
         (
@@ -280,21 +293,21 @@ def test_what_no_such_drive_has_is_said_and_nothing_written(arguments, message, 
 def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "can_ask_user", lambda: True)
     examples = {item.question: item.example for item in KINDS["linear"].items}
-    asked = []
-    output = iter(["gearless", "Linear", "8 kg"])
+    questions = []
+    answers = iter(["gearless", "Linear", "8 kg"])
 
     def prompt(text, default, err):
-        asked.append(text)
-        return next(output, default or examples.get(text.partition(", such as")[0]))
+        questions.append(text)
+        return next(answers, default or examples.get(text.partition(", such as")[0]))
 
     monkeypatch.setattr("typer.prompt", prompt)
     code, lines, errors = call("init", "axis.toml", "--frequency", "20 Hz")
     assert code == 0 and lines[0].startswith("axis.toml: a study")
-    assert asked[0] == asked[1] and asked[0] == "kind of this drive"
-    assert [text.partition(",")[0] for text in asked[2:]] == [
+    assert questions[0] == questions[1] and questions[0] == "kind of this drive"
+    assert [text.partition(",")[0] for text in questions[2:]] == [
         item.question.partition(",")[0] for item in KINDS["linear"].items[:-1]
     ]
-    assert errors[0] == "Kinds of drives:" and all(len(line) <= 80 for line in (*errors[:5], *asked))
+    assert errors[0] == "Kinds of drives:" and all(len(line) <= 80 for line in (*errors[:5], *questions))
     assert errors[5].startswith("  --kind 'gearless': should be one of geared")
     assert read_config(tmp_path / "axis.toml").drive.motor_inertia == 8.0
 
@@ -304,7 +317,7 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     ("kind", "commands"), [("geared", ("simulate", "sweep")), ("screw", ("simulate", "tune")), ("linear", ("tune",))]
 )
 def test_simulate_sweep_and_tune_run_what_is_written(kind, commands, call):
-    numbers = {"screw": words("screw", SCREW), "linear": words("linear", LINEAR)}
+    numbers = {"screw": option_words("screw", SCREW), "linear": option_words("linear", LINEAR)}
     noise = {"linear": "20 nm"}.get(kind, "5 arcsec")
     code, lines, _ = call("init", "axis.toml", *numbers.get(kind, WORDS), "--frequency", "5 Hz", "--encoder-noise", noise)
     assert code == 0

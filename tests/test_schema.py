@@ -16,7 +16,7 @@ STUDIES = sorted((Path(__file__).parents[1] / "sweeps").glob("*.toml"))
 
 
 @pytest.fixture(scope="module")
-def errors():
+def schema_errors():
     """Faults of a study, by the schema."""
     jsonschema.Draft7Validator.check_schema(build_schema())
     validator = jsonschema.Draft7Validator(build_schema())
@@ -24,15 +24,15 @@ def errors():
 
 
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
-def test_it_takes_every_study(file, errors):
-    assert errors(tomllib.loads(file.read_text(encoding="utf-8"))) == []
+def test_it_takes_every_study(file, schema_errors):
+    assert schema_errors(tomllib.loads(file.read_text(encoding="utf-8"))) == []
 
 
-def test_it_takes_what_a_part_may_have(errors):
+def test_it_takes_what_a_part_may_have(schema_errors):
     """An included file has the other keys; a column's name alone stands for a table."""
     for part in ({}, {"include": "a.toml", "drive": {"motor_inertia": 0.1}}, {"log": {"theta_e": "x", "u": 3}}):
-        assert errors(part) == []
-    assert errors(Config.model_validate(small_study(axes=[listed_axis(ALPHA, 1.0)])).to_dict()) == []
+        assert schema_errors(part) == []
+    assert schema_errors(Config.model_validate(small_study(axes=[listed_axis(ALPHA, 1.0)])).to_dict()) == []
 
 
 @pytest.mark.parametrize(
@@ -52,8 +52,8 @@ def test_it_takes_what_a_part_may_have(errors):
     ],
     ids=str,
 )
-def test_it_refuses_what_is_wrong(wrong, errors):
-    assert len(errors(wrong)) >= 1
+def test_it_refuses_what_is_wrong(wrong, schema_errors):
+    assert len(schema_errors(wrong)) >= 1
 
 
 def test_it_says_units_and_meanings_and_knows_every_effect():

@@ -152,19 +152,19 @@ def test_whole_trace_against_an_independent_copy():
     np.testing.assert_allclose(signals.torque, torque, atol=1e-9)
     np.testing.assert_allclose(signals.twist, measured[:, 0] - 5.0 * measured[:, 1], atol=1e-9)
     for j, side in enumerate(("motor", "load")):
-        mine = signals.side(side)
+        side_signals = signals.side(side)
         estimate, reconstructed, (stiffness, dead_zone) = expected[side]
         position, velocity = truth[:, 2 * j], truth[:, 2 * j + 1]
-        np.testing.assert_allclose(mine.measured, measured[:, j], atol=1e-9)
-        np.testing.assert_allclose(mine.true.position, position, atol=1e-9)
-        np.testing.assert_allclose(mine.true.velocity, velocity, atol=1e-7)
-        np.testing.assert_allclose(mine.true.acceleration[:-1], np.diff(velocity) / 1e-3, atol=2e-5)
-        np.testing.assert_allclose(mine.position_estimate, estimate[:, 0], atol=1e-8)
-        np.testing.assert_allclose(mine.velocity_estimate, estimate[:, 1], atol=1e-6)
-        np.testing.assert_allclose(mine.torque_estimate, reconstructed, atol=1e-3 * np.abs(reconstructed).max())
-        nominal = (signals.input if side == "motor" else 0.0) - DRIVE.viscous(side) * mine.velocity_estimate
+        np.testing.assert_allclose(side_signals.measured, measured[:, j], atol=1e-9)
+        np.testing.assert_allclose(side_signals.true.position, position, atol=1e-9)
+        np.testing.assert_allclose(side_signals.true.velocity, velocity, atol=1e-7)
+        np.testing.assert_allclose(side_signals.true.acceleration[:-1], np.diff(velocity) / 1e-3, atol=2e-5)
+        np.testing.assert_allclose(side_signals.position_estimate, estimate[:, 0], atol=1e-8)
+        np.testing.assert_allclose(side_signals.velocity_estimate, estimate[:, 1], atol=1e-6)
+        np.testing.assert_allclose(side_signals.torque_estimate, reconstructed, atol=1e-3 * np.abs(reconstructed).max())
+        nominal = (signals.input if side == "motor" else 0.0) - DRIVE.viscous(side) * side_signals.velocity_estimate
         np.testing.assert_allclose(
-            mine.true.perturbation, mine.true.acceleration - nominal / DRIVE.inertia(side), atol=1e-12
+            side_signals.true.perturbation, side_signals.true.acceleration - nominal / DRIVE.inertia(side), atol=1e-12
         )
         np.testing.assert_allclose(result[f"{side}.stiffness_error"], stiffness / 1.0 - 1.0, atol=1e-4)
         np.testing.assert_allclose(result[f"{side}.dead_zone_error"], dead_zone / 0.02 - 1.0, atol=1e-4)
@@ -228,13 +228,13 @@ def test_a_diverging_lane_leaves_its_neighbours_alone():
     experiment = paper_experiment(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
     run = jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (ALL_METRICS,))[0]))
-    lanes, calm = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
+    lanes, stable_lanes = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
     np.testing.assert_array_equal(lanes["finite"], [True, False, True])
-    assert np.all(calm["finite"])
+    assert np.all(stable_lanes["finite"])
     assert not lanes["motor.converged"][1]
     assert not lanes["load.converged"][1]
     for name, values in lanes.items():
-        np.testing.assert_array_equal(values[::2], calm[name][::2], err_msg=name)
+        np.testing.assert_array_equal(values[::2], stable_lanes[name][::2], err_msg=name)
 
 
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
@@ -324,13 +324,17 @@ def test_a_replayed_record_gives_what_the_observers_gave(stride):
     signals = trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
     run = jit(lambda *columns: replay(*columns, record=everything, stride=stride, state=initial_state(experiment)))
-    _, again = run(experiment, signals.input, measured)
+    _, replayed = run(experiment, signals.input, measured)
     for side in experiment.sides:
-        mine, theirs = again.side(side), signals.side(side)
-        np.testing.assert_allclose(mine.velocity_estimate, theirs.velocity_estimate[::stride], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(mine.torque_estimate, theirs.torque_estimate[::stride], rtol=1e-12, atol=1e-12)
-        assert mine.true is None
-    np.testing.assert_allclose(again.time, signals.time[::stride])
+        replayed_side, original_side = replayed.side(side), signals.side(side)
+        np.testing.assert_allclose(
+            replayed_side.velocity_estimate, original_side.velocity_estimate[::stride], rtol=1e-12, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            replayed_side.torque_estimate, original_side.torque_estimate[::stride], rtol=1e-12, atol=1e-12
+        )
+        assert replayed_side.true is None
+    np.testing.assert_allclose(replayed.time, signals.time[::stride])
 
 
 def test_what_observers_are_told_is_not_in_their_equivalent_control():

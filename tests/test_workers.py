@@ -161,6 +161,6 @@ def test_a_program_that_another_process_is_still_writing_is_compiled_in_silence(
     assert entries
     for entry in entries:
         entry.write_bytes(entry.read_bytes()[:100])
-    again = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-    assert again.stdout == "6.0\n"
-    assert not again.stderr
+    second = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    assert second.stdout == "6.0\n"
+    assert not second.stderr

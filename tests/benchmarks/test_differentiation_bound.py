@@ -21,17 +21,17 @@ CASES = [(1e-5, 8.0, 1e-3), (0.0, 8.0, 1e-3), (1.0, 1.0, 1.0), (3e-4, 2.0, 2e-3)
 @pytest.mark.parametrize(("noise", "slope", "period"), CASES)
 def test_the_linear_program_agrees_with_the_closed_form_and_its_signal_is_admitted(noise, slope, period):
     samples = 2 * best_samples(noise, slope, period) + 5
-    errors_found = worst_signal(noise, slope, period, samples)
-    assert errors_found.error == pytest.approx(least_worst_error(noise, slope, period), rel=1e-7)
-    assert np.abs(errors_found.signal).max() <= noise + 1e-9 * slope * period**2
-    assert np.abs(errors_found.acceleration).max() <= slope * (1.0 + 1e-9)
+    worst = worst_signal(noise, slope, period, samples)
+    assert worst.error == pytest.approx(least_worst_error(noise, slope, period), rel=1e-7)
+    assert np.abs(worst.signal).max() <= noise + 1e-9 * slope * period**2
+    assert np.abs(worst.acceleration).max() <= slope * (1.0 + 1e-9)
     # the signal's values are those that its own second derivative makes
-    velocity, value, values = errors_found.error, errors_found.signal[0], [errors_found.signal[0]]
-    for acceleration in errors_found.acceleration:
+    velocity, value, values = worst.error, worst.signal[0], [worst.signal[0]]
+    for acceleration in worst.acceleration:
         value += -period * velocity + 0.5 * period**2 * acceleration
         velocity -= period * acceleration
         values.append(value)
-    np.testing.assert_allclose(values, errors_found.signal, atol=1e-9 * (noise + slope * period**2))
+    np.testing.assert_allclose(values, worst.signal, atol=1e-9 * (noise + slope * period**2))
 
 
 @pytest.mark.parametrize(("noise", "slope", "period"), CASES)
@@ -73,8 +73,8 @@ def climb_errors(noise, samples, starts=200):
     choice[::2, :samples] = 0.5 * pair.acceleration
     choice[::2, samples:] = -(pair.signal - pair.signal[0]) / max(noise, 1e-300) - 1.0
     choice = np.clip(choice, -1.0, 1.0)
-    back = np.arange(samples + 1)
-    weights = np.maximum(back[:, None] - np.arange(samples)[None, :] - 0.5, 0.0)
+    periods = np.arange(samples + 1)
+    weights = np.maximum(periods[:, None] - np.arange(samples)[None, :] - 0.5, 0.0)
 
     def errors(choice):
         # f(0) = f'(0) = 0
@@ -83,11 +83,11 @@ def climb_errors(noise, samples, starts=200):
 
     best = errors(choice)
     for j in [*rng.permutation(2 * samples + 1)] * 4:
-        turned = choice.copy()
-        turned[:, j] = np.where(rng.random(starts) < 0.5, -turned[:, j], rng.uniform(-1.0, 1.0, starts))
-        errors_found = errors(turned)
-        better = errors_found > best
-        choice[better], best = turned[better], np.maximum(best, errors_found)
+        candidates = choice.copy()
+        candidates[:, j] = np.where(rng.random(starts) < 0.5, -candidates[:, j], rng.uniform(-1.0, 1.0, starts))
+        candidate_errors = errors(candidates)
+        is_better = candidate_errors > best
+        choice[is_better], best = candidates[is_better], np.maximum(best, candidate_errors)
     return best.max()
 
 
@@ -96,8 +96,8 @@ def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_n
     """The pair of signals behind the bound makes it err by just that, and no search finds more."""
     least = least_exact_error(noise, 1.0, 1.0)
     assert least >= least_worst_error(noise, 1.0, 1.0)
-    errors_found = climb_errors(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
-    assert errors_found == pytest.approx(least, rel=1e-6)
+    largest = climb_errors(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
+    assert largest == pytest.approx(least, rel=1e-6)
 
 
 def prove_bound(noise):
@@ -125,10 +125,10 @@ def test_the_proof_gives_the_bound(noise):
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.145, 0.2, 0.4])
 def test_the_adaptive_quotient_under_little_noise(noise):
-    errors_found = climb_errors(noise, 4) / least_exact_error(noise, 1.0, 1.0)
-    assert errors_found <= (1.21 if noise else 1.0 + 1e-12)
+    ratio = climb_errors(noise, 4) / least_exact_error(noise, 1.0, 1.0)
+    assert ratio <= (1.21 if noise else 1.0 + 1e-12)
     # every noise that it takes for granted is there
-    assert errors_found >= 0.999
+    assert ratio >= 0.999
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

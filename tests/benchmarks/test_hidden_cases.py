@@ -63,10 +63,10 @@ def test_clutter_is_there_and_small_and_its_name_is_not_spurious(hidden_cases):
         assert bool(case.truth["clutter"]) == (case.kind == "clutter")
         assert not set(case.truth["clutter"]) & set(case.truth["effects"])
     case = hidden_cases[-1]
-    output = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
-    judged = outcome(case, {"verdict": "unknown_effect", "findings": output})
-    assert judged.is_right and judged.spurious_effects == ["motor.inertia"]
-    assert sum(row["right"] * row["count"] for row in calibration([judged])) == 2
+    findings = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
+    case_outcome = outcome(case, {"verdict": "unknown_effect", "findings": findings})
+    assert case_outcome.is_right and case_outcome.spurious_effects == ["motor.inertia"]
+    assert sum(row["right"] * row["count"] for row in calibration([case_outcome])) == 2
 
 
 def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
@@ -126,35 +126,37 @@ def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apa
 
 
 def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(hidden_cases):
-    checked = {"single": 0, "new": 0}
+    counts = {"single": 0, "new": 0}
     for case in hidden_cases:
         read_model(case.model)
         config, _ = read_model(case.oracle)
-        if checked.get(case.kind, 4) == 4 or case.truth["growth"] > 1.0:
+        if counts.get(case.kind, 4) == 4 or case.truth["growth"] > 1.0:
             continue
         law = None if config.transmission is None else config.transmission.build()
         plant = Plant(config.drive.build(), law, tuple(effect.build() for effect in config.effects))
-        package = _package(plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"])
+        package_positions = _simulate_positions(
+            plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"]
+        )
         truth = case.traces[0].states[0]
-        assert np.abs(package - truth).max() < 2e-3 * np.ptp(truth), case.name
-        checked[case.kind] += 1
-    assert checked == {"single": 4, "new": min(len(NEW), 4)}
+        assert np.abs(package_positions - truth).max() < 2e-3 * np.ptp(truth), case.name
+        counts[case.kind] += 1
+    assert counts == {"single": 4, "new": min(len(NEW), 4)}
 
 
-def _package(plant, initial, torques, period, substeps=20):
+def _simulate_positions(plant, initial, torques, period, substeps=20):
     """Motor position by the package's own plant."""
     plant, state = as_arrays((plant, Initial(*(initial[i] for i in range(4)))), jnp.float64)
 
     @eqx.filter_jit
-    def positions(plant, state, torques):
-        def over(carry, torque):
+    def move_samples(plant, state, torques):
+        def move_sample(carry, torque):
             state, start = carry
-            after = move_plant(plant, Run(jnp.asarray(period), 1, substeps), state, torque, start)
-            return (after, start + period), state.position["motor"]
+            next_state = move_plant(plant, Run(jnp.asarray(period), 1, substeps), state, torque, start)
+            return (next_state, start + period), state.position["motor"]
 
-        return jax.lax.scan(over, (plant.init(state), jnp.asarray(0.0)), torques)[1]
+        return jax.lax.scan(move_sample, (plant.init(state), jnp.asarray(0.0)), torques)[1]
 
-    return np.asarray(positions(plant, state, jnp.asarray(torques)))
+    return np.asarray(move_samples(plant, state, jnp.asarray(torques)))
 
 
 def test_an_oracle_gets_full_marks(hidden_cases, oracle):
@@ -194,20 +196,20 @@ def test_who_never_sees_anything_raises_no_alarm_and_finds_nothing(hidden_cases)
 
 def test_a_wrong_answer_is_counted_where_it_belongs(hidden_cases):
     pair = next(case for case in hidden_cases if case.kind == "pairs")
-    wrong = next(name for name in EFFECTS if name not in pair.hidden)
-    findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong)]
+    wrong_effect = next(name for name in EFFECTS if name not in pair.hidden)
+    findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong_effect)]
     gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
-    messages = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
-    assert messages.is_right and messages.spurious_effects == [wrong] and messages.worse
-    assert messages.reduction < 0.0 and messages.reachable is None
+    case_outcome = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
+    assert case_outcome.is_right and case_outcome.spurious_effects == [wrong_effect] and case_outcome.worse
+    assert case_outcome.reduction < 0.0 and case_outcome.reachable is None
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {"theta_e": 0.1}).reachable == pytest.approx(1.0)
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {}).reachable is None
-    curve = calibration([messages])
+    curve = calibration([case_outcome])
     assert curve == [{"confidence": pytest.approx(0.8), "right": pytest.approx(2 / 3), "count": 3}]
     assert calibration_error(curve) == pytest.approx(0.8 - 2 / 3)
     unknown = next(case for case in hidden_cases if case.kind == "unknown")
-    messages = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong, "confidence": 0.95}]})
-    assert scores([messages])["confidently_wrong"]["value"] == 1.0
+    case_outcome = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong_effect, "confidence": 0.95}]})
+    assert scores([case_outcome])["confidently_wrong"]["value"] == 1.0
     with pytest.raises(ValueError, match="verdict 'maybe'"):
         outcome(unknown, {"verdict": "maybe"})
 
@@ -235,8 +237,8 @@ def test_the_error_of_a_nominal_number_is_the_effect_and_nothing_else():
 def test_processes_share_the_cases_and_an_oracle_may_fail(hidden_cases, capsys):
     selection = [case for case in hidden_cases if case.hidden][:3]
     outcomes = run(selection, see_nothing, fail_to_reach, jobs=2)
-    assert [judged.name for judged in outcomes] == [case.name for case in selection]
-    assert all(judged.ratio is None and judged.reduction == 0.0 for judged in outcomes)
+    assert [case_outcome.name for case_outcome in outcomes] == [case.name for case in selection]
+    assert all(case_outcome.ratio is None and case_outcome.reduction == 0.0 for case_outcome in outcomes)
     messages = [line for line in capsys.readouterr().err.splitlines() if " of 3: " in line]
     assert len(messages) == 3 and all("WRONG" in line for line in messages)
 
@@ -245,9 +247,9 @@ def test_the_proof_parts_true_from_nominal_model(hidden_cases):
     case = next(case for case in hidden_cases if case.kind == "single")
     nominal, true = foretold([(case, case.model), (case, case.oracle)])
     assert true["theta_e"] < 1e-6 * nominal["theta_e"]
-    worse = {**case.model, "effects": [{"kind": "motor.constant_torque", "torque": 100.0}]}
-    foreign = {**case.model, "effects": [{"kind": "motor.of_another_package"}]}
-    results = proofs([(case, case.oracle), (case, worse), (case, foreign)])
+    worse_model = {**case.model, "effects": [{"kind": "motor.constant_torque", "torque": 100.0}]}
+    foreign_model = {**case.model, "effects": [{"kind": "motor.of_another_package"}]}
+    results = proofs([(case, case.oracle), (case, worse_model), (case, foreign_model)])
     assert results[0] == (pytest.approx(1.0), False)
     assert results[1][1]
     assert results[2] == (None, None)
@@ -275,7 +277,7 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(hidden_cases, ora
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
     assert set(truth) == {case.name for case in selection}
     outcomes = read_outcomes(hidden_cases[:4], tmp_path / "found")
-    assert [judged.is_right for judged in outcomes] == [True, True, True, False]
-    result = write(outcomes, tmp_path / "out", "A seed")
-    assert {path.name for path in result} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
+    assert [case_outcome.is_right for case_outcome in outcomes] == [True, True, True, False]
+    figure_files = write(outcomes, tmp_path / "out", "A seed")
+    assert {path.name for path in figure_files} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
     assert (tmp_path / "out" / "scores.md").read_text().startswith("## A seed")

@@ -25,9 +25,9 @@ def gear_torques(t, y, u, flank):
     z = x - 5.0 * q + 0.01 * np.sin(2.0 * q + 0.3)
     ratio = 5.0 - 0.02 * np.cos(2.0 * q + 0.3)
     bent = z - 0.08 * flank if flank else 0.0
-    through = 60.0 * bent + 300.0 * bent**3 + (0.4 * (v - ratio * w) if flank else 0.0)
-    motor = u - through - 0.15 * v - 0.3 * np.sin(6.0 * x + 0.5)
-    load = ratio * through - 16.0 * w - 2.0 * np.sin(q - 0.2) - 0.5 * w * abs(w) - np.sin(2 * np.pi * 3.0 * t + 1.0)
+    transmitted = 60.0 * bent + 300.0 * bent**3 + (0.4 * (v - ratio * w) if flank else 0.0)
+    motor = u - transmitted - 0.15 * v - 0.3 * np.sin(6.0 * x + 0.5)
+    load = ratio * transmitted - 16.0 * w - 2.0 * np.sin(q - 0.2) - 0.5 * w * abs(w) - np.sin(2 * np.pi * 3.0 * t + 1.0)
     return motor, load, 0.3 + 0.4 * np.exp(-((v / 0.5) ** 2)), 7.0, z, 0.0
 
 
@@ -49,7 +49,7 @@ GEARED_MACHINE = Machine(
 )
 
 
-def rigid(t, y, u, flank):
+def rigid_torques(t, y, u, flank):
     """A dent, hysteresis, drifting friction, torque ripple; u has been through dead time, gain, limit and lag."""
     x, v, _, _, h = y
     rate = (v - 0.5 * (abs(v) * abs(h) * h + v * h * h)) / 0.2
@@ -77,15 +77,15 @@ RIGID_MACHINE = Machine(
 )
 
 
-def bristles(t, y, u, flank):
+def bristle_torques(t, y, u, flank):
     """LuGre's friction of the motor, in its own numbers, and what else the package has learnt since."""
     x, v, q, w, z = y
-    through = 60.0 * (x - 5.0 * q)
+    transmitted = 60.0 * (x - 5.0 * q)
     g = 0.8 + 0.3 * np.exp(-((v / 0.5) ** 2))
     rate = v - 0.8 / 0.05 * abs(v) * z / g
-    motor = u - through - (0.17 if v > 0.0 else 0.13) * v - 0.8 / 0.05 * z - 0.02 * rate
-    load = 5.0 * through - 16.0 * w - (1.0 if w > 0.0 else -2.0) * w - 0.25
-    return motor, load, 0.1 * abs(through), 3.0 + 2.0 * np.exp(-t / 0.4), 0.0, rate
+    motor = u - transmitted - (0.17 if v > 0.0 else 0.13) * v - 0.8 / 0.05 * z - 0.02 * rate
+    load = 5.0 * transmitted - 16.0 * w - (1.0 if w > 0.0 else -2.0) * w - 0.25
+    return motor, load, 0.1 * abs(transmitted), 3.0 + 2.0 * np.exp(-t / 0.4), 0.0, rate
 
 
 BRISTLES_MACHINE = Machine(
@@ -107,7 +107,7 @@ BRISTLES_MACHINE = Machine(
 
 def reference(torques, inertias, half, start, commands, lag):
     """States at the samples, shape (4, samples), and how many times the mode changed."""
-    state, changes, acted = np.array([*start, 0.0]), 0, 0.0
+    state, changes, last_input = np.array([*start, 0.0]), 0, 0.0
     states = np.zeros((4, len(commands)))
     # direction of each side, and the flank of the gap
     modes = [np.sign(start[1]), np.sign(start[3]), 1.0]
@@ -117,56 +117,63 @@ def reference(torques, inertias, half, start, commands, lag):
     for k, command in enumerate(commands):
         states[:, k] = state[:4]
         begin, now = k * PERIOD, k * PERIOD
-        held = acted
+        held_input = last_input
 
-        def act(t, begin=begin, command=command, held=held):
+        def input_at(t, begin=begin, command=command, held=held_input):
             return command + (held - command) * np.exp(-(t - begin) / lag) if lag else command
 
-        def sides(t, y):
-            motor, load, *levels, z, rate = torques(t, y, act(t), modes[2])
+        def side_torques(t, y):
+            motor, load, *levels, z, rate = torques(t, y, input_at(t), modes[2])
             return ((motor, levels[0]), (load, levels[1])), z, rate
 
-        for i, (total, level) in enumerate(sides(now, state)[0]):
+        for i, (total, level) in enumerate(side_torques(now, state)[0]):
             if modes[i] == 0.0 and abs(total) > level:
                 modes[i] = np.sign(total)
         while now < begin + PERIOD * (1 - 1e-12):
 
-            def right(t, y):
-                pair, _, rate = sides(t, y)
+            def derivatives(t, y):
+                pair, _, rate = side_torques(t, y)
                 a = [
                     abs(m) * (total - m * level) / j for m, (total, level), j in zip(modes[:2], pair, inertias, strict=True)
                 ]
                 return [y[1], a[0], y[3], a[1], rate]
 
-            def leaves(i):
+            def leaves_mode(i):
                 def event(t, y):
-                    total, level = sides(t, y)[0][i]
+                    total, level = side_torques(t, y)[0][i]
                     return modes[i] * y[1 + 2 * i] + 1e-13 if modes[i] else level - abs(total) + 1e-13
 
                 event.terminal, event.direction = True, -1
                 return event
 
             def flanks(t, y):
-                z, flank = sides(t, y)[1], modes[2]
+                z, flank = side_torques(t, y)[1], modes[2]
                 return (flank * z - half if flank else half - abs(z)) + 1e-14
 
             flanks.terminal, flanks.direction = True, -1
-            events = [leaves(0), leaves(1), flanks] if half else [leaves(0), leaves(1)]
-            result = solve_ivp(
-                right, (now, begin + PERIOD), state, "DOP853", events=events, rtol=1e-10, atol=1e-13, max_step=PERIOD / 4
+            events = [leaves_mode(0), leaves_mode(1), flanks] if half else [leaves_mode(0), leaves_mode(1)]
+            solution = solve_ivp(
+                derivatives,
+                (now, begin + PERIOD),
+                state,
+                "DOP853",
+                events=events,
+                rtol=1e-10,
+                atol=1e-13,
+                max_step=PERIOD / 4,
             )
-            state, now = result.y[:, -1], result.t[-1]
-            for i, times in enumerate(result.t_events):
+            state, now = solution.y[:, -1], solution.t[-1]
+            for i, times in enumerate(solution.t_events):
                 if not len(times):
                     continue
                 changes += 1
                 if i == 2:
-                    modes[2] = 0.0 if modes[2] else np.sign(sides(now, state)[1])
+                    modes[2] = 0.0 if modes[2] else np.sign(side_torques(now, state)[1])
                     continue
                 state[1 + 2 * i] = 0.0
-                total, level = sides(now, state)[0][i]
+                total, level = side_torques(now, state)[0][i]
                 modes[i] = 0.0 if modes[i] and abs(total) <= level else np.sign(total)
-        acted = act(begin + PERIOD)
+        last_input = input_at(begin + PERIOD)
     return states, changes
 
 
@@ -176,16 +183,16 @@ GEARED_START, RIGID_START = (0.05, 2.0, 0.01, 0.3), (0.3, 0.5, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def truths():
+def true_states():
     limited = np.clip(1.1 * np.append(np.zeros(3), RIGID_INPUT[:-3]), -0.25, 0.25)
     return {
         "geared": reference(gear_torques, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
-        "rigid": reference(rigid, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
-        "bristles": reference(bristles, (0.05, 7.0), 0.0, GEARED_START, GEARED_INPUT, 0.0),
+        "rigid": reference(rigid_torques, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
+        "bristles": reference(bristle_torques, (0.05, 7.0), 0.0, GEARED_START, GEARED_INPUT, 0.0),
     }
 
 
-def runs(samples=SAMPLES):
+def make_runs(samples=SAMPLES):
     return [
         Run(GEARED_MACHINE, PERIOD, GEARED_INPUT[:samples], initial=GEARED_START),
         Run(RIGID_MACHINE, PERIOD, RIGID_INPUT[:samples], initial=RIGID_START),
@@ -193,15 +200,15 @@ def runs(samples=SAMPLES):
     ]
 
 
-WHICH = ["geared", "rigid", "bristles"]
+MACHINE_NAMES = ["geared", "rigid", "bristles"]
 
 
-@pytest.mark.parametrize("machine_name", WHICH)
-def test_simulator_agrees_with_scipy_through_sticking_play_and_every_effect(truths, machine_name):
-    truth, changes = truths[machine_name]
+@pytest.mark.parametrize("machine_name", MACHINE_NAMES)
+def test_simulator_agrees_with_scipy_through_sticking_play_and_every_effect(true_states, machine_name):
+    truth, changes = true_states[machine_name]
     assert changes > 5
     # bristles have a kink where their side turns around, which no event marks
-    trace = simulate([runs()[WHICH.index(machine_name)]], 1e-4 if machine_name == "bristles" else 6e-4)[0]
+    trace = simulate([make_runs()[MACHINE_NAMES.index(machine_name)]], 1e-4 if machine_name == "bristles" else 6e-4)[0]
     rows = [0, 1] if machine_name == "rigid" else [0, 1, 2, 3]
     error = np.abs(trace.states - truth)[rows].max(1) / np.sqrt(np.mean(truth[rows] ** 2, axis=1))
     assert error.max() < 1e-6, error
@@ -218,12 +225,12 @@ def test_simulator_agrees_with_scipy_about_what_has_a_memory_in_the_gear_and_beh
     def right(t, y, u):
         x, v, q, w, h, twist, third = y
         rate = v - 5.0 * w
-        through = 60.0 * (x - 5.0 * q) + 1.5 * h
-        back = -((8.0 * np.pi) ** 2) * twist - 2.0 * 0.05 * 8.0 * np.pi * (third - w)
+        transmitted = 60.0 * (x - 5.0 * q) + 1.5 * h
+        third_acceleration = -((8.0 * np.pi) ** 2) * twist - 2.0 * 0.05 * 8.0 * np.pi * (third - w)
         cogging = 0.2 * np.sin(3.0 * x) - 0.3 * np.cos(6.0 * x) + 0.1 * np.sin(9.0 * x)
-        a = (u - through - 0.15 * v - cogging) / 0.05
-        b = (5.0 * through - 16.0 * w - 2.0 * back) / 7.0
-        return [v, a, w, b, (rate - 0.5 * (abs(rate) * abs(h) * h + rate * h * h)) / 0.03, third - w, back]
+        a = (u - transmitted - 0.15 * v - cogging) / 0.05
+        b = (5.0 * transmitted - 16.0 * w - 2.0 * third_acceleration) / 7.0
+        return [v, a, w, b, (rate - 0.5 * (abs(rate) * abs(h) * h + rate * h * h)) / 0.03, third - w, third_acceleration]
 
     state, truth = np.array([*GEARED_START, 0.0, 0.0, 0.0]), np.zeros((4, SAMPLES))
     for k, u in enumerate(GEARED_INPUT):
@@ -237,7 +244,7 @@ def test_simulator_agrees_with_scipy_about_what_has_a_memory_in_the_gear_and_beh
 
 
 def test_fourth_order_through_events():
-    smooth = runs(40)[:2]
+    smooth = make_runs(40)[:2]
     exact = simulate(smooth, 5e-5)
     errors = [
         max(np.abs(a.states - b.states)[:2].max() for a, b in zip(simulate(smooth, step), exact, strict=True))
@@ -249,19 +256,19 @@ def test_fourth_order_through_events():
 def test_stick_is_exact_and_held_still():
     machine = Machine(RIGID, None, ({"kind": "motor.coulomb_friction", "torque": 0.5},))
     trace = simulate([Run(machine, PERIOD, np.full(SAMPLES, 0.4), initial=(0.0, 2.0, 0.0, 0.0))])[0]
-    stopped = np.flatnonzero(trace.states[1] == 0.0)
-    assert len(stopped) > 10
-    assert np.ptp(trace.states[0, stopped[0] :]) == 0.0
+    stopped_samples = np.flatnonzero(trace.states[1] == 0.0)
+    assert len(stopped_samples) > 10
+    assert np.ptp(trace.states[0, stopped_samples[0] :]) == 0.0
 
 
 def test_random_torque_acts_and_loop_uses_the_noisy_encoder():
     machine = Machine(RIGID, None, ({"kind": "unknown.random_torque", "side": "load", "torque": 0.3},))
-    still = np.zeros((2, SAMPLES))
-    run = Run(machine, PERIOD, np.zeros(SAMPLES), still, kp=5.0, kd=0.3, filter=0.5, motor_noise=1e-3, seed=3)
-    quiet = simulate([run], PERIOD)[0]
-    assert np.ptp(quiet.command) > 5.0 * 1e-3
+    standstill = np.zeros((2, SAMPLES))
+    run = Run(machine, PERIOD, np.zeros(SAMPLES), standstill, kp=5.0, kd=0.3, filter=0.5, motor_noise=1e-3, seed=3)
+    undisturbed = simulate([run], PERIOD)[0]
+    assert np.ptp(undisturbed.command) > 5.0 * 1e-3
     run.disturbance = np.sin(0.05 * np.arange(SAMPLES + 1))
-    assert np.ptp(simulate([run], PERIOD)[0].states[0]) > 10.0 * np.ptp(quiet.states[0])
+    assert np.ptp(simulate([run], PERIOD)[0].states[0]) > 10.0 * np.ptp(undisturbed.states[0])
     run.reference = np.stack([np.sin(TIME), np.cos(TIME)])
     run.motor_resolution = 0.01
     trace = simulate([run], PERIOD)[0]
@@ -270,7 +277,7 @@ def test_random_torque_acts_and_loop_uses_the_noisy_encoder():
 
 @pytest.mark.skipif(simulator.engine()[1] == "numpy", reason="numba is not installed: there is one engine only")
 def test_both_engines_agree(monkeypatch):
-    compiled = simulate(runs(60))
+    compiled = simulate(make_runs(60))
     monkeypatch.setattr(simulator, "_ENGINE", [simulator._vectorise_loop(), "numpy"])
-    for compiled_trace, reference_trace in zip(compiled, simulate(runs(60)), strict=True):
+    for compiled_trace, reference_trace in zip(compiled, simulate(make_runs(60)), strict=True):
         np.testing.assert_allclose(compiled_trace.states, reference_trace.states, rtol=1e-7, atol=1e-9)

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from hidden_log import FRICTION, nominal_study, select_samples, simulate_direct_drive, simulate_multisine_log
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
@@ -134,14 +134,14 @@ def test_the_observers_are_a_second_witness(diagnosis):
         and description["time_constant"] == 0.01
         and description["bandwidth"] < 16.0
     )
-    trace, (observed,) = diagnosis.trace, diagnosis.observed["motor"]
+    trace, (witness,) = diagnosis.trace, diagnosis.observed["motor"]
     is_observed = trace["motor.observed_before"].notna()
     # the beginnings of both parts are left out
-    first = DELAY_SAMPLES + observed.skipped
+    first = DELAY_SAMPLES + witness.skipped
     assert not is_observed[:first].any() and is_observed[first:1500].all()
-    assert not is_observed[1500 : 1500 + observed.skipped].any() and is_observed[1500 + observed.skipped :].all()
+    assert not is_observed[1500 : 1500 + witness.skipped].any() and is_observed[1500 + witness.skipped :].all()
     assert (trace["motor.observed_noise"].notna() == is_observed).all()
-    np.testing.assert_array_equal(trace["motor.observed_before"][first:1500], observed.residual.torque)
+    np.testing.assert_array_equal(trace["motor.observed_before"][first:1500], witness.residual.torque)
     assert trace["motor.observed_before"][is_observed].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
     assert not any("observer" in note for note in diagnosis.summary["notes"])
 
@@ -163,28 +163,28 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, t
     assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
     assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
     assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
-    again = read_config(tmp_path / "model.toml")
-    assert [effect.kind for effect in again.effects] == ["motor.coulomb_friction"]
+    model = read_config(tmp_path / "model.toml")
+    assert [effect.kind for effect in model.effects] == ["motor.coulomb_friction"]
     summary = read_json(tmp_path / "diagnosis.json")
     assert summary == diagnosis.summary and diagnosis_lines(summary) == lines
-    assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
+    assert model.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 
 
 @needs_chromium
 def test_the_page_in_a_browser(diagnosis, tmp_path):
     write_diagnosis_report(diagnosis, tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
-        check(page, len(list((tmp_path / "figures").iterdir())))
+        check_figures(page, len(list((tmp_path / "figures").iterdir())))
         assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
 
 
 def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, diagnosis, tmp_path):
     """The model is read as written, with the record of the first log for its excitation."""
     write_diagnosis_report(diagnosis, tmp_path)
-    again = diagnose(logs / "other.csv", tmp_path / "model.toml")
-    assert again.config.excitation.kind == "recorded"
-    assert again.summary["verdict"] == "no_discrepancy" and again.summary["findings"] == []
-    (friction,) = again.model.effects
+    second = diagnose(logs / "other.csv", tmp_path / "model.toml")
+    assert second.config.excitation.kind == "recorded"
+    assert second.summary["verdict"] == "no_discrepancy" and second.summary["findings"] == []
+    (friction,) = second.model.effects
     assert friction.torque == pytest.approx(FRICTION["torque"], rel=0.02)
 
 
@@ -208,26 +208,30 @@ def test_a_steady_torque_is_no_other_one_when_shuffled(logs):
 
 
 def test_new_numbers_are_better_all_in_all():
-    def better(before, after):
+    def is_better_by_position(before, after):
         return is_better({"theta_e": after, "torque_motor": 1.1}, {"theta_e": before, "torque_motor": 1.0})
 
-    assert better(1.0, 0.9) and not better(1.0, 0.95)
+    assert is_better_by_position(1.0, 0.9) and not is_better_by_position(1.0, 0.95)
     # a model that diverges, or errs by nothing, is no error
-    assert better(np.inf, 1.0) and better(1.0, 0.0)
-    assert not better(1.0, np.inf) and not better(np.inf, np.inf) and not better(0.0, 1.0)
+    assert is_better_by_position(np.inf, 1.0) and is_better_by_position(1.0, 0.0)
+    assert (
+        not is_better_by_position(1.0, np.inf)
+        and not is_better_by_position(np.inf, np.inf)
+        and not is_better_by_position(0.0, 1.0)
+    )
 
 
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
-    real = explain.refined
+    refine = explain.refined
 
-    def spoilt(experiment, free, *inputs):
-        fit = real(experiment, free, *inputs)
+    def spoil_sizes(experiment, free, *inputs):
+        fit = refine(experiment, free, *inputs)
         sizes = [number.path for number in free if number.path.startswith("effects.") and number.role == "size"]
-        wrong = set_leaves(fit.experiment, {path: 4.0 * get_leaf(fit.experiment, path) for path in sizes})
-        return fit._replace(experiment=wrong)
+        spoilt_experiment = set_leaves(fit.experiment, {path: 4.0 * get_leaf(fit.experiment, path) for path in sizes})
+        return fit._replace(experiment=spoilt_experiment)
 
-    monkeypatch.setattr(explain, "refined", spoilt)
+    monkeypatch.setattr(explain, "refined", spoil_sizes)
     task = read_diagnosis_task(logs / "first.csv", nominal_study(), holdout=logs / "last.csv")
     stages = []
     diagnosis = run_diagnosis(task, lambda *counts: stages.append(counts))
@@ -249,8 +253,8 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
 def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     record = read_record(logs / "axis.csv")
     assert tied({"findings": []}) is None
-    messages = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
-    assert messages[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    lines = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
+    assert lines[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
     rival = {"effect": "motor.quadratic_drag", "drive": nominal_study()["drive"], "effects": other}
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
@@ -298,21 +302,21 @@ def expect_refusal(logs, *arguments, **keywords):
 
 def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
     log, axis = simulate_multisine_log(seed=2), logs / "axis.csv"
-    coarse, again = tmp_path / "coarse.csv", tmp_path / "again.csv"
+    coarse, fine = tmp_path / "coarse.csv", tmp_path / "again.csv"
     means = log.u.reshape(-1, 2).mean(axis=1)
     dataclasses.replace(log, t=log.t[::2], u=means, theta_e=log.theta_e[::2]).write(coarse)
-    log.write(again)
-    for inputs, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], again)):
+    log.write(fine)
+    for inputs, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], fine)):
         task = read_diagnosis_task(inputs, nominal_study(), holdout=holdout)
         for record in (task.record, task.holdout):
             assert record.sample_period == pytest.approx(0.004)
-        output = [
+        notes = [
             note
             for record in (task.record, task.holdout)
             for note in record.notes
             if "every 4 ms, in the log every 2" in note
         ]
-        assert output
+        assert notes
 
 
 def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
@@ -334,11 +338,11 @@ def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
     """And not called complete: friction of a third of the input goes unseen."""
     torque = 2e-3 * simulate_multisine_log().u
     simulate_direct_drive(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
-    messages = (
+    message = (
         r"axis\.csv: noise hides everything: with readings as noisy as 0\.03 rad \(theta_e\), no torque of less than "
         r"2\d\d % of the input would be seen; noise 7 times smaller, or torques as many times larger, are needed$"
     )
-    with pytest.raises(InputError, match=messages):
+    with pytest.raises(InputError, match=message):
         diagnose(tmp_path / "axis.csv", nominal_study())
 
 

@@ -20,7 +20,7 @@ class Candidate:
         return {"value": value}
 
 
-def columns(design, errors, scale, centre, **more):
+def make_products(design, errors, scale, centre, **more):
     """Two own numbers, one candidate; errors of unit variance are `errors` plus the columns."""
     full = np.column_stack([errors, design])
     return Products(full.T @ full, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
@@ -37,11 +37,11 @@ def test_evidence_is_that_of_a_gaussian(candidate):
     design, errors = draw_regression()
     scale, centre = np.array([0.4, 0.2, 0.7]), np.array([0.1, 0.0, -0.1])
     count = 2 if candidate is None else 3
-    used = design[:, :count]
-    covariance = np.eye(40) + used @ np.diag(scale[:count] ** 2) @ used.T
-    exact = multivariate_normal(-used @ centre[:count], covariance).logpdf(errors)
-    result = evidence_of(columns(design, errors, scale, centre), [Candidate()], candidate)
-    assert result.log_evidence + -0.5 * 40 * np.log(2.0 * np.pi) == pytest.approx(exact, rel=1e-9)
+    used_columns = design[:, :count]
+    covariance = np.eye(40) + used_columns @ np.diag(scale[:count] ** 2) @ used_columns.T
+    exact = multivariate_normal(-used_columns @ centre[:count], covariance).logpdf(errors)
+    evidence = evidence_of(make_products(design, errors, scale, centre), [Candidate()], candidate)
+    assert evidence.log_evidence + -0.5 * 40 * np.log(2.0 * np.pi) == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e8])
@@ -50,39 +50,39 @@ def test_twins_are_parted_by_their_priors(size):
     design, errors = draw_regression(size)
     factor, scale, centre = -2.5, np.array([0.02, 0.2, 0.7]), np.array([0.1, 0.0, 0.05])
     design[:, 2] = factor * design[:, 0]
-    result = evidence_of(columns(design, errors, scale, centre, twins={3: (1, factor)}), [Candidate()], 0)
-    wide = np.array([np.hypot(scale[0], factor * scale[2]), scale[1]])
-    middle = np.array([centre[0] + factor * centre[2], centre[1]])
-    alone = evidence_of(columns(design, errors, np.r_[wide, 1.0], np.r_[middle, 0.0]))
-    assert result.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
-    assert result.misfit == pytest.approx(alone.misfit, rel=1e-6)
-    value = result.numbers["value"]
-    assert result.own[0] + factor * value == pytest.approx(alone.own[0], rel=1e-9)
+    evidence = evidence_of(make_products(design, errors, scale, centre, twins={3: (1, factor)}), [Candidate()], 0)
+    joint_scale = np.array([np.hypot(scale[0], factor * scale[2]), scale[1]])
+    joint_centre = np.array([centre[0] + factor * centre[2], centre[1]])
+    joint_evidence = evidence_of(make_products(design, errors, np.r_[joint_scale, 1.0], np.r_[joint_centre, 0.0]))
+    assert evidence.log_evidence == pytest.approx(joint_evidence.log_evidence, rel=1e-9)
+    assert evidence.misfit == pytest.approx(joint_evidence.misfit, rel=1e-6)
+    value = evidence.numbers["value"]
+    assert evidence.own[0] + factor * value == pytest.approx(joint_evidence.own[0], rel=1e-9)
     # each is as far from its mean as its variance allows
-    assert (result.own[0] - centre[0]) / scale[0] ** 2 == pytest.approx((value - centre[2]) / (factor * scale[2] ** 2))
+    assert (evidence.own[0] - centre[0]) / scale[0] ** 2 == pytest.approx((value - centre[2]) / (factor * scale[2] ** 2))
     if size == 1.0:
-        together = evidence_of(columns(design, errors, scale, centre), [Candidate()], 0)
-        assert result.log_evidence == pytest.approx(together.log_evidence, rel=1e-6)
-        np.testing.assert_allclose(result.own, together.own, atol=1e-6)
-        assert value == pytest.approx(together.numbers["value"], abs=1e-6)
+        direct_evidence = evidence_of(make_products(design, errors, scale, centre), [Candidate()], 0)
+        assert evidence.log_evidence == pytest.approx(direct_evidence.log_evidence, rel=1e-6)
+        np.testing.assert_allclose(evidence.own, direct_evidence.own, atol=1e-6)
+        assert value == pytest.approx(direct_evidence.numbers["value"], abs=1e-6)
 
 
 def test_a_number_is_held_at_its_bound():
     """Against SciPy's bounded least squares; the other numbers, and the misfit, make the best of it."""
     design, errors = draw_regression()
     scale, centre = np.array([0.05, 0.5, 0.7]), np.array([0.01, 0.0, 0.0])
-    inputs = columns(design, errors, scale, centre)
+    products = make_products(design, errors, scale, centre)
     free, bounded = (
-        evidence_of(dataclasses.replace(inputs, bound=np.array([bound, np.inf])), [Candidate()], 0)
+        evidence_of(dataclasses.replace(products, bound=np.array([bound, np.inf])), [Candidate()], 0)
         for bound in (np.inf, 0.3)
     )
     assert abs(free.own[0] - centre[0]) > 0.3 * scale[0]
-    stacked, towards = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
+    stacked, targets = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
     reach = np.array([0.3 * scale[0], np.inf, np.inf])
-    expected = lsq_linear(stacked, towards, (centre - reach, centre + reach), tol=1e-12).x
+    expected = lsq_linear(stacked, targets, (centre - reach, centre + reach), tol=1e-12).x
     np.testing.assert_allclose([*bounded.own, bounded.numbers["value"]], expected, atol=1e-6)
     assert bounded.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
     assert bounded.misfit > free.misfit
-    total = np.asarray(inputs.products)
-    solution = _least_squares(total, scale**-2.0, centre, reach)
+    matrix = np.asarray(products.products)
+    solution = _least_squares(matrix, scale**-2.0, centre, reach)
     np.testing.assert_allclose(solution, expected, atol=1e-9)

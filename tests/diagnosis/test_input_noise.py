@@ -17,20 +17,20 @@ INPUTS = {
 
 
 @pytest.fixture(params=INPUTS)
-def true(request):
+def true_input(request):
     return INPUTS[request.param]
 
 
 @pytest.mark.parametrize("noise", [3e-3, 1e-2, 3e-2])
-def test_noise_is_measured_and_smoothed_away(true, noise):
-    noisy = true + noise * np.random.default_rng(1).standard_normal(SAMPLES)
+def test_noise_is_measured_and_smoothed_away(true_input, noise):
+    noisy = true_input + noise * np.random.default_rng(1).standard_normal(SAMPLES)
     assert estimate_white_noise([noisy]) == pytest.approx(noise, rel=0.05)
-    left = smoothed_input(noisy, estimate_white_noise([noisy])) - true
-    assert np.sqrt(np.mean(left**2)) < 0.3 * noise
+    remainder = smoothed_input(noisy, estimate_white_noise([noisy])) - true_input
+    assert np.sqrt(np.mean(remainder**2)) < 0.3 * noise
 
 
-def test_an_input_without_noise_has_none(true):
-    assert estimate_white_noise([true]) < 1e-6
+def test_an_input_without_noise_has_none(true_input):
+    assert estimate_white_noise([true_input]) < 1e-6
 
 
 def test_jumps_stay_where_they_are():
@@ -79,11 +79,11 @@ def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
     )  # whole periods of both parts
     reading = 1e-4 * rng.standard_normal((SAMPLES, 2))
     effect = np.convolve(1e-4 * rng.standard_normal(SAMPLES), [0.2, 0.5, 0.3], "same")[:, None] * np.array([1.0, 0.0])
-    inputs = lacking + reading + effect * (not felt)
-    smooth = inputs - effect
-    alone = 1e-4 / np.sqrt(np.sum(effect**2))
+    prediction_errors = lacking + reading + effect * (not felt)
+    errors_without = prediction_errors - effect
+    least_error = 1e-4 / np.sqrt(np.sum(effect**2))
     parts = slice(0, 3000), slice(3000, SAMPLES)
-    share, error = unfelt([inputs[part] for part in parts], [smooth[part] for part in parts])
+    share, error = unfelt([prediction_errors[part] for part in parts], [errors_without[part] for part in parts])
     assert share == pytest.approx(0.0 if felt else 1.0, abs=3.0 * error)
     # the given errors' spectrum holds the effect too, where that is not felt
-    assert 0.9 < error / alone < 1.6
+    assert 0.9 < error / least_error < 1.6

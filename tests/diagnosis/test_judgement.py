@@ -87,8 +87,8 @@ def test_a_verdict_that_held_out_data_support_stays():
 def test_one_reason_is_enough_against_it(changes, reason):
     judgement = judge(**changes)
     assert judgement.found.verdict == "unknown_effect" and judgement.found.findings == make_search_result().findings
-    none = {key: value for key, value in PASSED.items() if key != "level"}
-    assert {key: getattr(judgement, key) for key in none} == none | reason
+    passed = {key: value for key, value in PASSED.items() if key != "level"}
+    assert {key: getattr(judgement, key) for key in passed} == passed | reason
 
 
 def test_a_finding_is_no_surer_than_what_held_out_data_say_for_it():
@@ -107,8 +107,8 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, 
         errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
-    inputs = dataclasses.replace(make_search_result(), findings=(finding,), wrong=None)
-    (judged_finding,) = judged(inputs, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
+    explanation = dataclasses.replace(make_search_result(), findings=(finding,), wrong=None)
+    (judged_finding,) = judged(explanation, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
     assert judged_finding == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
@@ -139,9 +139,9 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     assert finding.alternatives == ((NAME, pytest.approx(0.98 - finding.confidence)), ("motor.inertia", 0.02))
     # what the log alone said for the other one is no argument any more
     fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
-    back = [Control("wrong", NOISE, 1.8, NAME)]
-    after = judged(exchange, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
-    assert after.found.findings == (finding,)
+    reverse_control = [Control("wrong", NOISE, 1.8, NAME)]
+    judgement = judged(exchange, fitted, BEFORE, NOISE, LIMITS, reverse_control, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
+    assert judgement.found.findings == (finding,)
     assert (
         exchanged(
             make_search_result(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]
@@ -152,10 +152,10 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
 
 def test_held_out_data_outweigh_a_better_fit_of_another_effect():
     # a delay and a lag over a start that neither knows
-    def other(z):
+    def exchange_at(z):
         return exchanged(make_search_result(fit_gain=-380.0), [Control("wrong", NOISE, z, "motor.viscous_friction")])
 
-    assert other(5.0) is None and other(0.5) is None and other(-0.5) is not None
+    assert exchange_at(5.0) is None and exchange_at(0.5) is None and exchange_at(-0.5) is not None
     finding = judge(controls=[Control("wrong", NOISE, 5.0, "motor.viscous_friction")], fit_gain=-380.0).found.findings[0]
     assert finding.confidence == pytest.approx(0.98, abs=1e-3)
 
@@ -165,9 +165,9 @@ def test_what_a_log_leaves_open_held_out_data_decide():
     fitted = SimpleNamespace(names=(NAME,), theta=np.zeros(1), free=[], errors=dict, experiment=None)
 
     def judge_tie(z):
-        inputs = dataclasses.replace(make_search_result(fit_gain=0.0), findings=(tie,))
+        explanation = dataclasses.replace(make_search_result(fit_gain=0.0), findings=(tie,))
         controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
-        return judged(inputs, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
+        return judged(explanation, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
 
     assert judge_tie(5.0).confidence > 0.99 and judge_tie(5.0).alternatives == ()
     assert judge_tie(1.0) == tie

@@ -26,7 +26,7 @@ PATHS = {1: ["drive.motor_inertia", "drive.motor_viscous"], 2: ["drive.load_iner
 
 
 @functools.cache
-def setting(sides):
+def simulate_segment(sides):
     """Return an experiment, and the segment of a log of it."""
     settings = {"run.duration": 2.0, "run.substeps": 5}
     excitation = {"kind": "multisine", "amplitude": 5.0 if sides == 2 else 1.0, "frequency": 0.7}
@@ -37,9 +37,9 @@ def setting(sides):
     return prepare(read_config(data)), segment_of(simulate_study(data, seed=8))
 
 
-def linear(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
+def linearise(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
     """Linearise the model along a log, and `idle` times along the same without an input."""
-    experiment, segment = setting(sides)
+    experiment, segment = simulate_segment(sides)
     free = make_free_parameters(experiment, PATHS[sides], 1.0)
     rng, smoothed = np.random.default_rng(3), {}
     for side, motion in segment.smoothed.items():
@@ -54,10 +54,10 @@ def linear(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
 @pytest.fixture(scope="module")
 def geared_model():
     """The model of two sides at its nominal numbers, for tests that change nothing of it."""
-    return linear(2)
+    return linearise(2)
 
 
-def errors(model, forces=None):
+def prediction_errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
     predicted = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
     flat = predicted.reshape(-1, predicted.shape[2])
@@ -66,23 +66,23 @@ def errors(model, forces=None):
     return remainder - basis @ (basis.T @ remainder)
 
 
-def size(values):
+def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.mark.parametrize("sides", [1, 2])
 def test_errors_of_the_smoothed_motion_cancel(sides):
-    plain, disturbed = (errors(linear(sides, disturbed=x))[:, 0] for x in (0.0, 1.0))
-    assert size(disturbed - plain) < 1e-3 * size(plain)
+    plain, disturbed = (prediction_errors(linearise(sides, disturbed=x))[:, 0] for x in (0.0, 1.0))
+    assert rms(disturbed - plain) < 1e-3 * rms(plain)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
 def test_own_columns_are_derivatives(sides):
     step = 1e-4
-    above, below = (errors(linear(sides, theta=x))[:, 0] for x in (step, -step))
-    columns = errors(linear(sides))[:, 1 : 1 + len(PATHS[sides])]
-    expected = (above - below) / (2.0 * step)
-    assert size(columns.sum(axis=1) - expected) < 1e-3 * size(expected)
+    errors_above, errors_below = (prediction_errors(linearise(sides, theta=x))[:, 0] for x in (step, -step))
+    columns = prediction_errors(linearise(sides))[:, 1 : 1 + len(PATHS[sides])]
+    expected = (errors_above - errors_below) / (2.0 * step)
+    assert rms(columns.sum(axis=1) - expected) < 1e-3 * rms(expected)
 
 
 LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
@@ -111,11 +111,11 @@ def test_a_candidates_torque_does_what_the_effect_does(geared_model, name):
     def with_effect(experiment):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
-    columns = errors(geared_model, Forces(geared_model.signals[0].of([effect])))
-    expected = errors(linear(2, with_effect))[:, 0] - columns[:, 0]
+    columns = prediction_errors(geared_model, Forces(geared_model.signals[0].of([effect])))
+    expected = prediction_errors(linearise(2, with_effect))[:, 0] - columns[:, 0]
     actual = columns[:, -1]
-    assert size(expected) > 0.0
-    assert size(actual - expected) < 0.03 * size(expected)
+    assert rms(expected) > 0.0
+    assert rms(actual - expected) < 0.03 * rms(expected)
 
 
 def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared_model):
@@ -151,7 +151,7 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
             (expected,) = signals.of([effect])
             assert columns.keys() == expected.keys()
             for point, torque in expected.items():
-                assert size(np.tensordot(values, columns[point], 1) - torque) < 0.02 * size(torque)
+                assert rms(np.tensordot(values, columns[point], 1) - torque) < 0.02 * rms(torque)
             names.add(variant.name)
     assert names == set(waves)
 
@@ -159,9 +159,9 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
 @pytest.mark.parametrize("sides", [1, 2])
 def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
-    model = linear(sides)
+    model = linearise(sides)
     products = model.columns((), [1e-6] * sides, np.ones(sides)).products
-    columns = errors(model)
+    columns = prediction_errors(model)
     assert products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(products))
 
 
@@ -193,11 +193,11 @@ def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
     """A second model along the log, whose numbers are others, with what the first one has left and from scratch."""
     if held:
         monkeypatch.setattr(Smoothed, "held", lambda self, period: np.arange(len(self.state)) % 500 < 100)
-    first = linear(2)
+    first = linearise(2)
     names = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
     variants = variants_of(first.experiment, names, lambda name: LOG)
     columns_of(variants, first.signals[0])
-    model = linear(2, theta=0.1)
+    model = linearise(2, theta=0.1)
     (signals,), selected = model.signals, first.signals[0].shared
     assert len(selected) > 100
     shared = MotionTorques(model.experiment, model.parts[0], selected)
@@ -210,7 +210,7 @@ def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
 
 
 def test_a_candidate_may_act_in_one_part_only():
-    model = linear(1, idle=1)
+    model = linearise(1, idle=1)
     variants = variants_of(model.experiment, ["actuator.gain_error"], model.scales)
     acting, idle = model.choose(variants).coefficients
     assert np.isfinite(acting).all()
@@ -239,7 +239,7 @@ def test_what_rounding_takes_is_known(growth):
 
 
 def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
-    model = linear(1)
+    model = linearise(1)
     smoothness = model.choose(()).smoothness
     assert np.isfinite(model.predictor(smoothness).squares).all()
     monkeypatch.setattr(module, "_LOST", 0.0)

@@ -67,8 +67,8 @@ def compare_logs(
         free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
         log = Torques(segments[: 1 if separate else 2], (first, second), turned, noise, rough)
-        held = Torques(segments[1:], (first, second), turned, noise, rough)
-        return contradictions(task, fitted, log, held, 5e-3)  # type: ignore[arg-type]
+        holdout = Torques(segments[1:], (first, second), turned, noise, rough)
+        return contradictions(task, fitted, log, holdout, 5e-3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("separate", [False, True])

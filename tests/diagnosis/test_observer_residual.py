@@ -61,8 +61,8 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def late(torque, period):
-    """A torque as it is behind the equivalent control's low-pass."""
+def low_pass(torque, period):
+    """Filter a torque by the equivalent control's low-pass."""
     share = -np.expm1(-period / LOW)
     return lfilter([share], [1.0, share - 1.0], torque)
 
@@ -81,7 +81,7 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
         )
         assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
-        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + witness.skipped : 1500]
+        missing = low_pass(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + witness.skipped : 1500]
         low, _ = narrowed(witness.residual, 10.0)
         true, _ = narrowed(replace(witness.residual, torque=missing), 10.0)
         assert np.corrcoef(low.torque, true.torque)[0, 1] > 0.99
@@ -94,10 +94,10 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretis
     if drive == "geared":
         tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
     _, _, observed = read_residuals(logs, drive, nominal_study(observer={"discretisation": discretisation}, **tables))
-    for side, (name,) in observed.items():
-        scores = [rms(name.residual.torque / name.residual.deviation)]
+    for side, (witness,) in observed.items():
+        scores = [rms(witness.residual.torque / witness.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
-            low, _ = narrowed(name.residual, cutoff)
+            low, _ = narrowed(witness.residual, cutoff)
             scores.append(rms(low.torque / low.deviation))
         # the explicit one has a lag of its own, which shows behind narrow low-passes
         if discretisation == "implicit":
@@ -124,10 +124,10 @@ def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
 
 
 def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
-    real = under_test._controls
+    compute_controls = under_test._controls
 
     def controls(*inputs):
-        return {side: values.at[0, -1].set(np.inf) for side, values in real(*inputs).items()}
+        return {side: values.at[0, -1].set(np.inf) for side, values in compute_controls(*inputs).items()}
 
     monkeypatch.setattr(under_test, "_controls", controls)
     _, _, observed = read_residuals(logs, "direct", nominal_study())

@@ -22,22 +22,32 @@ LOG = SimpleNamespace(noise_floor=lambda torques: {"theta_e": POSITION, "torque_
 
 
 @pytest.fixture
-def errors():
+def draw_errors():
     random = np.random.default_rng(0)
     return lambda size: size * random.standard_normal(1600)
 
 
-def test_a_ripple_that_only_the_torque_shows_counts(errors):
+def test_a_ripple_that_only_the_torque_shows_counts(draw_errors):
     # windows of the position go wrong by something else, which is far larger
-    control, better = compare_errors(errors(500.0), errors(4.0)), compare_errors(errors(500.0), errors(2.0))
+    control, better = (
+        compare_errors(draw_errors(500.0), draw_errors(4.0)),
+        compare_errors(draw_errors(500.0), draw_errors(2.0)),
+    )
     assert beaten(LOG, control, better) > 5.0
     assert beaten(LOG, better, control) < -2.0
     # or one channel against the other: all together
-    assert abs(beaten(LOG, compare_errors(errors(4.0), errors(2.0)), compare_errors(errors(2.0), errors(4.0)))) < 3.0
+    assert (
+        abs(
+            beaten(
+                LOG, compare_errors(draw_errors(4.0), draw_errors(2.0)), compare_errors(draw_errors(2.0), draw_errors(4.0))
+            )
+        )
+        < 3.0
+    )
 
 
-def test_one_factor_on_all_torques_and_the_input_makes_no_model_better(errors):
-    position, torque = errors(3.0), errors(3.0)
+def test_one_factor_on_all_torques_and_the_input_makes_no_model_better(draw_errors):
+    position, torque = draw_errors(3.0), draw_errors(3.0)
     scaled = compare_errors(position, torque, gain=0.6, floor=0.6 * TORQUE)
     assert beaten(LOG, compare_errors(position, torque), scaled) == pytest.approx(0.0, abs=1e-9)
     # nor does a smaller inertia, by which readings make less noise of torque
@@ -61,20 +71,20 @@ def accept_effects(monkeypatch, errors, shares, gain):
     proof = Proof.__new__(Proof)
     proof.before, proof.noise = compare_errors(errors(9.0), errors(9.0)), LOG.noise_floor({"motor": TORQUE})
     proof.other = SimpleNamespace(compare=lambda experiment: compare_errors(errors(1.0), errors(1.0)))
-    fitted = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
-    monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fitted)
+    fit = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
+    monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fit)
     monkeypatch.setattr(Proof, "_gain", lambda self, search, model, after, name: gain(name, model.names))
     search_result = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
     return proof.accepted(None, search_result)
 
 
-def test_a_wave_in_time_has_to_go_on_in_other_data(monkeypatch, errors):
+def test_a_wave_in_time_has_to_go_on_in_other_data(monkeypatch, draw_errors):
     shares = {"load.periodic_disturbance": 0.002, "motor.cogging": 0.01}
-    output = accept_effects(monkeypatch, errors, shares, lambda name, names: 1.4)
-    assert output.withdrawn == ["load.periodic_disturbance"] and output.fitted.names == ("motor.cogging",)
+    accepted = accept_effects(monkeypatch, draw_errors, shares, lambda name, names: 1.4)
+    assert accepted.withdrawn == ["load.periodic_disturbance"] and accepted.fitted.names == ("motor.cogging",)
 
 
-def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, errors):
+def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, draw_errors):
     """Beside a delay that stands for it a ripple seems needless."""
     shares = {"actuator.delay": 0.01, "motor.cogging": 0.2, "motor.coulomb_friction": 0.9}
 
@@ -82,9 +92,9 @@ def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, err
         alone = "actuator.delay" not in names
         return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
 
-    output = accept_effects(monkeypatch, errors, shares, gain)
-    assert output.withdrawn == ["actuator.delay"]
-    assert output.fitted.names == ("motor.cogging", "motor.coulomb_friction")
+    accepted = accept_effects(monkeypatch, draw_errors, shares, gain)
+    assert accepted.withdrawn == ["actuator.delay"]
+    assert accepted.fitted.names == ("motor.cogging", "motor.coulomb_friction")
 
 
 @pytest.mark.parametrize(("error", "apart"), [(0.02, True), (0.2, False)])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from measured import EMPS, XL330, real
+from measured import EMPS, XL330, find_recording
 from small_study import rigid_study
 
 from jaxbl.diagnosis import effect_search
@@ -40,7 +40,7 @@ def search_effects(log, study):
 def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     """Published: M 95.1 kg, F_v 203.5 N s/m, F_c 20.39 N, and F_v 166.7 N s/m forwards, 240.4 backwards; force error 66 %
     with the mass alone, 4.7 % with all of these."""
-    diagnosis = diagnose(real("emps/DATA_EMPS.mat"), emps(), holdout=real("emps/DATA_EMPS_PULSES.mat"))
+    diagnosis = diagnose(find_recording("emps/DATA_EMPS.mat"), emps(), holdout=find_recording("emps/DATA_EMPS_PULSES.mat"))
     summary = diagnosis.summary
     numbers = {finding["effect"]: finding["parameters"] for finding in summary["findings"]}
     assert set(numbers) == {"motor.viscous_friction", "motor.coulomb_friction", "motor.asymmetric_friction"}
@@ -64,7 +64,7 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
 
 def test_emps_an_effect_that_is_taken_out_is_named_again(monkeypatch):
     monkeypatch.setattr(effect_search, "_MOST", 1)
-    (finding,) = search_effects(real("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET)).findings
+    (finding,) = search_effects(find_recording("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET)).findings
     assert finding.effect == COULOMB["kind"]
     assert finding.numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
 
@@ -78,7 +78,7 @@ def test_xl330_gravity_and_then_dry_friction_are_named():
         log={key: XL330[key] for key in ("t", "theta_e")}
         | {"absent": ["u"], "where": {"torque_enable": False}, "resample": 3.5e-3},
     )
-    logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
+    logs = [find_recording(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
     gravity, friction = search_effects(logs, study).findings
     assert gravity.effect == "load.gravity"
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it

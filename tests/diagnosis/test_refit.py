@@ -23,7 +23,7 @@ NAME = "motor.coulomb_friction"
 
 
 @pytest.fixture(scope="module")
-def setting(tmp_path_factory):
+def refit_inputs(tmp_path_factory):
     log = tmp_path_factory.mktemp("log") / "axis.csv"
     simulate_multisine_log().write(log)
     task = read_diagnosis_task(log, nominal_study())
@@ -36,14 +36,14 @@ def setting(tmp_path_factory):
     return experiment, free, width, segments_of(task.record, bare.sides)
 
 
-def test_prediction_errors_are_least(setting):
+def test_prediction_errors_are_least(refit_inputs):
     """A search without derivatives that begins elsewhere finds none smaller of the same predictor."""
-    experiment, free, width, segments = setting
+    experiment, free, width, segments = refit_inputs
     (segment,) = segments
     # without the effects that do nothing
     plain = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.name == NAME))
-    result = refined(experiment, free, np.zeros(len(free)), width, segments)
-    gain = {"motor": Linear.gain_of(result.smoothness, segment.period)[0]}
+    fit = refined(experiment, free, np.zeros(len(free)), width, segments)
+    gain = {"motor": Linear.gain_of(fit.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
@@ -56,17 +56,17 @@ def test_prediction_errors_are_least(setting):
         errors = np.asarray(reading - predict(jnp.asarray(inputs)))
         return len(errors) * np.log(np.sum(errors**2)) + np.sum((inputs[2:] * 0.01 / width) ** 2)
 
-    here = np.concatenate([result.start[0], 100.0 * result.theta])
+    optimum = np.concatenate([fit.start[0], 100.0 * fit.theta])
     options = {"xatol": 1e-5, "fatol": 1e-4, "maxfev": 2000, "adaptive": True}
-    best = minimize(cost, here + np.array([1e-6, 1e-4, 0.3, -0.3, 0.3]), method="Nelder-Mead", options=options)
+    best = minimize(cost, optimum + np.array([1e-6, 1e-4, 0.3, -0.3, 0.3]), method="Nelder-Mead", options=options)
     # twice the logarithm of the likelihood: far less than what the noise leaves open
-    assert cost(here) - best.fun < 0.1
-    assert cost(here) < cost(here + np.array([0.0, 0.0, 0.1, -0.1, 0.1])) - 1.0
+    assert cost(optimum) - best.fun < 0.1
+    assert cost(optimum) < cost(optimum + np.array([0.0, 0.0, 0.1, -0.1, 0.1])) - 1.0
 
 
 def test_deviations_are_those_of_repetitions(tmp_path):
     """The friction's error over many noise realisations, against what is said of each."""
-    values, stated = [], []
+    values, deviations = [], []
     for seed in range(12):
         log = tmp_path / f"{seed}.csv"
         simulate_multisine_log(seed=seed).write(log)
@@ -77,19 +77,19 @@ def test_deviations_are_those_of_repetitions(tmp_path):
         free_parameters = make_free_parameters(bare, default_paths(task.config, bare), torque)
         free = (*free_parameters, *make_free_parameters(experiment, paths_of([NAME]), torque))
         width = np.array([*[task.config.uncertainty.relative] * len(free_parameters), 3.0])
-        result = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
-        values.append(result.theta[-1])
-        stated.append(result.deviation[-1])
-    errors = np.array(values) / np.array(stated)
+        fit = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
+        values.append(fit.theta[-1])
+        deviations.append(fit.deviation[-1])
+    errors = np.array(values) / np.array(deviations)
     assert 0.6 < np.sqrt(np.mean(errors**2)) < 1.5
     assert np.max(np.abs(errors)) < 3.5
 
 
-def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
+def test_numbers_under_which_the_predictor_diverges_are_not_taken(refit_inputs):
     """Errors that are not finite have no likelihood, and nothing is said of them."""
-    experiment, free, width, segments = setting
-    wild = with_numbers(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
-    refiner = _Refiner(wild, free, width, segments)
+    experiment, free, width, segments = refit_inputs
+    diverging = with_numbers(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
+    refiner = _Refiner(diverging, free, width, segments)
     theta = np.zeros(len(free))
     (path,) = refiner._path(theta, refiner.start(), [1e-11])
     assert not np.isfinite(path.smoothed["motor"].state[:, :2]).all()

@@ -24,7 +24,7 @@ def study(sides, effects=()):
     return small_study(SETTINGS, excitation=excitation, transmission=GAP, **tables)
 
 
-def record(data, seed=0, transmitted=None):
+def simulate_record(data, seed=0, transmitted=None):
     """Simulate a study, and return the trace and its segment."""
     trace = simulate_study(data, seed)
     measured = None if transmitted is None else trace["torque"].to_numpy() + transmitted
@@ -35,7 +35,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def scores(residual, cutoff=None):
+def score_residual(residual, cutoff=None):
     if cutoff is not None:
         residual, _ = narrowed(residual, cutoff)
     return rms(residual.torque / residual.deviation)
@@ -46,9 +46,9 @@ def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, e
     side_scores = {}
     experiment = prepare(read_config(study(sides, effects)))
     for seed in range(3):
-        _, segment = record(study(sides, effects), seed)
+        _, segment = simulate_record(study(sides, effects), seed)
         for side, (residual,) in residual_torques(experiment, [segment]).items():
-            bands = [scores(residual), scores(residual, 20.0), scores(residual, 8.0)]
+            bands = [score_residual(residual), score_residual(residual, 20.0), score_residual(residual, 8.0)]
             side_scores.setdefault(side, []).append(bands)
     assert set(side_scores) == set(experiment.sides)
     for bands in side_scores.values():
@@ -59,12 +59,12 @@ def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
     experiment = prepare(read_config(study(1)))
     errors = []
     for seed in range(3):
-        trace, segment = record(study(1, [FRICTION]), seed)
+        trace, segment = simulate_record(study(1, [FRICTION]), seed)
         (residual,) = residual_torques(experiment, [segment])["motor"]
         missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
         smoothed = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
         errors.append(rms((residual.torque - smoothed) / residual.deviation))
-        assert scores(residual) > 3.0
+        assert score_residual(residual) > 3.0
         # the other way round as the balance
         balance_torque = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
         assert np.corrcoef(balance_torque[200:-200], residual.torque[200:-200])[0, 1] > 0.97
@@ -73,13 +73,13 @@ def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
 
 def test_a_measured_torque_takes_the_place_of_the_models():
     noise = 0.02 * np.random.default_rng(0).standard_normal(4000)
-    _, segment = record(study(2), transmitted=noise)
+    _, segment = simulate_record(study(2), transmitted=noise)
     for stiffness in (60.0, 50.0):
         experiment = prepare(read_config(study(2) | {"transmission": GAP | {"stiffness": stiffness}}))
         residuals = residual_torques(experiment, [segment])
         assert list(residuals) == ["motor", "load"]
         for (residual,) in residuals.values():
-            assert scores(residual) == pytest.approx(1.0, abs=0.12)
+            assert score_residual(residual) == pytest.approx(1.0, abs=0.12)
 
 
 def test_narrowing_keeps_the_noise_level_and_what_is_slow():
@@ -91,9 +91,9 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     assert len(low.time) < 2000 and low.bandwidth == 5.0
     np.testing.assert_array_equal(low.time, time[rows])
     assert rms((low.torque - slow[rows]) / low.deviation) == pytest.approx(1.0, abs=0.1)
-    again, _ = narrowed(low, 2.5)
-    direct, _ = narrowed(white, 2.3)
-    assert again.deviation[50] == pytest.approx(direct.deviation[50], rel=0.1)
+    narrowed_twice, _ = narrowed(low, 2.5)
+    narrowed_once, _ = narrowed(white, 2.3)
+    assert narrowed_twice.deviation[50] == pytest.approx(narrowed_once.deviation[50], rel=0.1)
 
 
 def test_noise_spectrum_is_the_transform_of_the_correlation():

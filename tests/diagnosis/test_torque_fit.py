@@ -30,9 +30,9 @@ def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins
         )
         assert np.all(deviation > 0.0) and by_torque.linear is not fitted.linear
         theta = fitted.theta + np.array([0.03, -0.03, 0.3])
-        away = fitted._replace(theta=theta, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
-        again = fit_to_torque(search, away, setup.fitted)
+        shifted_fit = fitted._replace(theta=theta, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
+        torque_fit = fit_to_torque(search, shifted_fit, setup.fitted)
     # the prior weighs more where more torque is missing at first
-    np.testing.assert_allclose(again.theta, by_torque.theta, atol=3.0 * np.max(deviation))
-    missing = [np.std(setup.fitted.missing(fitted.experiment)["motor"]) for fitted in (away, again)]
+    np.testing.assert_allclose(torque_fit.theta, by_torque.theta, atol=3.0 * np.max(deviation))
+    missing = [np.std(setup.fitted.missing(fitted.experiment)["motor"]) for fitted in (shifted_fit, torque_fit)]
     assert missing[1] < 0.5 * missing[0]

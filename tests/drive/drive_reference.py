@@ -1,6 +1,6 @@
 """An oracle for the drive: the equations of motion written out once more in NumPy, integrated by SciPy to tight tolerance.
 
-Nothing of the physics here comes from the package; :func:`trajectory` runs the package's own plant for comparison.
+Nothing of the physics here comes from the package; :func:`simulate_plant` runs the package's own plant for comparison.
 """
 
 import equinox as eqx
@@ -40,11 +40,11 @@ def right_side(t, y, u, law, effects, drive):
             cold, warm = drifting["initial_torque"], drifting["torque"]
             dry += warm + (cold - warm) * np.exp(-t / drifting["time_constant"])
         differs = f"{name}.asymmetric_friction"
-        more = 0.5 if v > 0.0 else -0.5
-        dry += more * value(differs, "torque_difference")
+        half_sign = 0.5 if v > 0.0 else -0.5
+        dry += half_sign * value(differs, "torque_difference")
         return (
             dry * np.sign(v)
-            + (value(f"{name}.viscous_friction", "viscous") + more * value(differs, "viscous_difference")) * v
+            + (value(f"{name}.viscous_friction", "viscous") + half_sign * value(differs, "viscous_difference")) * v
             + value(f"{name}.quadratic_drag", "drag") * abs(v) * v
             + value(f"{name}.constant_torque", "torque")
         )
@@ -123,12 +123,12 @@ def right_side(t, y, u, law, effects, drive):
     omega_s_dot = (ratio * torque - drive["load_viscous"] * omega_s - at_load) / (
         drive["load_inertia"] + value("load.inertia", "inertia")
     )
-    behind = third - omega_s
-    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot, w_dot, behind, third_dot]
+    twist_rate = third - omega_s
+    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot, w_dot, twist_rate, third_dot]
 
 
-def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
-    """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
+def integrate_reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
+    """Integrate the equations: (theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
     y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], *[0.0] * 6]
     states = []
     delay_samples = (effects or {}).get("actuator.delay", {"delay": 0.0})["delay"] / hold
@@ -154,19 +154,19 @@ def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQU
     return np.array(states)
 
 
-def plant(*effects, law=None, dtype=jnp.float64, **changes):
-    """The package's plant with the constants of `DRIVE`."""
+def make_plant(*effects, law=None, dtype=jnp.float64, **changes):
+    """Make the package's plant with the constants of `DRIVE`."""
     law = SigmoidBacklash(**SIGMOID) if law is None else law
     return as_arrays(Plant(TwoInertia(**(DRIVE | changes)), law, effects), dtype)
 
 
-def block(*effects, inertia=0.05, viscous=0.0, dtype=jnp.float64):
-    """A single inertia on whatever the effects make of its support."""
+def make_block(*effects, inertia=0.05, viscous=0.0, dtype=jnp.float64):
+    """Make a plant of a single inertia on whatever the effects make of its support."""
     return as_arrays(Plant(Rigid(motor_inertia=inertia, motor_viscous=viscous), None, effects), dtype)
 
 
 @eqx.filter_jit
-def _trajectory(plant, initial, torques, substeps, hold):
+def _simulate(plant, initial, torques, substeps, hold):
     step = hold / substeps.astype(hold.dtype)
 
     def advance_hold(carry, torque):
@@ -185,22 +185,22 @@ def _trajectory(plant, initial, torques, substeps, hold):
     return jax.lax.scan(advance_hold, (plant.init(initial), jnp.zeros_like(hold)), torques)[1]
 
 
-def trajectory(plant, substeps, start=START, torques=TORQUES, hold=HOLD, dtype=jnp.float64):
-    """The package's counterpart of :func:`reference`: positions, then velocities, at the end of each hold."""
+def simulate_plant(plant, substeps, start=START, torques=TORQUES, hold=HOLD, dtype=jnp.float64):
+    """Simulate the package's plant: positions, then velocities, at the end of each hold, as :func:`integrate_reference`."""
     initial, torques, hold = as_arrays((Initial(**start), jnp.asarray(torques, dtype), float(hold)), dtype)
-    states = _trajectory(plant, initial, torques, jnp.asarray(substeps), hold)
+    states = _simulate(plant, initial, torques, jnp.asarray(substeps), hold)
     assert states.dtype == dtype
     return np.asarray(states)
 
 
-_trajectories = eqx.filter_jit(eqx.filter_vmap(_trajectory, in_axes=(eqx.if_array(0), None, None, None, None)))
+_simulate_stacked = eqx.filter_jit(eqx.filter_vmap(_simulate, in_axes=(eqx.if_array(0), None, None, None, None)))
 
 
-def trajectories(plants, substeps, dtype=jnp.float64):
-    """The same for several plants of one structure, shape (plants, holds, 4)."""
+def simulate_plant_batch(plants, substeps, dtype=jnp.float64):
+    """Simulate several plants of one structure at once from `START` under `TORQUES`, shape (plants, holds, 4)."""
     stacked = jax.tree.map(lambda *numbers: np.stack(numbers), *plants)
     initial, torques, hold = as_arrays((Initial(**START), jnp.asarray(TORQUES, dtype), float(HOLD)), dtype)
-    states = _trajectories(stacked, initial, torques, jnp.asarray(substeps), hold)
+    states = _simulate_stacked(stacked, initial, torques, jnp.asarray(substeps), hold)
     assert states.dtype == dtype
     return np.asarray(states)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drive_reference import START, block, plant, reference, trajectories, trajectory
+from drive_reference import START, integrate_reference, make_block, make_plant, simulate_plant, simulate_plant_batch
 from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
@@ -35,25 +35,25 @@ def make_neutral(name):
 
 
 @functools.cache
-def single_effect_trajectories(substeps, dtype=jnp.float64):
+def simulate_single_effects(substeps, dtype=jnp.float64):
     """The trajectory of the drive with each effect by its name, the others neutral: all by one program."""
     neutral = {name: make_neutral(name) for name in VALUES}
     effects = [neutral | {name: make_effect(name, **VALUES[name])} for name in VALUES]
-    plants = [plant(*by_name.values(), dtype=dtype) for by_name in effects]
-    return dict(zip(VALUES, trajectories(plants, substeps, dtype), strict=True))
+    plants = [make_plant(*by_name.values(), dtype=dtype) for by_name in effects]
+    return dict(zip(VALUES, simulate_plant_batch(plants, substeps, dtype), strict=True))
 
 
 def errors(values, *substeps):
     """Distances of the drive from the reference, by so many substeps."""
-    expected = reference(effects=values)
+    expected = integrate_reference(effects=values)
     assert expected[:, 2:].min() > 0.1  # sliding forwards
-    return [np.abs(trajectory(plant(*make_effects(values)), n) - expected).max() for n in substeps]
+    return [np.abs(simulate_plant(make_plant(*make_effects(values)), n) - expected).max() for n in substeps]
 
 
 @pytest.fixture(scope="module")
 def motion_without_effects():
     """The reference without effects."""
-    return reference()
+    return integrate_reference()
 
 
 def test_the_names_are_the_contract():
@@ -66,9 +66,9 @@ def test_the_names_are_the_contract():
 
 @pytest.mark.parametrize("name", VALUES)
 def test_each_effect_is_what_its_equation_says_to_second_order(name, motion_without_effects):
-    expected = reference(effects={name: VALUES[name]})
+    expected = integrate_reference(effects={name: VALUES[name]})
     assert expected[:, 2:].min() > 0.1  # sliding forwards
-    coarse, fine = (np.abs(single_effect_trajectories(n)[name] - expected).max() for n in (128, 1024))
+    coarse, fine = (np.abs(simulate_single_effects(n)[name] - expected).max() for n in (128, 1024))
     assert np.abs(expected - motion_without_effects).max() > 0.1  # it matters
     # a hard gap is only piecewise smooth: of second order in the mean
     tolerance = 0.2 if name == "transmission.backlash" else 0.01
@@ -78,14 +78,14 @@ def test_each_effect_is_what_its_equation_says_to_second_order(name, motion_with
 
 def test_effects_on_an_encoder_change_its_reading_alone():
     effects = make_effects(ENCODERS)
-    np.testing.assert_array_equal(trajectory(plant(*effects), 8), trajectory(plant(), 8))
-    two_inertia, rigid = plant(*effects), block(*effects)
+    np.testing.assert_array_equal(simulate_plant(make_plant(*effects), 8), simulate_plant(make_plant(), 8))
+    two_inertia, rigid = make_plant(*effects), make_block(*effects)
     assert float(two_inertia.read("motor", 0.3, 2.0)) == pytest.approx(0.4)
     skewed = 0.3 - 2e-3 * 2.0
     assert float(two_inertia.read("load", 0.3, 2.0)) == pytest.approx(skewed + 0.01 * np.sin(2.0 * skewed + 0.4))
     # a rigid drive has one encoder
     assert float(rigid.read("motor", 0.3, 2.0)) == pytest.approx(0.1 + skewed + 0.01 * np.sin(2.0 * (skewed + 0.1) + 0.4))
-    assert float(plant().read("load", 0.3, 2.0)) == pytest.approx(0.3)
+    assert float(make_plant().read("load", 0.3, 2.0)) == pytest.approx(0.3)
 
 
 def test_effects_add_up_in_any_order():
@@ -96,8 +96,8 @@ def test_effects_add_up_in_any_order():
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
     shuffled = sorted(make_effects(values), key=lambda effect: (effect.place == "actuator", effect.place))
-    there, back = (trajectory(plant(*order), 64) for order in (make_effects(values), shuffled))
-    np.testing.assert_allclose(there, back, rtol=1e-11)
+    in_order, reordered = (simulate_plant(make_plant(*order), 64) for order in (make_effects(values), shuffled))
+    np.testing.assert_allclose(in_order, reordered, rtol=1e-11)
 
 
 def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
@@ -109,7 +109,7 @@ def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
 
 @pytest.mark.parametrize("name", VALUES)
 def test_float32_stays_float32_and_close(name):
-    double, single = (single_effect_trajectories(32, dtype)[name] for dtype in (jnp.float64, jnp.float32))
+    double, single = (simulate_single_effects(32, dtype)[name] for dtype in (jnp.float64, jnp.float32))
     np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-3)
 
 
@@ -130,7 +130,7 @@ def slide_block(friction, torque, seconds, dtype=jnp.float64, velocity=0.0, **bl
     """Position and velocity of a block at every default sample (1 ms in 10 substeps) under a constant torque."""
     torques = np.full(round(seconds * 1000), torque)
     start = REST | {"motor_velocity": velocity}
-    return trajectory(block(friction, dtype=dtype, **block_values), 10, start, torques, 1e-3, dtype).T
+    return simulate_plant(make_block(friction, dtype=dtype, **block_values), 10, start, torques, 1e-3, dtype).T
 
 
 @DTYPES
@@ -143,11 +143,11 @@ def test_a_block_below_breakaway_does_not_creep_at_all(friction, torque, dtype):
 @DTYPES
 def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
     weight = make_effects({"load.constant_torque": {"torque": 0.3}, "motor.coulomb_friction": {"torque": 0.02}})
-    drive = plant(*weight, CoulombFriction(side="load", torque=0.31), dtype=dtype)
+    drive = make_plant(*weight, CoulombFriction(side="load", torque=0.31), dtype=dtype)
     # the motor holds too, and with it the load sees its weight alone
-    assert not trajectory(drive, 10, REST, np.full(10_000, 0.019), 1e-3, dtype).any()
-    free = trajectory(
-        plant(*weight, CoulombFriction(side="load", torque=0.29), dtype=dtype), 10, REST, [0.0] * 99, 1e-3, dtype
+    assert not simulate_plant(drive, 10, REST, np.full(10_000, 0.019), 1e-3, dtype).any()
+    free = simulate_plant(
+        make_plant(*weight, CoulombFriction(side="load", torque=0.29), dtype=dtype), 10, REST, [0.0] * 99, 1e-3, dtype
     )
     assert free[-1, 1] < 0.0
 
@@ -206,7 +206,7 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
     stiffness, level, inertia, start = 2.0, 0.05, 0.05, 0.33
     frictions = (CoulombFriction(side="motor", torque=level), CoulombFriction(side="load", torque=10.0))
     drive = as_arrays(Plant(TwoInertia(inertia, 0.0, 1.0, 0.0, 2.0), LinearShaft(stiffness), frictions), dtype)
-    states = trajectory(drive, 10, REST | {"motor_position": start}, np.zeros(10_000), 1e-3, dtype)
+    states = simulate_plant(drive, 10, REST | {"motor_position": start}, np.zeros(10_000), 1e-3, dtype)
     motor, load = states[:, 0], states[:, 1]
     assert not load.any()
     turning = [start]
@@ -222,15 +222,15 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
 
 def test_the_gain_of_the_input_is_that_of_small_ones():
     chain = make_effects({name: numbers for name, numbers in VALUES.items() if name.startswith("actuator.")})
-    assert block(*chain).input_gain == pytest.approx(1.1 * 0.02 / 0.01)
-    assert block().input_gain == 1.0
+    assert make_block(*chain).input_gain == pytest.approx(1.1 * 0.02 / 0.01)
+    assert make_block().input_gain == 1.0
 
 
 @pytest.mark.parametrize("samples", [0.0, 0.3, 1.0, 2.7, 16.0])
 def test_a_delayed_input_is_the_input_shifted(samples):
     period, inputs = 2e-3, np.random.default_rng(0).standard_normal(40)
     delay = samples * period
-    drive = block(make_effect("actuator.delay", delay=delay))
+    drive = make_block(make_effect("actuator.delay", delay=delay))
     states, quarters = (drive.effects[0].init(),), 0.25 * period * np.arange(4)
     for k, torque in enumerate(inputs):
         states, arriving = drive.receive(states, torque, period)
@@ -281,7 +281,7 @@ def test_other_packages_add_effects_through_entry_points(install):
     spring = make_effect("motor.torsion_spring", spring_stiffness=0.8)
     assert spring.name == "motor.torsion_spring"
     # omega = 4 rad/s
-    states = trajectory(block(spring), 10, REST | {"motor_position": 0.5}, np.zeros(1000), 1e-3)
+    states = simulate_plant(make_block(spring), 10, REST | {"motor_position": 0.5}, np.zeros(1000), 1e-3)
     np.testing.assert_allclose(states[:, 0], 0.5 * np.cos(4e-3 * np.arange(1, 1001)), atol=1e-7)
 
 
@@ -415,11 +415,11 @@ def test_memory_moves_with_the_positions_to_second_order():
         return [v, (0.1 - 2.0 * stretch) / 0.05, v - 3.0 * stretch]
 
     expected = solve_ivp(rates, (0.0, 2.0), [0.2, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:2, -1]
-    drive = block(Maxwell(side="motor", torque=2.0, rate=3.0))
+    drive = make_block(Maxwell(side="motor", torque=2.0, rate=3.0))
     errors = []
     for samples in (100, 200, 400):
         start = REST | {"motor_position": 0.2}
-        end = trajectory(drive, 1, start, np.full(samples, 0.1), 2.0 / samples)[-1]
+        end = simulate_plant(drive, 1, start, np.full(samples, 0.1), 2.0 / samples)[-1]
         errors.append(np.abs(end - expected).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
     assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)

@@ -60,7 +60,7 @@ def test_chirp_against_scipy_and_steady_afterwards():
 
 
 @pytest.fixture(scope="module")
-def bits():
+def long_bits():
     """That repeat only after the run: each tells its own index."""
     return sample(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(60_000))
 
@@ -68,11 +68,11 @@ def bits():
 @DTYPES
 @PERIODS
 @pytest.mark.parametrize("samples_per_hold", [1, 7, 50])
-def test_levels_change_at_the_sample_of_the_edge(bits, dtype, period, samples_per_hold):
+def test_levels_change_at_the_sample_of_the_edge(long_bits, dtype, period, samples_per_hold):
     """Whatever the precision rounds to, over a minute of samples."""
-    expected = bits[np.arange(bits.size) // samples_per_hold]
+    expected = long_bits[np.arange(long_bits.size) // samples_per_hold]
     prbs = Prbs(amplitude=1.0, hold=samples_per_hold * period, order=16)
-    np.testing.assert_array_equal(sample(prbs, sample_times(bits.size, period, dtype), dtype), expected)
+    np.testing.assert_array_equal(sample(prbs, sample_times(long_bits.size, period, dtype), dtype), expected)
 
 
 @pytest.mark.parametrize("order", [2, 5, 10])

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drive_reference import HOLD, LAWS, SIGMOID, START, TORQUES, plant, reference, trajectory
+from drive_reference import HOLD, LAWS, SIGMOID, START, TORQUES, integrate_reference, make_plant, simulate_plant
 from hypothesis import given, settings, strategies as st
 
 from jaxbl.drive import DRIVES, Initial, LinearShaft, Plant, Rigid, SigmoidBacklash, TwoInertia, as_arrays, make_effect
@@ -18,8 +18,8 @@ FREE = PAPER | {"motor_viscous": 0.0, "load_viscous": 0.0}
 @pytest.mark.parametrize("law", LAWS)
 def test_second_order_against_scipy(law):
     ours, theirs = LAWS[law]
-    expected = reference(theirs)
-    coarse, fine = (np.abs(trajectory(plant(law=ours), substeps) - expected).max() for substeps in (64, 1024))
+    expected = integrate_reference(theirs)
+    coarse, fine = (np.abs(simulate_plant(make_plant(law=ours), substeps) - expected).max() for substeps in (64, 1024))
     # the hard gap is only piecewise smooth: of second order in the mean
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.1 if law == "dead_zone" else 5e-3)
     assert fine < 1e-6
@@ -28,12 +28,14 @@ def test_second_order_against_scipy(law):
 def test_the_papers_drive_at_the_default_step():
     """Positions to 1e-8 rad over a period of the paper's input, held for a tenth of a second."""
     torques = 0.1 * np.sin(2.0 * np.pi * 0.16 * 0.1 * np.arange(62))
-    drive = plant(law=SigmoidBacklash(stiffness=1.0, dead_zone=0.02, slope=20.0), **PAPER)
-    expected = reference(lambda z: z - 0.08 * np.tanh(10.0 * z), drive=PAPER, start=REST, torques=torques, hold=0.1)
+    drive = make_plant(law=SigmoidBacklash(stiffness=1.0, dead_zone=0.02, slope=20.0), **PAPER)
+    expected = integrate_reference(
+        lambda z: z - 0.08 * np.tanh(10.0 * z), drive=PAPER, start=REST, torques=torques, hold=0.1
+    )
     assert np.abs(expected[:, 0]).max() > 0.1
-    np.testing.assert_allclose(trajectory(drive, 1000, REST, torques, 0.1)[:, :2], expected[:, :2], atol=1e-8)
+    np.testing.assert_allclose(simulate_plant(drive, 1000, REST, torques, 0.1)[:, :2], expected[:, :2], atol=1e-8)
     # and without a single substep, an order above the noise of a good encoder
-    np.testing.assert_allclose(trajectory(drive, 100, REST, torques, 0.1)[:, :2], expected[:, :2], atol=1e-6)
+    np.testing.assert_allclose(simulate_plant(drive, 100, REST, torques, 0.1)[:, :2], expected[:, :2], atol=1e-6)
 
 
 def potential(law, z):
@@ -50,9 +52,9 @@ def potential(law, z):
 def test_energy_drifts_less_than_a_millionth_in_20_s(law, twist, eccentric):
     """On the paper's inertias at the default step, without friction and input, relative to the energy above the minimum."""
     error = {"amplitude": 0.2, "harmonic": 40.0, "phase": 0.5} if eccentric else {"amplitude": 0.0, "harmonic": 1.0}
-    drive = plant(make_effect("transmission.eccentricity", **error), law=LAWS[law][0], **FREE)
+    drive = make_plant(make_effect("transmission.eccentricity", **error), law=LAWS[law][0], **FREE)
     start = REST | {"motor_position": twist, "load_velocity": 0.05}
-    states = np.vstack([[twist, 0.0, 0.0, 0.05], trajectory(drive, 10, start, np.zeros(20_000), 1e-3)])
+    states = np.vstack([[twist, 0.0, 0.0, 0.05], simulate_plant(drive, 10, start, np.zeros(20_000), 1e-3)])
     motor, load, motor_velocity, load_velocity = states.T
     kinetic = 0.5 * FREE["motor_inertia"] * motor_velocity**2 + 0.5 * FREE["load_inertia"] * load_velocity**2
     z = motor - FREE["gear_ratio"] * load + error["amplitude"] * np.sin(error["harmonic"] * load + error.get("phase", 0.0))
@@ -74,7 +76,7 @@ def advance(drive, state, step=1e-3, torque=0.0):
     return _advance(drive, state, *(jnp.asarray(value) for value in (torque, 0.3, step)))
 
 
-FREE_DRIVES = {name: plant(law=law, **FREE) for name, (law, _) in LAWS.items()}
+FREE_DRIVES = {name: make_plant(law=law, **FREE) for name, (law, _) in LAWS.items()}
 
 
 @settings(deadline=None, max_examples=50)
@@ -99,7 +101,7 @@ def conservative_drive():
         "transmission.eccentricity": {"amplitude": 0.05, "harmonic": 3.0},
         "transmission.hardening": {"cubic_stiffness": 20.0},
     }
-    return plant(*(make_effect(name, **numbers) for name, numbers in effects.items()), **PAPER)
+    return make_plant(*(make_effect(name, **numbers) for name, numbers in effects.items()), **PAPER)
 
 
 @settings(deadline=None, max_examples=50)
@@ -108,18 +110,18 @@ def test_the_scheme_is_symmetric_in_time(conservative_drive, initial, torque):
     """A step back undoes a step: this is what keeps the energy."""
     drive = conservative_drive
     before = drive.init(as_arrays(initial, jnp.float64))
-    there = advance(drive, before, 1e-2, torque)
-    back = advance(drive, there, -1e-2, torque)
-    np.testing.assert_allclose(jax.tree.leaves(back), jax.tree.leaves(before), atol=1e-8)
+    forward = advance(drive, before, 1e-2, torque)
+    backward = advance(drive, forward, -1e-2, torque)
+    np.testing.assert_allclose(jax.tree.leaves(backward), jax.tree.leaves(before), atol=1e-8)
 
 
 def test_a_linear_shaft_against_the_closed_form():
     """Free drive: the centre of momentum moves on, the twist swings at sqrt(K (1 / J_e + N_0^2 / J_s))."""
     stiffness, twist = 2.0, 0.4
-    drive = plant(law=LinearShaft(stiffness), **FREE)
+    drive = make_plant(law=LinearShaft(stiffness), **FREE)
     start = REST | {"motor_position": twist, "motor_velocity": 0.5, "load_velocity": 0.1}
     time = 1e-3 * np.arange(1, 5001)
-    states = trajectory(drive, 10, start, np.zeros(5000), 1e-3)
+    states = simulate_plant(drive, 10, start, np.zeros(5000), 1e-3)
     omega = np.sqrt(stiffness * (1.0 / 0.05 + 25.0 / 7.0))
     z = twist * np.cos(omega * time)  # 0.5 = N_0 0.1: no twist rate at the start
     weighted = 5.0 * 0.05 * (twist + 0.5 * time) + 7.0 * 0.1 * time
@@ -132,7 +134,7 @@ def test_effects_and_drive_parameters_are_differentiable():
     """Forward derivatives of the whole motion, which the fits need, against differences."""
 
     def end(stiffness, drag):
-        drive = plant(make_effect("load.quadratic_drag", drag=0.05), law=LinearShaft(3.0))
+        drive = make_plant(make_effect("load.quadratic_drag", drag=0.05), law=LinearShaft(3.0))
         drive = eqx.tree_at(lambda p: (p.transmission.stiffness, p.effects[0].drag), drive, (stiffness, drag))
         return _end(drive)
 
@@ -140,14 +142,16 @@ def test_effects_and_drive_parameters_are_differentiable():
     for i, step in enumerate((1e-4, 1e-5)):
         direction = tuple(jnp.asarray(float(i == j)) for j in range(2))
         _, derivative = jax.jvp(end, values, direction)
-        ahead, behind = (end(*(x + sign * step * d for x, d in zip(values, direction, strict=True))) for sign in (1.0, -1.0))
-        assert float(derivative) == pytest.approx(float(ahead - behind) / (2.0 * step), rel=1e-6)
+        end_above, end_below = (
+            end(*(x + sign * step * d for x, d in zip(values, direction, strict=True))) for sign in (1.0, -1.0)
+        )
+        assert float(derivative) == pytest.approx(float(end_above - end_below) / (2.0 * step), rel=1e-6)
         assert abs(derivative) > 1e-3
 
 
 def test_a_batch_of_drives_moves_as_each_alone():
     frictions = jnp.asarray([0.0, 0.05, 0.2])
-    drive = plant(make_effect("motor.coulomb_friction", torque=0.0))
+    drive = make_plant(make_effect("motor.coulomb_friction", torque=0.0))
 
     def end(level):
         return _end(eqx.tree_at(lambda p: p.effects[0].torque, drive, level))
@@ -186,7 +190,7 @@ def test_what_the_observers_know_of_a_drive():
 
 def test_initial_state_has_the_sides_of_the_drive():
     initial = as_arrays(Initial(motor_position=1.0, motor_velocity=2.0, load_position=3.0, load_velocity=4.0), jnp.float64)
-    two = plant(make_effect("actuator.lag", time_constant=0.1)).init(initial)
+    two = make_plant(make_effect("actuator.lag", time_constant=0.1)).init(initial)
     assert (two.position, two.velocity, two.effects) == ({"motor": 1.0, "load": 3.0}, {"motor": 2.0, "load": 4.0}, ((0.0,),))
     rigid = Plant(Rigid(0.05, 0.15), None).init(initial)
     assert (rigid.position, rigid.velocity) == ({"motor": 1.0}, {"motor": 2.0})

@@ -17,14 +17,14 @@ _CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctype
 COMPILERS = [pytest.param(compiler, marks=pytest.mark.program(compiler)) for compiler in ("gcc", "clang")]
 
 
-def ran(*command, cwd=None, **options):
+def run_program(*command, cwd=None, **options):
     """Run a program; what it says is shown where it fails."""
     done = subprocess.run(list(map(str, command)), cwd=cwd, capture_output=True, text=True, check=False, **options)
     assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
     return done
 
 
-def harness(summary, header=True):
+def write_harness(summary, header=True):
     """C that runs many samples, with outputs as rows of real numbers."""
     name, real = summary["name"], summary["precision"]
     inputs, outputs, first = (len(summary[key]) for key in ("inputs", "outputs", "first"))
@@ -54,9 +54,9 @@ class Native:
         self.summary = read_json(folder / "export.json")
         name = self.summary["name"]
         build = Path(tempfile.mkdtemp(dir=folder))
-        (build / "harness.c").write_text(harness(self.summary))
+        (build / "harness.c").write_text(write_harness(self.summary))
         objects = ["-I", folder, folder / f"{name}.c", build / "harness.c"]
-        ran(compiler, *STRICT, *flags, "-fPIC", "-shared", *objects, "-o", build / "code.so", "-lm")
+        run_program(compiler, *STRICT, *flags, "-fPIC", "-shared", *objects, "-o", build / "code.so", "-lm")
         self._library = ctypes.CDLL(str(build / "code.so"))
         self._library.size_of_state.restype = ctypes.c_size_t
         self.dtype = np.dtype(np.float32 if self.summary["precision"] == "float" else np.float64)
@@ -78,7 +78,7 @@ class Native:
         return out
 
 
-def samples(count, sides, period=1e-3, seed=0):
+def draw_samples(count, sides, period=1e-3, seed=0):
     """Inputs (samples, 1 + sides): a torque and positions with noise, as of a drive that swings through its gap."""
     time, noise = np.arange(count) * period, np.random.default_rng(seed)
     motor = 0.4 * np.sin(9.0 * time) + 0.2 * np.sin(23.0 * time) + 1e-4 * noise.standard_normal(count)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, ran, samples
+from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, draw_samples, run_program
 from small_study import small_study
 from strict import Strict
 
@@ -36,7 +36,7 @@ def export_native(tmp_path, data, precision="double", **flags):
 
 
 @pytest.fixture(scope="module")
-def code(tmp_path_factory):
+def exported_code(tmp_path_factory):
     """Folder of the code of a kind of observer in a precision, and the code compiled without optimisation."""
 
     @functools.cache
@@ -55,8 +55,8 @@ def outputs(native, inputs):
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-O3"])
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_all_compilers_and_levels_give_the_same_bits(code, compiler, level, precision):
-    inputs, (folder, plain) = samples(3000, 2), code(precision)
+def test_all_compilers_and_levels_give_the_same_bits(exported_code, compiler, level, precision):
+    inputs, (folder, plain) = draw_samples(3000, 2), exported_code(precision)
     first = outputs(plain, inputs)
     result = outputs(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
     assert np.isfinite(result).all()
@@ -76,18 +76,18 @@ def strictly(data, precision, inputs):
 @pytest.mark.program("gcc")
 @pytest.mark.parametrize("kind", OBSERVERS)
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_every_kind_is_the_traced_step_bit_for_bit(code, kind, precision):
-    inputs = samples(400, 2)
-    _, native = code(precision, kind)
+def test_every_kind_is_the_traced_step_bit_for_bit(exported_code, kind, precision):
+    inputs = draw_samples(400, 2)
+    _, native = exported_code(precision, kind)
     assert native.size == native.summary["state_bytes"]
     actual, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
     assert (bits(actual) == bits(expected)).all()
 
 
 @pytest.mark.program("gcc")
-def test_many_steps_are_the_traced_step_bit_for_bit(code, repeats):
-    inputs = samples(repeats(20_000, 1_000_000), 2)
-    _, native = code("double")
+def test_many_steps_are_the_traced_step_bit_for_bit(exported_code, repeats):
+    inputs = draw_samples(repeats(20_000, 1_000_000), 2)
+    _, native = exported_code("double")
     assert (bits(outputs(native, inputs)) == bits(strictly(study(), "double", inputs))).all()
 
 
@@ -104,7 +104,7 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
     else:
         data["transmission"] = {"law": law, "stiffness": 1.0} | numbers.get(law, {})
     sides = ("motor",) if law is None else ("motor", "load")
-    inputs = samples(4000, len(sides))
+    inputs = draw_samples(4000, len(sides))
     native = export_native(tmp_path, data)
     actual = outputs(native, inputs)
     with jax.enable_x64(True):
@@ -128,10 +128,10 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
 @pytest.mark.program("gcc")
 def test_the_example_filter_reads_and_writes_csv(tmp_path):
     jaxbl.export(study(), tmp_path, name="drive")
-    ran("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)
-    inputs = samples(200, 2)
+    run_program("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)
+    inputs = draw_samples(200, 2)
     rows = "\n".join(f"{i * 1e-3!r},{','.join(map(repr, row.tolist()))}" for i, row in enumerate(inputs))
-    lines = ran("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}\n").stdout.splitlines()
+    lines = run_program("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}\n").stdout.splitlines()
     native = Native(tmp_path)
     result = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
     assert lines[0].split(",")[1:] == [output["name"] for output in native.summary["outputs"]]

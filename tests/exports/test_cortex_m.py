@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from native import STRICT, UNCONTRACTED, Native, ran, samples
+from native import STRICT, UNCONTRACTED, Native, draw_samples, run_program
 from test_c import outputs, study
 
 import jaxbl
@@ -46,13 +46,13 @@ _MACHINE = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-c
 @pytest.mark.parametrize("kind", ["super_twisting", "kalman", "differentiator_3"])
 def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     jaxbl.export(study(kind), tmp_path, precision="float", name="drive")
-    inputs = samples(300, 2).astype(np.float32)
+    inputs = draw_samples(300, 2).astype(np.float32)
     rows = ", ".join("{" + ", ".join(f"{float(x)!r}f" for x in row) + "}" for row in inputs)
     (tmp_path / "board.c").write_text(_PROGRAM % {"rows": rows})
     (tmp_path / "board.ld").write_text(_SCRIPT)
     build = ("arm-none-eabi-gcc", "-std=gnu99", "-O2", *UNCONTRACTED, *_CORE, "-T", "board.ld")
-    ran(*build, "drive.c", "board.c", "-lm", "-o", "board.elf", cwd=tmp_path)
-    done = ran(*_MACHINE, "-kernel", "board.elf", cwd=tmp_path, stdin=-3, timeout=60)
+    run_program(*build, "drive.c", "board.c", "-lm", "-o", "board.elf", cwd=tmp_path)
+    done = run_program(*_MACHINE, "-kernel", "board.elf", cwd=tmp_path, stdin=-3, timeout=60)
     words = (done.stdout + done.stderr).split()
     view = np.array([int(word, 16) for word in words], np.uint32).view(np.float32).reshape(-1, 2)
     native = Native(tmp_path)
@@ -64,7 +64,7 @@ def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
 @pytest.mark.program("arm-none-eabi-gcc")
 def test_a_cortex_m4s_compiler_has_nothing_to_say(tmp_path):
     jaxbl.export(study("differentiator_5"), tmp_path, precision="float", name="drive")
-    ran("arm-none-eabi-gcc", *STRICT, *_CORE[:-1], "-c", "drive.c", "-o", "drive.o", cwd=tmp_path)
+    run_program("arm-none-eabi-gcc", *STRICT, *_CORE[:-1], "-c", "drive.c", "-o", "drive.o", cwd=tmp_path)
 
 
 CHECK = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")
@@ -78,11 +78,11 @@ def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
         # whose code differs from that in double precision by its literals
         del data["identifier"]
     jaxbl.export(data, tmp_path, precision=precision, name="drive")
-    output = ran(*CHECK, "drive.c", "drive.h", cwd=tmp_path)
+    output = run_program(*CHECK, "drive.c", "drive.h", cwd=tmp_path)
     assert output.stdout + output.stderr == ""
 
 
 @pytest.mark.program("cppcheck")
 def test_cppchecks_misra_rules_find_a_fault(tmp_path):
     (tmp_path / "wrong.c").write_text("int f(int a) { if (a) return 1; else return 2; }\n")
-    assert "misra-c2012" in ran(*CHECK, "wrong.c", cwd=tmp_path).stderr
+    assert "misra-c2012" in run_program(*CHECK, "wrong.c", cwd=tmp_path).stderr

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_values import ENCODERS, VALUES
-from native import STRICT, bits, ran
+from native import STRICT, bits, run_program
 from small_study import rigid_study, small_study
 from strict import Strict
 
@@ -278,7 +278,7 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     # the same study has the same bytes at any time: there is no time of linking in the header
     content = Path(library).read_bytes()
     assert content[int.from_bytes(content[60:64], "little") + 8 :][:4] == bytes(4)
-    ran("x86_64-w64-mingw32-gcc", "-O1", Path(__file__).parent / "run_on_windows.c", "-o", "run.exe", cwd=tmp_path)
+    run_program("x86_64-w64-mingw32-gcc", "-O1", Path(__file__).parent / "run_on_windows.c", "-o", "run.exe", cwd=tmp_path)
     torques = [5.0 * np.sin(8.0 * i * 1e-3) for i in range(500)]
     with Instance(path) as instance:
         expected = instance.begin().run(torques)
@@ -286,7 +286,7 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
             instance.step(0.5, 0.3e-3)
     arguments = library, fmi, summary["token"], summary["sample_period"], expected.shape[1]
     input_lines = "\n".join(repr(float(torque)) for torque in torques)
-    stdout = ran("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=input_lines).stdout
+    stdout = run_program("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=input_lines).stdout
     *rows, refusal = stdout.splitlines()
     assert refusal == instance.said[-1]
     actual = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
@@ -325,8 +325,8 @@ def test_parameters_are_those_of_the_study(unit_of, fmi):
 def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
     path, _ = export_unit(study("actuator.de", "actuator.la", "load.pre", transmission=GAP), tmp_path, fmi)
     torques = 3.0 * np.sin(0.2 * np.arange(60))
-    with Instance(path) as instance, Instance(path) as two:
-        instance.begin(), two.begin()
+    with Instance(path) as instance, Instance(path) as second:
+        instance.begin(), second.begin()
         instance.run(torques[:30])
         stored_state = instance.state()
         first = instance.run(torques[30:], 30)
@@ -337,17 +337,17 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
         instance.restore(stored_state)
         for i, torque in enumerate(torques[30:], 30):
             pair.append(instance.run([torque], i)[0])
-            two.run([-torque], i - 30)
+            second.run([-torque], i - 30)
         assert (np.array(pair) == first).all()
         bytes_of = instance.bytes_of(stored_state)
-        there = two.state_of(bytes_of)
-        two.restore(there)
-        assert (two.run(torques[30:], 30) == first).all()
+        there = second.state_of(bytes_of)
+        second.restore(there)
+        assert (second.run(torques[30:], 30) == first).all()
         for other in (bytes_of[:-1], bytes_of + b"x", b"x" + bytes_of[1:]):
             with pytest.raises(FMICallException):
-                two.state_of(other)
-        assert two.said[-1] == f"these {len(bytes_of)} bytes are no state of this model"
-        instance.release(stored_state), two.release(there)
+                second.state_of(other)
+        assert second.said[-1] == f"these {len(bytes_of)} bytes are no state of this model"
+        instance.release(stored_state), second.release(there)
 
 
 @COMPILED
@@ -355,16 +355,16 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
 def test_steps_are_multiples_of_the_sample_period(unit_of, fmi):
     path, _ = unit_of("moved gap", fmi)
     # of several instances of FMI 2, FMPy gives the log to the last one
-    with Instance(path) as two, Instance(path) as instance:
-        instance.begin(10.0), two.begin()
+    with Instance(path) as second, Instance(path) as instance:
+        instance.begin(10.0), second.begin()
         assert instance.get("motor.position", "load.velocity", "z") == [0.3, 0.4, 0.3 - 5.0 * 0.02]
         assert instance.time() == 10.0
-        instance.set(u=1.5), two.set(u=1.5)
+        instance.set(u=1.5), second.set(u=1.5)
         # as sums of decimal numbers give it
         instance.step(10.0, 0.1 + 0.2 - 0.29)
         for i in range(10):
-            two.step(i * 1e-3, 1e-3)
-        assert instance.outputs() == two.outputs()
+            second.step(i * 1e-3, 1e-3)
+        assert instance.outputs() == second.outputs()
         assert instance.time() == 10.01
         before = instance.outputs()
         for time, length, message in (
@@ -563,9 +563,9 @@ def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, comp
     path, _ = export_unit(study("transmission.", "load.flex"), tmp_path, fmi, precision=precision)
     zipfile.ZipFile(path).extractall(tmp_path / "there")
     sources = tmp_path / "there" / "sources"
-    ran(compiler, *STRICT, "-O2", "-c", *(file.name for file in sources.glob("*.c")), cwd=sources)
+    run_program(compiler, *STRICT, "-O2", "-c", *(file.name for file in sources.glob("*.c")), cwd=sources)
     # kinds of symbols: of data that can be written there is none
-    symbol_kinds = {line[17:18] for line in ran("nm", *sources.glob("*.o")).stdout.splitlines()}
+    symbol_kinds = {line[17:18] for line in run_program("nm", *sources.glob("*.o")).stdout.splitlines()}
     assert {"T", "r"} <= symbol_kinds
     assert not symbol_kinds & {*"dDbBC"}
 
@@ -628,12 +628,12 @@ def test_many_are_linked_into_one_program_by_a_prefix(tmp_path, fmi):
         path, _ = export_unit(STUDIES["gap"], tmp_path / name, fmi, name=name)
         zipfile.ZipFile(path).extractall(tmp_path / name)
         files = f"fmi-{fmi}.c", f"{name}.c"
-        ran("gcc", "-std=c99", f"-DFMI{fmi}_FUNCTION_PREFIX={name}_", "-c", *files, cwd=tmp_path / name / "sources")
+        run_program("gcc", "-std=c99", f"-DFMI{fmi}_FUNCTION_PREFIX={name}_", "-c", *files, cwd=tmp_path / name / "sources")
     calls = [f"{name}_fmi{fmi}GetVersion" for name in names]
     declarations = "".join(f"const char *{call}(void);\n" for call in calls)
     (tmp_path / "both.c").write_text(f"{declarations}int main(void) {{ return *{calls[0]}() - *{calls[1]}(); }}\n")
-    ran("gcc", "both.c", *tmp_path.glob("*/sources/*.o"), "-lm", "-o", "both", cwd=tmp_path)
-    ran("./both", cwd=tmp_path)
+    run_program("gcc", "both.c", *tmp_path.glob("*/sources/*.o"), "-lm", "-o", "both", cwd=tmp_path)
+    run_program("./both", cwd=tmp_path)
 
 
 @pytest.mark.program("gcc")
@@ -644,8 +644,8 @@ def test_odd_calls_do_nothing_undefined(tmp_path):
     zipfile.ZipFile(path).extractall(tmp_path)
     (tmp_path / "sources" / "odd.c").write_text(ODD_CALLS)
     checks = "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"
-    ran("gcc", "-std=c99", "-g", *checks, "odd.c", "drive.c", "-lm", "-o", "odd", cwd=tmp_path / "sources")
-    ran("./odd", cwd=tmp_path / "sources")
+    run_program("gcc", "-std=c99", "-g", *checks, "odd.c", "drive.c", "-lm", "-o", "odd", cwd=tmp_path / "sources")
+    run_program("./odd", cwd=tmp_path / "sources")
 
 
 @VERSIONS
@@ -679,8 +679,8 @@ def test_the_same_study_with_other_code_has_another_token(tmp_path, monkeypatch)
     """A law that a later version, or another package, has changed: states and descriptions of the old one do not fit."""
     before = export_unit(STUDIES["shaft"], tmp_path / "a")[1]
     monkeypatch.setattr(LinearShaft, "torque", lambda self, deflection: self.stiffness * deflection * deflection)
-    after = export_unit(STUDIES["shaft"], tmp_path / "b")[1]
-    assert before["identity"] == after["identity"] and before["token"] != after["token"]
+    changed = export_unit(STUDIES["shaft"], tmp_path / "b")[1]
+    assert before["identity"] == changed["identity"] and before["token"] != changed["token"]
 
 
 @pytest.mark.usefixtures("sources_alone")

@@ -25,13 +25,13 @@ from jaxbl.exports.to_mujoco import to_mujoco
 SHAFT = {"law": "linear_shaft", "stiffness": 1.0}
 GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
 TABLE = {"positions": [-1.0, 0.0, 2.0], "position_torques": [0.5, -0.2, 1.0]}
-SAID = [
+EFFECT_CASES = [
     ({"kind": name, **{key: list(n) if isinstance(n, tuple) else n for key, n in numbers.items()}}, SHAFT, ())
     for name, numbers in VALUES.items()
     # its bristles are relaxed at first
     if not name.endswith("stribeck_friction")
 ]
-SAID += [
+EFFECT_CASES += [
     ({"kind": "motor.tabulated", **TABLE}, SHAFT, ()),
     ({"kind": "load.asymmetric_friction", "viscous_difference": 0.0, "torque_difference": -0.3}, SHAFT, ()),
     ({"kind": "load.gravity", "torque": -0.5, "phase": 0.4}, SHAFT, ()),
@@ -55,11 +55,11 @@ def study(*effects, **tables):
 
 def compile_model(config, linear=()):
     """The model at the study's initial state, and what it has of the study."""
-    text, _, output = write_mjcf(config, linear=linear)
+    text, _, notes = write_mjcf(config, linear=linear)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    return model, data, output
+    return model, data, notes
 
 
 def name_case(case):
@@ -68,14 +68,14 @@ def name_case(case):
     return "-".join((effect["kind"], law["law"], *linear))
 
 
-@pytest.mark.parametrize("case", SAID, ids=name_case)
+@pytest.mark.parametrize("case", EFFECT_CASES, ids=name_case)
 def test_accelerations_are_those_of_the_plant(case):
     effect, law, linear = case
     if effect["kind"] == "actuator.delay":
         effect = effect | {"delay": 0.004}
     config = study(effect, transmission=law)
-    model, data, output = compile_model(config, linear)
-    (how, text) = output[f"effects.{effect['kind']}"]
+    model, data, notes = compile_model(config, linear)
+    (fidelity, text) = notes[f"effects.{effect['kind']}"]
     assert text
     plant = as_arrays(config.build().plant, jnp.float64)
     twist, load, speed, rate, inputs = (np.random.default_rng(0).uniform(-1.0, 1.0, (20, 5)) * [0.5, 2.0, 1.0, 1.0, 0.4]).T
@@ -90,7 +90,7 @@ def test_accelerations_are_those_of_the_plant(case):
             for side, (total, level) in plant.side_torques(position, velocity, states, torque, 0.0).items()
         ]
 
-    off = []
+    errors = []
     expected_rows = np.transpose(jax.vmap(accelerate)(positions, velocities, inputs))
     for i, (u, expected) in enumerate(zip(inputs, expected_rows, strict=True)):
         position, velocity = ({side: column[i] for side, column in columns.items()} for columns in (positions, velocities))
@@ -106,10 +106,10 @@ def test_accelerations_are_those_of_the_plant(case):
             mujoco.mj_initCtrlHistory(model, data, 0, None, np.full(model.actuator_history[0][0], u))
         mujoco.mj_forward(model, data)
         accelerations = [data.joint(side).qacc[0] for side in ("motor", "load")]
-        off.append(np.abs((np.array(accelerations) - expected) / (1.0 + np.abs(expected))))
-    if how != "not said":
+        errors.append(np.abs((np.array(accelerations) - expected) / (1.0 + np.abs(expected))))
+    if fidelity != "not said":
         # weak constraints take 1e-4 of what acts beside them
-        assert np.max(off) < (1e-9 if how == output["transmission"].fidelity == "exactly" else 2e-3)
+        assert np.max(errors) < (1e-9 if fidelity == notes["transmission"].fidelity == "exactly" else 2e-3)
 
 
 @pytest.mark.parametrize("kind", bench.KINDS)
@@ -127,9 +127,9 @@ def test_smooth_gap_by_chords_is_as_near_as_said():
     _, text = to_mujoco(law, parts)
     z = np.linspace(-1.0, 1.0, 4001)
     springs = sum(spring.linear * (z - np.clip(z, spring.low, spring.high)) for spring in parts.springs)
-    off = np.max(np.abs(springs - law.torque(jnp.asarray(z))))
+    error = np.max(np.abs(springs - law.torque(jnp.asarray(z))))
     part = float(text.split(" N m off")[0].split()[-1])
-    assert 0.5 * part < off < 1.05 * part
+    assert 0.5 * part < error < 1.05 * part
     assert part < 1e-3 * 4.0 * 0.03 * 2.0
 
 
@@ -141,23 +141,23 @@ def test_every_part_is_listed_with_its_path(tmp_path):
         {"kind": "encoder.offset", **ENCODERS["encoder.offset"]},
     ]
     config = study(*effects, title="rough -- new")
-    out = jaxbl.export(config, tmp_path / "out", "mjcf")
+    export = jaxbl.export(config, tmp_path / "out", "mjcf")
     content = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert out.summary.items() <= content.items()
-    written, step, output = write_mjcf(config)
-    groups = {how: set(content[how]) for how in ("exactly", "approximated", "not said")}
+    assert export.summary.items() <= content.items()
+    model_text, step, notes = write_mjcf(config)
+    groups = {fidelity: set(content[fidelity]) for fidelity in ("exactly", "approximated", "not said")}
     assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
     assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
-    gone = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
-    assert groups["not said"] == gone
-    assert set(output) == set().union(*groups.values())
+    missing = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
+    assert groups["not said"] == missing
+    assert set(notes) == set().union(*groups.values())
     assert content["time_step"] == step
-    text = (out.folder / "model.xml").read_text(encoding="utf-8")
-    assert text == written
+    text = (export.folder / "model.xml").read_text(encoding="utf-8")
+    assert text == model_text
     assert "drive.motor_inertia = 0.05 kg m²" in text
     assert "effects.motor.cogging: amplitude = 0.1 N m, harmonic = 6 1/turn" in text
-    assert all(f"Not in this model: {path}: " in text for path in gone)
-    model = mujoco.MjModel.from_xml_path(str(out.folder / "model.xml"))
+    assert all(f"Not in this model: {path}: " in text for path in missing)
+    model = mujoco.MjModel.from_xml_path(str(export.folder / "model.xml"))
     assert [model.sensor(i).name for i in range(model.nsensor)][-2:] == ["twist", "motor_torque"]
     assert model.opt.timestep == step
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
-from native import STRICT, UNCONTRACTED, ran
+from native import STRICT, UNCONTRACTED, run_program
 from small_study import multisine_study
 
 from jaxbl.cli import app, main
@@ -48,8 +48,8 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     run(config, seed=3).trace[["t", "u", "theta_e", "theta_s"]].to_csv(log, index=False)
     code = tmp_path / "code"
     command("export", tuned, "--target", "c", "--precision", "double", "--name", "axis", "--out", code, "--quiet")
-    ran("gcc", *STRICT, *UNCONTRACTED, "-O2", "axis.c", "axis_filter.c", "-lm", "-o", "axis_filter", cwd=code)
-    ran("./axis_filter", log, "filtered.csv", cwd=code)
+    run_program("gcc", *STRICT, *UNCONTRACTED, "-O2", "axis.c", "axis_filter.c", "-lm", "-o", "axis_filter", cwd=code)
+    run_program("./axis_filter", log, "filtered.csv", cwd=code)
     frame = pd.read_csv(code / "filtered.csv")
 
     with jax.enable_x64(True):

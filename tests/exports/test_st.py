@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from native import bits, samples
+from native import bits, draw_samples
 from structured_text import FunctionBlock
 from test_c import strictly, study
 
@@ -18,7 +18,7 @@ def test_every_kind_is_the_traced_step_bit_for_bit(tmp_path, kind, precision):
     jaxbl.export(study(kind), tmp_path, "st", precision=precision, name="drive")
     block = FunctionBlock((tmp_path / "drive.st").read_text())
     assert block.name.text == b"drive"
-    inputs = samples(150, 2)
+    inputs = draw_samples(150, 2)
     rows = [list(block(input=u, motor_position=y, load_position=z).values()) for u, y, z in inputs]
     expected = strictly(study(kind), precision, inputs)
     assert (bits(np.array(rows, expected.dtype)) == bits(expected)).all()

@@ -20,19 +20,19 @@ def step(values, carry, sample_input):
 
 
 @pytest.fixture
-def parts():
+def split_step():
     values = [jnp.asarray(1.0), jnp.asarray(3.0)]
     kinds = find_carry_dependences(begin, ((step, jnp.asarray(0.0)),), values)
     return kinds, split_by_lane(step, values, begin(values), jnp.asarray(0.0), kinds, kinds)
 
 
-def test_kinds_of_a_carry(parts):
+def test_kinds_of_a_carry(split_step):
     names = sorted(begin([jnp.asarray(1.0)]))
-    assert [name for name, kind in zip(names, parts[0], strict=True) if kind == Dependence.LANE] == ["led", "own"]
+    assert [name for name, kind in zip(names, split_step[0], strict=True) if kind == Dependence.LANE] == ["led", "own"]
 
 
-def test_parts_make_the_whole(parts):
-    kinds, (shared, lane, of_lane) = parts
+def test_parts_make_the_whole(split_step):
+    kinds, (shared, lane, of_lane) = split_step
     assert of_lane == [kind == Dependence.LANE for kind in kinds]
     values = [jnp.asarray(0.3), jnp.asarray(-1.2)]
     carry = begin(values)
@@ -48,8 +48,8 @@ def test_parts_make_the_whole(parts):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
 
 
-def test_the_lanes_part_leaves_the_shared_work_to_the_other(parts):
-    names = {eqn.primitive.name for eqn in parts[1].lane.jaxpr.eqns}
+def test_the_lanes_part_leaves_the_shared_work_to_the_other(split_step):
+    names = {eqn.primitive.name for eqn in split_step[1].lane.jaxpr.eqns}
     assert "tanh" not in names
 
 

@@ -45,12 +45,12 @@ UNKNOWN = {
 
 def only(*changes):
     """Some of the changes, where a module may be imported in another place; a plant meets all three."""
-    return pytest.mark.parametrize("unknown", changes, ids=lambda change: change.__name__, indirect=True)
+    return pytest.mark.parametrize("refuse_feature", changes, ids=lambda change: change.__name__, indirect=True)
 
 
 @pytest.fixture(params=UNKNOWN, ids=lambda change: change.__name__)
-def unknown(request, monkeypatch):
-    """Makes it so; returns what is said of it."""
+def refuse_feature(request, monkeypatch):
+    """Return a function that makes the feature fail, and returns the pattern of the reason that is then given."""
     fused.warn_of_scan.cache_clear()
     single_plant._trajectory_loop.cache_clear()
     yield lambda: request.param(monkeypatch) or UNKNOWN[request.param]
@@ -73,38 +73,38 @@ def looped_run():
 
 
 @only(rename_parameters, hide_modules)
-def test_a_sweep_is_scanned(scanned_sweep, unknown, caplog):
-    output = unknown()
+def test_a_sweep_is_scanned(scanned_sweep, refuse_feature, caplog):
+    pattern = refuse_feature()
     result = jaxbl.sweep(SWEPT)
     (reason,) = result.fallback_reasons
     np.testing.assert_array_equal(result.frame[NAME], scanned_sweep[NAME])
-    assert re.fullmatch(output, reason)
+    assert re.fullmatch(pattern, reason)
     with pytest.raises(
-        jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {output}; use --backend scan"
+        jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {pattern}; use --backend scan"
     ):
         jaxbl.sweep(SWEPT, backend="fused")
     assert not caplog.messages
 
 
 @only(refuse_assembly, hide_modules)
-def test_a_run_is_scanned(looped_run, unknown, caplog):
-    output = unknown()
+def test_a_run_is_scanned(looped_run, refuse_feature, caplog):
+    pattern = refuse_feature()
     trials = [jaxbl.run(STUDY, every=7) for _ in range(2)]
     for trial in trials:
         assert trial.summary["metrics"][NAME] == pytest.approx(looped_run.summary["metrics"][NAME], rel=1e-6)
         np.testing.assert_allclose(trial.trace["theta_e"], looped_run.trace["theta_e"], rtol=1e-6, atol=1e-9)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCAN_MESSAGE % output, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % pattern, line)
 
 
-def test_a_plant_is_scanned(unknown, caplog):
+def test_a_plant_is_scanned(refuse_feature, caplog):
     with jax.enable_x64(True):
         experiment = prepare(jaxbl.read_config(STUDY))
         start, torque = experiment.plant.init(experiment.initial), np.ones(50)
-        expected, output = single_plant.simulate_plant(experiment, start, torque), unknown()
+        expected, pattern = single_plant.simulate_plant(experiment, start, torque), refuse_feature()
         single_plant._trajectory_loop.cache_clear()
         plants = [single_plant.simulate_plant(experiment, start, torque) for _ in range(2)]
     for path in plants:
         np.testing.assert_allclose(path.position["motor"], expected.position["motor"], rtol=1e-9, atol=1e-12)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCAN_MESSAGE % output, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % pattern, line)

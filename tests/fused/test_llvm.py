@@ -12,7 +12,7 @@ NUMBER, INDEX = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), np.int
 
 
 @pytest.fixture(scope="module")
-def loop():
+def sum_loop():
     """Sums of a factor times the samples, and the sums so far."""
 
     def sample(factor, total, first, index, value):
@@ -40,11 +40,18 @@ def arrays():
     }
 
 
-def test_a_loop_says_what_it_takes(loop):
-    assert [arg.name for arg in loop.signature] == list(arrays())
-    assert [arg.extent for arg in loop.signature] == ["lanes", "lanes", "scalar", "samples", "samples", "samples and lanes"]
+def test_a_loop_says_what_it_takes(sum_loop):
+    assert [arg.name for arg in sum_loop.signature] == list(arrays())
+    assert [arg.extent for arg in sum_loop.signature] == [
+        "lanes",
+        "lanes",
+        "scalar",
+        "samples",
+        "samples",
+        "samples and lanes",
+    ]
     inputs = arrays()
-    loop(list(inputs.values()), 5, 0, 2)
+    sum_loop(list(inputs.values()), 5, 0, 2)
     np.testing.assert_array_equal(inputs["carry 0"], [110.0, 120.0])
     np.testing.assert_array_equal(inputs["sample output 0"].reshape(5, 2)[2], [33.0, 36.0])
 
@@ -59,34 +66,34 @@ WRONG = {
 
 @pytest.mark.parametrize("name", arrays())
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_does_not_fit_is_refused(loop, name, wrong):
+def test_what_does_not_fit_is_refused(sum_loop, name, wrong):
     inputs = arrays()
     inputs[name] = WRONG[wrong](inputs[name])
     with pytest.raises(ValueError, match=rf"^{name} of a loop needs \d+ contiguous numbers of type"):
-        loop(list(inputs.values()), 5, 0, 2)
+        sum_loop(list(inputs.values()), 5, 0, 2)
 
 
-def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(loop):
-    loop_arrays = LoopArrays(loop.signature, list(arrays().values()), 5, 2)
+def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(sum_loop):
+    loop_arrays = LoopArrays(sum_loop.signature, list(arrays().values()), 5, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
-        loop(loop_arrays, 6, 0, 2)
+        sum_loop(loop_arrays, 6, 0, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
-        loop(loop_arrays, 5, 0, 4)
+        sum_loop(loop_arrays, 5, 0, 4)
     with pytest.raises(ValueError, match="needs 6 arrays, not 5"):
-        loop(list(arrays().values())[:-1], 5, 0, 2)
+        sum_loop(list(arrays().values())[:-1], 5, 0, 2)
 
 
-def test_rows_of_one_array_stand_for_several(loop):
+def test_rows_of_one_array_stand_for_several(sum_loop):
     inputs = arrays()
     pair = np.array([inputs["value 0"], inputs["carry 0"]])
     remainder = list(inputs.values())[2:]
-    loop([ArrayRows(pair), *remainder], 5, 0, 2)
+    sum_loop([ArrayRows(pair), *remainder], 5, 0, 2)
     np.testing.assert_array_equal(pair, [[1.0, 2.0], [110.0, 120.0]])
     with pytest.raises(ValueError, match="sample input 0 of a loop needs 5 contiguous numbers of type int32"):
-        loop([ArrayRows(pair), remainder[0], ArrayRows(np.zeros((2, 5))), remainder[3]], 5, 0, 2)
+        sum_loop([ArrayRows(pair), remainder[0], ArrayRows(np.zeros((2, 5))), remainder[3]], 5, 0, 2)
     with pytest.raises(ValueError, match="constant 0 of a loop is no row of one array"):
-        loop([ArrayRows(np.zeros((3, 2))), *remainder[1:]], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((3, 2))), *remainder[1:]], 5, 0, 2)
     with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
-        loop([ArrayRows(np.zeros((4, 2))[::2]), *remainder], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((4, 2))[::2]), *remainder], 5, 0, 2)
     with pytest.raises(ValueError, match="needs 6 arrays, not 7"):
-        loop([ArrayRows(np.zeros((3, 2))), *remainder], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((3, 2))), *remainder], 5, 0, 2)

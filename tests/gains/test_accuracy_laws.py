@@ -259,7 +259,7 @@ def test_wrong_keys_of_a_figure(case):
 
 
 @pytest.fixture(scope="module")
-def real():
+def swept_laws():
     """The shipped study made small: one inertia with a cogging torque that the observer does not know."""
     axes = [
         listed_axis(WORDS, "explicit", "implicit"),
@@ -284,8 +284,8 @@ def real():
     return sweep(data)
 
 
-def test_slopes_of_a_real_sweep_are_theory_s(real):
-    laws = {(fitted_law.figure, fitted_law.series[WORDS]): fitted_law for fitted_law in jaxbl.accuracy_laws(real)}
+def test_slopes_of_a_real_sweep_are_theory_s(swept_laws):
+    laws = {(fitted_law.figure, fitted_law.series[WORDS]): fitted_law for fitted_law in jaxbl.accuracy_laws(swept_laws)}
     for key, fitted_law in laws.items():
         if key == (0, "implicit"):
             assert fitted_law.fit is None
@@ -295,8 +295,8 @@ def test_slopes_of_a_real_sweep_are_theory_s(real):
             assert fitted_law.standard_error < 0.05
 
 
-def test_report_of_laws(real, tmp_path):
-    lines = write_sweep_report(real, tmp_path)
+def test_report_of_laws(swept_laws, tmp_path):
+    lines = write_sweep_report(swept_laws, tmp_path)
     assert "Accuracy laws: 7 of 8 have a slope within 0.1 of theory." in lines
     assert any("motor.position_rmse over run.sample_period (implicit, encoders.noise = 0): no power law" in x for x in lines)
     laws = json.loads((tmp_path / "laws.json").read_text())

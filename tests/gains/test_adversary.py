@@ -75,21 +75,21 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_a_bound_that_is_too_small_is_found_out(system):
     proof, result = search(system)
-    wrong = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / result.worst))
-    refuted = search_violations(system, system.noise, 0.0, wrong, wrong.bounds[-1], 1)
+    low_proof = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / result.worst))
+    refuted = search_violations(system, system.noise, 0.0, low_proof, low_proof.bounds[-1], 1)
     assert refuted.violations > 0
 
 
 def test_runs_from_the_start_are_held_against_the_bound_of_each_sample():
     system = ErrorSystem(True, 1.5, 1.1, 1.0)
     proof = prove(system, 1.0, 50.0)
-    settled = 1.05 * proof.bounds[-1]
-    result = search_violations(system, 1.0, 50.0, proof, settled, 1)
-    reached = int((proof.bounds <= settled).argmax())
-    assert 0.85 * reached <= result.latest + 1 <= reached
+    settled_bound = 1.05 * proof.bounds[-1]
+    result = search_violations(system, 1.0, 50.0, proof, settled_bound, 1)
+    settling_sample = int((proof.bounds <= settled_bound).argmax())
+    assert 0.85 * settling_sample <= result.latest + 1 <= settling_sample
     # half the time: the worst errors do not fall so fast
-    early = proof._replace(bounds=proof.bounds[::2])
-    assert search_violations(system, 1.0, 50.0, early, settled, 1).violations > 0
+    sparse_proof = proof._replace(bounds=proof.bounds[::2])
+    assert search_violations(system, 1.0, 50.0, sparse_proof, settled_bound, 1).violations > 0
 
 
 def test_the_same_seed_finds_the_same():

@@ -22,14 +22,14 @@ STUDY = read_config(
 
 
 @pytest.fixture(scope="module")
-def frame():
+def sweep_frame():
     return sweep(STUDY).frame
 
 
-def test_runs_below_their_bound_are_counted_and_explained(frame):
-    below = frame[frame["motor.converged"] & (frame["motor.margin_alpha"] <= 1.0)]
-    assert 2 <= len(below) < len(frame)
-    summary = summarise_converged_below(STUDY, "motor", frame)
+def test_runs_below_their_bound_are_counted_and_explained(sweep_frame):
+    below = sweep_frame[sweep_frame["motor.converged"] & (sweep_frame["motor.margin_alpha"] <= 1.0)]
+    assert 2 <= len(below) < len(sweep_frame)
+    summary = summarise_converged_below(STUDY, "motor", sweep_frame)
     assert summary["converged_runs"] == summary["runs"] == len(below)
     shares, areas = [], []
     for _, row in below.iterrows():
@@ -48,8 +48,8 @@ def test_runs_below_their_bound_are_counted_and_explained(frame):
     assert axis_values[ALPHA] == 1.8
 
 
-def test_none_below(frame):
-    assert summarise_converged_below(STUDY, "motor", frame[frame[ALPHA] == 4.0]) is None
+def test_none_below(sweep_frame):
+    assert summarise_converged_below(STUDY, "motor", sweep_frame[sweep_frame[ALPHA] == 4.0]) is None
 
 
 def test_the_disturbance_is_what_the_model_lacks():

@@ -45,19 +45,21 @@ def _proofs_once(compiled_once):
 
 
 @pytest.fixture(scope="module")
-def proven():
+def certified_gains():
     return certify(*GAINS, **BOUNDS)
 
 
-def test_bounds_lie_between_what_is_found_and_little_more(proven):
-    worst = proven["search"]["worst"]
-    assert proven["certified"] and proven["why_none"] is None
-    assert worst < proven["final_accuracy"] < proven["accuracy"] <= 1.0501 * proven["final_accuracy"]
-    assert proven["search"]["ratio"] == pytest.approx(proven["final_accuracy"] / worst)
-    assert proven["search"]["ratio"] < 1.1
-    assert proven["search"]["reaching_time"] <= proven["reaching_time"]
-    assert proven["final_accuracy"] > least_worst_error(5e-5, 5.0, 1e-3)
-    assert proven["assumptions"] == {"discretisation": "implicit", "position_error": 5e-5} | {
+def test_bounds_lie_between_what_is_found_and_little_more(certified_gains):
+    worst = certified_gains["search"]["worst"]
+    assert certified_gains["certified"] and certified_gains["why_none"] is None
+    assert (
+        worst < certified_gains["final_accuracy"] < certified_gains["accuracy"] <= 1.0501 * certified_gains["final_accuracy"]
+    )
+    assert certified_gains["search"]["ratio"] == pytest.approx(certified_gains["final_accuracy"] / worst)
+    assert certified_gains["search"]["ratio"] < 1.1
+    assert certified_gains["search"]["reaching_time"] <= certified_gains["reaching_time"]
+    assert certified_gains["final_accuracy"] > least_worst_error(5e-5, 5.0, 1e-3)
+    assert certified_gains["assumptions"] == {"discretisation": "implicit", "position_error": 5e-5} | {
         name: BOUNDS[name] for name in ("noise", "f_plus", "period", "velocity_error")
     }
 
@@ -79,23 +81,23 @@ def test_other_units_of_time_and_angle_change_nothing(discretisation):
     assert ("acceleration" in first["assumptions"]) == (discretisation == "explicit")
 
 
-def test_worse_assumptions_prove_less(proven):
+def test_worse_assumptions_prove_less(certified_gains):
     for name, value in (("noise", 1e-4), ("f_plus", 6.0)):
-        assert certify(*GAINS, **BOUNDS | {name: value})["final_accuracy"] > 1.05 * proven["final_accuracy"]
+        assert certify(*GAINS, **BOUNDS | {name: value})["final_accuracy"] > 1.05 * certified_gains["final_accuracy"]
     slower = certify(*GAINS, **BOUNDS | {"velocity_error": 0.3})
-    assert slower["reaching_time"] > 1.5 * proven["reaching_time"]
-    assert slower["final_accuracy"] == pytest.approx(proven["final_accuracy"], rel=0.02)
+    assert slower["reaching_time"] > 1.5 * certified_gains["reaching_time"]
+    assert slower["final_accuracy"] == pytest.approx(certified_gains["final_accuracy"], rel=0.02)
 
 
-def test_limits_are_met_or_not(proven):
-    final, time = proven["final_accuracy"], proven["reaching_time"]
+def test_limits_are_met_or_not(certified_gains):
+    final, time = certified_gains["final_accuracy"], certified_gains["reaching_time"]
     wide = certify(*GAINS, **BOUNDS, accuracy=1.5 * final, reaching_time=time)
     assert wide["accuracy"] == 1.5 * final
     # a wider bound holds earlier
     assert wide["reaching_time"] < time
     assert wide["limits"] == {"accuracy": {"asked": 1.5 * final, "met": True}, "reaching_time": {"asked": time, "met": True}}
     narrow = certify(*GAINS, **BOUNDS, accuracy=0.9 * final, reaching_time=0.5 * time)
-    assert narrow["accuracy"] == pytest.approx(proven["accuracy"])
+    assert narrow["accuracy"] == pytest.approx(certified_gains["accuracy"])
     assert not any(limit["met"] for limit in narrow["limits"].values())
 
 
@@ -105,29 +107,30 @@ def test_the_final_accuracy_itself_can_be_asked_for(f_plus, period):
     gains = 2.5 * math.sqrt(f_plus), 3.0 * f_plus
     bounds = {"noise": 0.5 * f_plus * period**2, "f_plus": f_plus, "period": period, "velocity_error": 2.0 * f_plus * period}
     free = certify(*gains, **bounds, runs=1)
-    asked = certify(*gains, **bounds, runs=1, accuracy=free["final_accuracy"])
-    assert asked["accuracy"] == free["final_accuracy"]
-    assert asked["limits"]["accuracy"]["met"]
-    assert asked["reaching_time"] >= free["reaching_time"] > 0.0
+    second = certify(*gains, **bounds, runs=1, accuracy=free["final_accuracy"])
+    assert second["accuracy"] == free["final_accuracy"]
+    assert second["limits"]["accuracy"]["met"]
+    assert second["reaching_time"] >= free["reaching_time"] > 0.0
     curve = free["curve"]
-    assert np.interp(asked["reaching_time"], curve["time"], curve["bound"]) == asked["accuracy"]
+    assert np.interp(second["reaching_time"], curve["time"], curve["bound"]) == second["accuracy"]
 
 
 @pytest.mark.parametrize("change", [1.0, 1.00004, 0.99996])
-def test_what_is_printed_is_proven(proven, change):
+def test_what_is_printed_is_proven(certified_gains, change):
     """Bounds are rounded up, and what they assume is rounded down."""
     scaled = ("accuracy", "final_accuracy", "reaching_time")
-    certificate_data = proven | {name: change * proven[name] for name in scaled}
+    certificate_data = certified_gains | {name: change * certified_gains[name] for name in scaled}
     arguments = {
-        name: change * proven["assumptions"][name] for name in ("noise", "f_plus", "velocity_error", "position_error")
+        name: change * certified_gains["assumptions"][name]
+        for name in ("noise", "f_plus", "velocity_error", "position_error")
     }
-    certificate_data["assumptions"] = proven["assumptions"] | arguments
+    certificate_data["assumptions"] = certified_gains["assumptions"] | arguments
     summary = {"certificates": {"motor": certificate_data}, "passed_over": {"motor": 0}}
     line = certificate_lines(summary)[0]
     accuracy, time, final, noise, f_plus, period, velocity, position = map(
         float, re.findall(r"[\d.]+(?:e-\d+)?(?= |\.$)", line)
     )
-    assert period == proven["assumptions"]["period"]
+    assert period == certified_gains["assumptions"]["period"]
     table = certificate_tables(summary)[0]
     assert table.columns == ["", "motor"]
     row = dict(table.rows)
@@ -185,28 +188,28 @@ def test_a_bound_that_runs_exceed_is_refused(monkeypatch):
     assert certificate_data["why_none"].startswith("refused: ")
 
 
-def test_single_precision_of_the_caller_does_not_matter(proven):
+def test_single_precision_of_the_caller_does_not_matter(certified_gains):
     with jax.enable_x64(False):
-        assert certify(*GAINS, **BOUNDS) == proven
+        assert certify(*GAINS, **BOUNDS) == certified_gains
 
 
 TABLE = {"num": 3, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 10.0}, "lambda_ratio": {"start": 0.8, "stop": 6.0}}
 
 
-def study(**asked):
+def study(**certificate_table):
     changes = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
                "encoders.noise": 1e-5, "encoders.motor_resolution": 2e-5, "run.duration": 0.2}  # fmt: skip
     torque = [{"kind": "motor.constant_torque", "torque": 0.05}]
-    return rigid_study(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": asked}})
+    return rigid_study(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": certificate_table}})
 
 
 @pytest.fixture(scope="module")
-def free():
+def tuned_study():
     return tune(study())
 
 
-def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
-    tuned = free
+def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, tuned_study):
+    tuned = tuned_study
     certificate_data, gains = tuned.summary["certificates"]["motor"], tuned.summary["gains"]["motor"]
     assert certificate_data["gains"] == {name: gains[name] for name in ("lambda", "alpha")}
     arguments = certificate_data["assumptions"]
@@ -217,8 +220,8 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     lines = write_tune_report(tuned, tmp_path)
     assert any(line.startswith("motor, proven: velocity error at most ") for line in lines)
     assert any("none violates what is proven" in line for line in lines)
-    written = json.loads((tmp_path / "certificate.json").read_text())
-    assert written["sides"] == {"motor": certificate_data}
+    stored = json.loads((tmp_path / "certificate.json").read_text())
+    assert stored["sides"] == {"motor": certificate_data}
     # the runs that were certified stay below
     data = study() | {"observer": {"motor": certificate_data["gains"] | {"velocity_error": 0.1}}}
     data["run"]["duration"] = certificate_data["reaching_time"] + 0.5
@@ -228,37 +231,39 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
     assert 0.0 < error[late].max() <= certificate_data["accuracy"]
 
 
-def test_a_finished_certificate_is_read_again(tmp_path, free, monkeypatch):
+def test_a_finished_certificate_is_read_again(tmp_path, tuned_study, monkeypatch):
     tune(study(), tmp_path)
     monkeypatch.setattr(certificate, "certify", None)
-    assert tune(study(), tmp_path).summary["certificates"] == free.summary["certificates"]
+    assert tune(study(), tmp_path).summary["certificates"] == tuned_study.summary["certificates"]
     limited = tmp_path / "tune" / "certificate.json"
     limited.write_text(limited.read_text()[:-20])
     monkeypatch.undo()
-    assert tune(study(), tmp_path).summary["certificates"] == free.summary["certificates"]
+    assert tune(study(), tmp_path).summary["certificates"] == tuned_study.summary["certificates"]
 
 
-def test_gains_are_chosen_that_keep_the_limits(free):
-    limit = 0.9 * free.summary["certificates"]["motor"]["final_accuracy"]
+def test_gains_are_chosen_that_keep_the_limits(tuned_study):
+    limit = 0.9 * tuned_study.summary["certificates"]["motor"]["final_accuracy"]
     limited = tune(study(accuracy=limit))
     certificate_data = limited.summary["certificates"]["motor"]
     assert certificate_data["final_accuracy"] <= limit == certificate_data["accuracy"]
     assert limited.summary["passed_over"]["motor"] > 0
     # the best of those that do
-    better = limited.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
-    better = better[better["error"] < limited.summary["achieved"]["motor"]["velocity_rmse"]]
-    assert len(better) == limited.summary["passed_over"]["motor"]
-    for row in better.to_dict("records"):
+    better_candidates = limited.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
+    better_candidates = better_candidates[better_candidates["error"] < limited.summary["achieved"]["motor"]["velocity_rmse"]]
+    assert len(better_candidates) == limited.summary["passed_over"]["motor"]
+    for row in better_candidates.to_dict("records"):
         f_plus = max(limited.summary["f_plus"]["motor"], row["f_plus"])
         assumptions = Assumptions(**certificate_data["assumptions"] | {"f_plus": f_plus})
         assert _prove(row["lambda"], row["alpha"], assumptions, None).bounds[-1] > limit
     lines = certificate_lines(limited.summary)
-    assert any(f"the gains keep what was asked for; {len(better)} gains with less error" in line for line in lines)
+    assert any(
+        f"the gains keep what was asked for; {len(better_candidates)} gains with less error" in line for line in lines
+    )
 
 
-def test_limits_that_no_gains_keep_are_said_to_be_missed(free):
+def test_limits_that_no_gains_keep_are_said_to_be_missed(tuned_study):
     tuned = tune(study(accuracy=1e-6))
-    assert tuned.summary["gains"] == free.summary["gains"]
+    assert tuned.summary["gains"] == tuned_study.summary["gains"]
     assert tuned.summary["passed_over"] == {"motor": 0}
     lines = certificate_lines(tuned.summary)
     assert "motor, certificate: what was asked for is not proven: accuracy 1e-06 rad/s." in lines
@@ -272,14 +277,14 @@ def test_without_a_proof_there_is_no_file(tmp_path):
     assert not (tmp_path / "certificate.json").exists()
 
 
-def test_what_is_refuted_is_said_first(tmp_path, free):
-    certificate_data = free.summary["certificates"]["motor"]
+def test_what_is_refuted_is_said_first(tmp_path, tuned_study):
+    certificate_data = tuned_study.summary["certificates"]["motor"]
     certificate_data = certificate_data | {
         "certified": False,
         "why_none": "refused: 3 of 9",
         "search": certificate_data["search"] | {"violations": 3},
     }
-    tuned = dataclasses.replace(free, summary=free.summary | {"certificates": {"motor": certificate_data}})
+    tuned = dataclasses.replace(tuned_study, summary=tuned_study.summary | {"certificates": {"motor": certificate_data}})
     assert write_tune_report(tuned, tmp_path)[0] == "motor: no certificate: refused: 3 of 9."
     assert not (tmp_path / "certificate.json").exists()
 

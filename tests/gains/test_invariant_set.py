@@ -135,8 +135,8 @@ def test_reaching_time_without_noise_is_that_of_continuous_time(lambda_, alpha, 
     proof = prove(ErrorSystem(True, lambda_, alpha, 0.0), 0.0, speed, finest=0.05)
     with jax.enable_x64(True):
         time = float(convergence_time_worst(*(jnp.asarray(x) for x in (lambda_, alpha, 1.0, 0.0, speed))))
-    reached = int((proof.bounds <= 1.05 * proof.bounds[-1]).argmax())
-    assert reached == pytest.approx(time, rel=within)
+    reaching_sample = int((proof.bounds <= 1.05 * proof.bounds[-1]).argmax())
+    assert reaching_sample == pytest.approx(time, rel=within)
 
 
 def test_forward_euler_with_a_large_lambda_has_a_set():
@@ -144,8 +144,8 @@ def test_forward_euler_with_a_large_lambda_has_a_set():
     system = ErrorSystem(False, 20.0, 1.5, 0.0)
     bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
     with jax.enable_x64(True):
-        reached, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
-    assert 50.0 < reached.worst <= bound <= 1.1 * reached.worst
+        worst_errors, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+    assert 50.0 < worst_errors.worst <= bound <= 1.1 * worst_errors.worst
 
 
 @pytest.mark.parametrize("implicit", [True, False])

@@ -79,8 +79,8 @@ CONSTRAINTS = {
 
 @pytest.mark.parametrize("name", CONSTRAINTS)
 def test_a_constraint_that_forbids_less_error_binds(name):
-    how, (gain, way) = CONSTRAINTS[name]
-    limits = find_limits(build_search(bowl, **how), "motor")
+    constraint, (gain, way) = CONSTRAINTS[name]
+    limits = find_limits(build_search(bowl, **constraint), "motor")
     assert limits["binding"] == [name]
     assert [key for key, entry in limits["constraints"].items() if entry["binds"]] == [name]
     towards = limits["towards"][gain][way]

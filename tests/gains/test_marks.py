@@ -33,19 +33,19 @@ def _few_digits():
 
 
 @pytest.fixture(scope="module")
-def marks(_few_digits):
+def judged_marks(_few_digits):
     return {mark["name"]: mark for mark in judge_marks(STUDY, STUDY, Stages(STUDY, "verify"))}
 
 
-def test_gains_that_hold_the_exact_condition_need_no_explanation(marks):
-    assert marks["good"]["peak_ratio"] < 1.0
-    assert marks["good"]["on_this_disturbance"] is None
+def test_gains_that_hold_the_exact_condition_need_no_explanation(judged_marks):
+    assert judged_marks["good"]["peak_ratio"] < 1.0
+    assert judged_marks["good"]["on_this_disturbance"] is None
 
 
-def test_alpha_below_the_disturbance(marks):
+def test_alpha_below_the_disturbance(judged_marks):
     trace = run(STUDY).trace
     missing = np.abs(trace["motor.acceleration"] - (trace["u"] - 0.15 * trace["motor.velocity"]) / 0.05)
-    explanation = marks["below"]["on_this_disturbance"]
+    explanation = judged_marks["below"]["on_this_disturbance"]
     assert explanation["largest_disturbance"] == pytest.approx(missing.max())
     assert explanation["share_above_alpha"] == pytest.approx((missing > 1.9).mean())
     assert 0.05 < explanation["share_above_alpha"] < 0.5
@@ -56,8 +56,8 @@ def test_alpha_below_the_disturbance(marks):
     assert explanation["sine_cycle"] == {"least_predicted": np.inf, "least_simulated": None}
 
 
-def test_alpha_above_the_disturbance_but_too_small_a_lambda(marks):
-    mark = marks["small"]
+def test_alpha_above_the_disturbance_but_too_small_a_lambda(judged_marks):
+    mark = judged_marks["small"]
     explanation = mark["on_this_disturbance"]
     assert mark["peak_ratio"] > 3.0 and mark["converged"]
     assert explanation["share_above_alpha"] == 0.0

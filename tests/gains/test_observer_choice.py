@@ -30,7 +30,7 @@ def study(changes=None, **table):
 
 
 @pytest.fixture(scope="module")
-def chosen():
+def observer_choice():
     return tune(study(holdout=SINE, refine=2))
 
 
@@ -69,10 +69,10 @@ def test_kinds_that_noise_alone_parts_are_not_told_apart():
     assert count / 400 == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 400))
 
 
-def test_the_search_agrees_with_brute_force(chosen):
+def test_the_search_agrees_with_brute_force(observer_choice):
     """A sweep of its own over a fine grid finds no gains that are much better."""
     config = read_config(study())
-    ranking = chosen.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
+    ranking = observer_choice.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
     data = config.to_dict()
     data.pop("tune")
     data["observer"] = {"kind": "luenberger", "motor": ranking["gains"] | {"velocity_error": 0.1}}
@@ -85,11 +85,11 @@ def test_the_search_agrees_with_brute_force(chosen):
     assert 0.85 * errors.min() < ranking["error_in_search"] < 1.02 * errors.min()
 
 
-def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
+def test_held_out_errors_are_those_of_runs_with_these_gains(observer_choice):
     """Checked for every kind, on the other input and with seeds that the search has not seen."""
-    point = chosen.summary["points"][0]["sides"]["motor"]
-    assert chosen.summary["seeds"] == [0, 1]
-    assert chosen.summary["holdout"]["seeds"] == [2, 9]
+    point = observer_choice.summary["points"][0]["sides"]["motor"]
+    assert observer_choice.summary["seeds"] == [0, 1]
+    assert observer_choice.summary["holdout"]["seeds"] == [2, 9]
     logs = {}
     for kind, kind_data in point["kinds"].items():
         data = read_config(study()).to_dict()
@@ -108,17 +108,17 @@ def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
         assert kind_data["low"] <= kind_data["ratio"] <= kind_data["high"]
 
 
-def test_the_chosen_observer_can_be_included(chosen, tmp_path):
-    kind = chosen.summary["for_both_sides"]
-    assert kind == chosen.summary["points"][0]["sides"]["motor"]["best"]
-    (tmp_path / "gains.toml").write_text(observer_toml(chosen.summary), encoding="utf-8")
+def test_the_chosen_observer_can_be_included(observer_choice, tmp_path):
+    kind = observer_choice.summary["for_both_sides"]
+    assert kind == observer_choice.summary["points"][0]["sides"]["motor"]["best"]
+    (tmp_path / "gains.toml").write_text(observer_toml(observer_choice.summary), encoding="utf-8")
     data = read_config(study()).to_dict()
     data.pop("tune")
     data.pop("observer")
     (tmp_path / "study.toml").write_text('include = "gains.toml"\n' + tomli_w.dumps(data), encoding="utf-8")
     observer = read_config(tmp_path / "study.toml").build().observer.motor
     assert observer.name == kind
-    gains = chosen.summary["points"][0]["sides"]["motor"]["kinds"][kind]["gains"]
+    gains = observer_choice.summary["points"][0]["sides"]["motor"]["kinds"][kind]["gains"]
     assert {key: getattr(observer, key) for key in gains} == gains
 
 
@@ -130,12 +130,12 @@ def test_a_point_of_a_map_is_what_the_study_there_gives(tmp_path):
     assert [list(kind_data["values"].values()) for kind_data in choice.summary["points"]] == [
         [1e-3, 1e-5], [1e-3, 1e-4], [2e-3, 1e-5], [2e-3, 1e-4]
     ]  # fmt: skip
-    alone = tune(study({"run.sample_period": 2e-3, "encoders.noise": 1e-4}, **table))
-    for kind, kind_data in alone.summary["points"][0]["sides"]["motor"]["kinds"].items():
-        there = choice.summary["points"][3]["sides"]["motor"]["kinds"][kind]
-        assert there == {key: pytest.approx(value) for key, value in kind_data.items()}
-    again = tune(study(**table, axes=axes), tmp_path)
-    assert (again.cost["lanes"], again.summary) == (0.0, choice.summary)
+    single_choice = tune(study({"run.sample_period": 2e-3, "encoders.noise": 1e-4}, **table))
+    for kind, kind_data in single_choice.summary["points"][0]["sides"]["motor"]["kinds"].items():
+        point_data = choice.summary["points"][3]["sides"]["motor"]["kinds"][kind]
+        assert point_data == {key: pytest.approx(value) for key, value in kind_data.items()}
+    second = tune(study(**table, axes=axes), tmp_path)
+    assert (second.cost["lanes"], second.summary) == (0.0, choice.summary)
     assert choice.cost["lanes"] == 4 * 2 * (8 * 2 + 8)
 
 

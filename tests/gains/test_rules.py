@@ -52,13 +52,13 @@ def test_region_is_the_one_that_is_stated(name):
     # half of them in the units of f_plus, half as numbers
     unit = np.where(np.arange(300) % 2, f_plus, 1.0)
     alpha, lambda_ = unit * 10.0 ** draw.uniform(-1.0, 1.5, 300), np.sqrt(unit) * 10.0 ** draw.uniform(-1.0, 1.5, 300)
-    judgements = [
-        bool(allows_gains(RULES[name], *np.array([[judgement], [two]]), f)[0])
-        for judgement, two, f in zip(lambda_, alpha, f_plus, strict=True)
+    actual = [
+        bool(allows_gains(RULES[name], *np.array([[trial_lambda], [trial_alpha]]), f)[0])
+        for trial_lambda, trial_alpha, f in zip(lambda_, alpha, f_plus, strict=True)
     ]
     expected = [bool(STATED[name](*numbers)) for numbers in zip(lambda_, alpha, f_plus, strict=True)]
     assert 5 < sum(expected) < 295
-    assert judgements == expected
+    assert actual == expected
 
 
 def test_which_are_sufficient_and_which_depend_on_units(judged_rules):
@@ -84,15 +84,15 @@ def test_no_gains_of_a_sufficient_rule_fail(name):
         ratios = np.asarray(peak_ratio(lambda_, alpha, np.full(300, bound)))
         assert (ratios[allowed] < 1.0).all()
         assert (ratios >= 1.0).any()
-        below = bound * 10.0 ** draw.uniform(-2.0, 0.0, 300)
-        assert not allows_gains(RULES[name], lambda_, below, bound).any()
+        small_alpha = bound * 10.0 ** draw.uniform(-2.0, 0.0, 300)
+        assert not allows_gains(RULES[name], lambda_, small_alpha, bound).any()
 
 
 @pytest.mark.parametrize("name", sorted(set(RULES) - SUFFICIENT))
 def test_counterexamples_in_the_observers_own_states(name, judged_rules):
     """An adversary who sees the error: its largest push outward, then homeward."""
-    judgements = judged_rules[name]["counterexample"]
-    f_plus, alpha, lambda_ = (judgements[key] for key in ("f_plus", "alpha", "lambda"))
+    counterexample = judged_rules[name]["counterexample"]
+    f_plus, alpha, lambda_ = (counterexample[key] for key in ("f_plus", "alpha", "lambda"))
     assert STATED[name](lambda_, alpha, f_plus)
 
     def slope(t, s):
@@ -104,19 +104,19 @@ def test_counterexamples_in_the_observers_own_states(name, judged_rules):
 
     passes.terminal, passes.direction = True, -1
     unit = np.sqrt(f_plus)
-    judgement = solve_ivp(
+    solution = solve_ivp(
         slope, (0.0, 40.0 / unit), [0.0, unit], events=passes, rtol=1e-8, atol=1e-10 * f_plus, max_step=0.01 / unit
     )
     if alpha < f_plus:
-        assert judgements["peak_ratio_simulated"] == np.inf
-        assert judgement.status == 0
-        assert judgement.y[1, -1] > 1.5 * unit
+        assert counterexample["peak_ratio_simulated"] == np.inf
+        assert solution.status == 0
+        assert solution.y[1, -1] > 1.5 * unit
         return
-    assert judgement.status == 1
-    ratio = -judgement.y[1, -1] / unit
+    assert solution.status == 1
+    ratio = -solution.y[1, -1] / unit
     assert ratio > 1.0
-    assert ratio == pytest.approx(judgements["peak_ratio_simulated"], rel=2e-3)
-    assert judgements["peak_ratio"] == pytest.approx(judgements["peak_ratio_simulated"], rel=1e-5)
+    assert ratio == pytest.approx(counterexample["peak_ratio_simulated"], rel=2e-3)
+    assert counterexample["peak_ratio"] == pytest.approx(counterexample["peak_ratio_simulated"], rel=1e-5)
 
 
 @pytest.mark.parametrize("name", STATED)
@@ -125,11 +125,11 @@ def test_coverage_is_the_share_of_cells(name, judged_rules):
     draw = np.random.default_rng(7)
     alpha = ALPHA[0] * (ALPHA[-1] / ALPHA[0]) ** draw.random(20_000)
     lambda_ = LAMBDA[0] * (LAMBDA[-1] / LAMBDA[0]) ** draw.random(20_000)
-    works = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha))) < 1.0
+    converges = np.asarray(peak_ratio(lambda_, alpha, np.ones_like(alpha))) < 1.0
     for entry in judged_rules[name]["covers"]:
         bound = entry["f_plus"]
         allowed = allows_gains(RULES[name], np.sqrt(bound) * lambda_, bound * alpha, bound)
-        assert entry["share"] == pytest.approx((allowed & works).sum() / works.sum(), abs=0.02)
+        assert entry["share"] == pytest.approx((allowed & converges).sum() / converges.sum(), abs=0.02)
     cells = judged_rules[name]["cells"]
     grid = allows_gains(RULES[name], LAMBDA[:, None], ALPHA[None, :], 1.0)
     fails = np.asarray(peak_ratio(*np.broadcast_arrays(LAMBDA[:, None], ALPHA[None, :]), np.ones((96, 96)))) >= 1.0

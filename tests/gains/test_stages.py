@@ -68,7 +68,9 @@ def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
     """The third one has another drive, and figures of all are those of studies by themselves."""
     compiled = []
     monkeypatch.setattr(
-        programs, "_compile_fused", lambda *options, real=programs._compile_fused: compiled.append(options) or real(*options)
+        programs,
+        "_compile_fused",
+        lambda *options, compile_fused=programs._compile_fused: compiled.append(options) or compile_fused(*options),
     )
     axes = [[listed_axis(ALPHA, *alphas), listed_axis(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
     inertias = 0.05, 0.05, 0.06

@@ -32,21 +32,21 @@ def one_side(changes=None, **tables):
 
 
 @pytest.fixture(scope="module")
-def chosen():
+def tuned_study():
     return tune(one_side(tune=TABLE | {"compare": [{"name": "loud", "motor": {"lambda": 50.0, "alpha": 500.0}}]}))
 
 
-def test_the_bound_is_the_largest_of_the_run_and_of_the_start(chosen):
-    pilot = chosen.summary["pilot"]["motor"]
+def test_the_bound_is_the_largest_of_the_run_and_of_the_start(tuned_study):
+    pilot = tuned_study.summary["pilot"]["motor"]
     assert pilot["disturbance"] == pytest.approx(1.0, rel=2e-3)
     assert pilot["start"] == pytest.approx(1.0 + 3.0 * 0.1, rel=2e-3)
-    assert chosen.summary["f_plus"]["motor"] == pilot["start"]
+    assert tuned_study.summary["f_plus"]["motor"] == pilot["start"]
     assert not pilot["starting_error_assumed"]
 
 
-def test_optimum_agrees_with_brute_force_over_a_fine_grid(chosen):
+def test_optimum_agrees_with_brute_force_over_a_fine_grid(tuned_study):
     """A sweep of its own over 11 x 11 gains finds none that is feasible and much better."""
-    bound = chosen.summary["f_plus"]["motor"]
+    bound = tuned_study.summary["f_plus"]["motor"]
     axes = [
         listed_axis("observer.motor.alpha", *(bound * np.geomspace(1.2, 20.0, 11))),
         listed_axis("observer.motor.lambda", *(math.sqrt(bound) * np.geomspace(0.5, 20.0, 11))),
@@ -59,7 +59,7 @@ def test_optimum_agrees_with_brute_force_over_a_fine_grid(chosen):
     error = groups["motor.velocity_rmse"].max()
     meets_all = groups["motor.converged"].min() & (groups["motor.margin_alpha"].min() >= 1.1)
     least = error[meets_all & (groups["motor.margin_exact"].min() >= 1.1)].min()
-    achieved = chosen.summary["achieved"]["motor"]
+    achieved = tuned_study.summary["achieved"]["motor"]
     # two stages of five values each way reach a step of 1.4 in lambda and alpha
     assert achieved["velocity_rmse"] <= 1.1 * least
     assert achieved["velocity_rmse"] >= 0.98 * least
@@ -67,29 +67,29 @@ def test_optimum_agrees_with_brute_force_over_a_fine_grid(chosen):
     assert achieved["margin_exact"] >= 1.1
 
 
-def test_candidates_are_judged_by_their_worst_run(chosen):
-    frame = chosen.candidates["motor"]
+def test_candidates_are_judged_by_their_worst_run(tuned_study):
+    frame = tuned_study.candidates["motor"]
     assert len(frame) == 2 * 25
     assert set(frame["stage"]) == {0, 1}
     meets_all = frame["converged"] & (frame["margin_alpha"] >= 1.1) & (frame["margin_exact"] >= 1.1)
     pd.testing.assert_series_equal(frame["feasible"], meets_all, check_names=False)
     best = frame[frame["feasible"]].sort_values("error").iloc[0]
-    gains = chosen.summary["gains"]["motor"]
+    gains = tuned_study.summary["gains"]["motor"]
     assert (gains["lambda"], gains["alpha"]) == (best["lambda"], best["alpha"])
-    bound = chosen.summary["f_plus"]["motor"]
+    bound = tuned_study.summary["f_plus"]["motor"]
     np.testing.assert_allclose(frame["alpha_ratio"] * bound, frame["alpha"])
     np.testing.assert_allclose(frame["lambda_ratio"] * math.sqrt(bound), frame["lambda"])
 
 
-def test_a_zoom_lies_about_the_best_cell_and_inside_of_the_range(chosen):
-    coarse, zoom = (stage["motor"] for stage in chosen.summary["stages"])
+def test_a_zoom_lies_about_the_best_cell_and_inside_of_the_range(tuned_study):
+    coarse, zoom = (stage["motor"] for stage in tuned_study.summary["stages"])
     for key, best in (("alpha_ratio", "alpha_ratio"), ("lambda_ratio", "lambda_ratio")):
         assert coarse[key][0] <= zoom[key][0] < zoom[key][1] <= coarse[key][1]
-        frame = chosen.candidates["motor"].query("stage == 0 and feasible")
+        frame = tuned_study.candidates["motor"].query("stage == 0 and feasible")
         centre = frame.loc[frame["error"].idxmin(), best]
         assert zoom[key][0] <= centre <= zoom[key][1]
     step = (zoom["alpha_ratio"][1] / zoom["alpha_ratio"][0]) ** 0.25
-    assert chosen.summary["resolution"]["motor"]["alpha"] == pytest.approx(step - 1.0)
+    assert tuned_study.summary["resolution"]["motor"]["alpha"] == pytest.approx(step - 1.0)
 
 
 def test_pareto_front_has_what_none_beats():
@@ -102,24 +102,24 @@ def test_pareto_front_has_what_none_beats():
     assert list(zip(front["convergence_time"], front["error"], strict=True)) == [(1.0, 5.0), (2.0, 3.0), (4.0, 1.0)]
 
 
-def test_pareto_front_of_a_search_ends_at_the_tuned_gains(chosen):
-    front = chosen.summary["pareto"]["motor"]
+def test_pareto_front_of_a_search_ends_at_the_tuned_gains(tuned_study):
+    front = tuned_study.summary["pareto"]["motor"]
     errors, times = ([point[key] for point in front] for key in ("error", "convergence_time"))
     assert sorted(errors, reverse=True) == errors
     assert sorted(times) == times
-    assert front[-1]["error"] == chosen.summary["achieved"]["motor"]["velocity_rmse"]
-    assert front[-1]["lambda"] == chosen.summary["gains"]["motor"]["lambda"]
+    assert front[-1]["error"] == tuned_study.summary["achieved"]["motor"]["velocity_rmse"]
+    assert front[-1]["lambda"] == tuned_study.summary["gains"]["motor"]["lambda"]
 
 
-def test_comparison_is_on_noise_that_the_search_has_not_seen(chosen):
-    held = chosen.summary["holdout"]
-    assert chosen.summary["seeds"] == [0, 1]
-    assert held["seeds"] == [2, 3]
-    assert held["same_excitation"]
-    assert any("No tune.holdout is given" in line for line in chosen.summary["remarks"])
-    rows = {row["name"]: row for row in held["rows"]}
+def test_comparison_is_on_noise_that_the_search_has_not_seen(tuned_study):
+    holdout = tuned_study.summary["holdout"]
+    assert tuned_study.summary["seeds"] == [0, 1]
+    assert holdout["seeds"] == [2, 3]
+    assert holdout["same_excitation"]
+    assert any("No tune.holdout is given" in line for line in tuned_study.summary["remarks"])
+    rows = {row["name"]: row for row in holdout["rows"]}
     assert list(rows) == ["tuned", "usual rule", "config", "loud"]
-    bound = chosen.summary["f_plus"]["motor"]
+    bound = tuned_study.summary["f_plus"]["motor"]
     assert rows["usual rule"]["alpha"] == pytest.approx(1.1 * bound)
     assert rows["usual rule"]["lambda"] == pytest.approx(1.5 * math.sqrt(bound))
     assert (rows["config"]["lambda"], rows["config"]["alpha"]) == (4.0, 9.0)
@@ -129,13 +129,13 @@ def test_comparison_is_on_noise_that_the_search_has_not_seen(chosen):
     assert list(frame["seed"]) == [2, 3]
     assert rows["loud"]["velocity_rmse"]["worst"] == pytest.approx(frame["motor.velocity_rmse"].max(), rel=1e-9)
     assert rows["loud"]["runs"] == 2
-    factor = held["factors"]["motor"]["loud"]["velocity_rmse"]["worst"]
+    factor = holdout["factors"]["motor"]["loud"]["velocity_rmse"]["worst"]
     assert factor == pytest.approx(rows["loud"]["velocity_rmse"]["worst"] / rows["tuned"]["velocity_rmse"]["worst"])
     assert factor > 2.0
 
 
-def test_summary_is_json_and_public_names_resolve(chosen):
-    assert json.loads(json.dumps(chosen.summary, allow_nan=False)) == chosen.summary
+def test_summary_is_json_and_public_names_resolve(tuned_study):
+    assert json.loads(json.dumps(tuned_study.summary, allow_nan=False)) == tuned_study.summary
     assert jaxbl.tune is tune
     for key in (
         "objective",
@@ -151,7 +151,7 @@ def test_summary_is_json_and_public_names_resolve(chosen):
         "range",
         "resolution",
     ):
-        assert key in chosen.summary
+        assert key in tuned_study.summary
 
 
 BOTH = {"num": 3, "refine": 1, "worst_over_uncertainty": True, "margin_exact": 1.0, "margin_alpha": 1.05}
@@ -182,19 +182,19 @@ def test_both_sides_at_once_over_uncertain_drives_and_a_restart(tmp_path, monkey
     np.testing.assert_allclose(inertias, [0.001, -0.004, -0.004, 0.006, 0.006], atol=1e-15)
     # a second call simulates nothing
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished search simulates"))
-    again = tune(study, tmp_path / "out")
-    assert again.summary == summary
-    assert again.cost["lanes"] == 0
+    second = tune(study, tmp_path / "out")
+    assert second.summary == summary
+    assert second.cost["lanes"] == 0
 
 
 def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
     study = one_side()
-    ran, run = [], Engine.run
+    run_chunks, run = [], Engine.run
 
     def count_lanes(engine, chunk):
-        if len(ran) == 2:
+        if len(run_chunks) == 2:
             raise KeyboardInterrupt
-        ran.append(chunk)
+        run_chunks.append(chunk)
         return run(engine, chunk)
 
     monkeypatch.setattr(Engine, "run", count_lanes)
@@ -202,11 +202,11 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
         tune(study, tmp_path, backend="scan")
     with pytest.raises(InputError, match="was begun with --backend scan; go on with that, or choose another folder"):
         tune(study, tmp_path, backend="fused")
-    monkeypatch.setattr(Engine, "run", lambda engine, chunk: ran.append(chunk) or run(engine, chunk))
+    monkeypatch.setattr(Engine, "run", lambda engine, chunk: run_chunks.append(chunk) or run(engine, chunk))
     # by the same without being told
     resumed = tune(study, tmp_path)
     # maps of both stages, the named gains twice: each once
-    assert len(ran) == 4
+    assert len(run_chunks) == 4
     assert resumed.summary == tune(study, backend="scan").summary
 
 
@@ -234,29 +234,29 @@ def test_a_constraint_that_holds_the_optimum_back_is_said():
     assert not limits["constraints"]["margin_alpha"]["binds"]
 
 
-def test_limits_are_those_of_the_candidates(chosen):
-    limits, achieved = (chosen.summary[key]["motor"] for key in ("limits", "achieved"))
+def test_limits_are_those_of_the_candidates(tuned_study):
+    limits, achieved = (tuned_study.summary[key]["motor"] for key in ("limits", "achieved"))
     assert list(limits["constraints"]) == ["converged", "margin_alpha", "margin_exact"]
     for name in ("margin_alpha", "margin_exact"):
         constraint = limits["constraints"][name]
         assert constraint["value"] == achieved[name]
         assert constraint["room"] == pytest.approx(achieved[name] / 1.1)
         assert constraint["binds"] == (name in limits["binding"])
-    gains, frame = chosen.summary["gains"]["motor"], chosen.candidates["motor"]
+    gains, frame = tuned_study.summary["gains"]["motor"], tuned_study.candidates["motor"]
     for gain, other in (("lambda", "alpha"), ("alpha", "lambda")):
         line = pd.DataFrame(limits["profiles"][gain])
         assert line[gain].is_monotonic_increasing
         # where the zoom was run, its own runs
-        there = frame[(frame["stage"] == 1) & np.isclose(frame[other], gains[other], rtol=1e-9)].sort_values(gain)
-        shown_line = line[line[gain].between(there[gain].min() * 0.999, there[gain].max() * 1.001)]
-        np.testing.assert_allclose(shown_line[gain], there[gain])
-        np.testing.assert_allclose(shown_line["error"], there["error"])
-        assert [not names for names in shown_line["missed"]] == there["feasible"].to_list()
+        neighbours = frame[(frame["stage"] == 1) & np.isclose(frame[other], gains[other], rtol=1e-9)].sort_values(gain)
+        shown_line = line[line[gain].between(neighbours[gain].min() * 0.999, neighbours[gain].max() * 1.001)]
+        np.testing.assert_allclose(shown_line[gain], neighbours[gain])
+        np.testing.assert_allclose(shown_line["error"], neighbours["error"])
+        assert [not names for names in shown_line["missed"]] == neighbours["feasible"].to_list()
         # and the whole range
-        assert line[f"{gain}_ratio"].iloc[[0, -1]].to_list() == pytest.approx(chosen.summary["range"][f"{gain}_ratio"])
-    held = chosen.summary["conditions"]["motor"]
-    assert held["lambda"] / held["least_lambda"]["exact"] == pytest.approx(achieved["margin_exact"], rel=1e-6)
-    assert held["f_plus"] == achieved["f_plus"]
+        assert line[f"{gain}_ratio"].iloc[[0, -1]].to_list() == pytest.approx(tuned_study.summary["range"][f"{gain}_ratio"])
+    conditions = tuned_study.summary["conditions"]["motor"]
+    assert conditions["lambda"] / conditions["least_lambda"]["exact"] == pytest.approx(achieved["margin_exact"], rel=1e-6)
+    assert conditions["f_plus"] == achieved["f_plus"]
 
 
 def test_gains_that_do_not_converge_have_no_factor():

@@ -74,18 +74,20 @@ def test_normalised_level_counted_again(verified_study):
     assert level_data["cells"] == 63
     least = [demand_lambda(alpha, 1.0) for alpha in plane.alpha]
     np.testing.assert_allclose(plane.boundary, [column["exact"] for column in least], atol=1e-6)
-    worked = np.array([[lambda_ > column["exact"] for column in least] for lambda_ in plane.lambda_])
-    np.testing.assert_array_equal(plane.ratio < 1.0, worked)
-    assert level_data["converged"] == worked.sum()
+    demanded_held = np.array([[lambda_ > column["exact"] for column in least] for lambda_ in plane.lambda_])
+    np.testing.assert_array_equal(plane.ratio < 1.0, demanded_held)
+    assert level_data["converged"] == demanded_held.sum()
     for entry in level_data["conditions"]:
         column = np.array([demands[entry["name"]] for demands in least])
         holds = plane.lambda_[:, None] > column
         assert 0 < entry["holds"] == holds.sum() < 63
         assert entry["counterexamples"] == 0
-        assert entry["fails_but_converged"] == (~holds & worked).sum()
+        assert entry["fails_but_converged"] == (~holds & demanded_held).sum()
         ratios = column / [demands["exact"] for demands in least]
-        stored = entry["conservatism"]
-        np.testing.assert_allclose((stored["median"], stored["max"]), (np.median(ratios), ratios.max()), rtol=1e-5)
+        conservatism = entry["conservatism"]
+        np.testing.assert_allclose(
+            (conservatism["median"], conservatism["max"]), (np.median(ratios), ratios.max()), rtol=1e-5
+        )
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +123,8 @@ def test_levels_of_the_drive_counted_again(level, cells, verified_study, judged_
             assert entry["counterexamples"] == sum(
                 h and not row["motor.converged"] for h, row in zip(holds, rows, strict=True)
             )
-            worked = sum(not h and row["motor.converged"] for h, row in zip(holds, rows, strict=True))
-            assert entry["fails_but_converged"] == worked
+            unneeded = sum(not h and row["motor.converged"] for h, row in zip(holds, rows, strict=True))
+            assert entry["fails_but_converged"] == unneeded
     # the least lambda that worked, everything else being equal
     first = {}
     for row in judged_cells[level, "true"]:
@@ -134,12 +136,14 @@ def test_levels_of_the_drive_counted_again(level, cells, verified_study, judged_
         ratios = np.array([row["demanded"][entry["name"]] / row[LAMBDA] for row in first.values()])
         least = np.array([row[LAMBDA] == 0.05 for row in first.values()])
         strict = np.isfinite(ratios) & (ratios > 1.0)
-        stored = entry["conservatism"]
+        conservatism = entry["conservatism"]
         if strict.any():
-            np.testing.assert_allclose((stored["median"], stored["max"]), (np.median(ratios[strict]), ratios[strict].max()))
+            np.testing.assert_allclose(
+                (conservatism["median"], conservatism["max"]), (np.median(ratios[strict]), ratios[strict].max())
+            )
         else:
-            assert stored["median"] is None and stored["max"] is None
-        assert (stored["columns"], stored["at_least"]) == (strict.sum(), (strict & least).sum())
+            assert conservatism["median"] is None and conservatism["max"] is None
+        assert (conservatism["columns"], conservatism["at_least"]) == (strict.sum(), (strict & least).sum())
     if level == "drive":
         assert (
             level_data["conditions"][0]["name"] == "davila_fridman"
@@ -151,8 +155,8 @@ def test_levels_of_the_drive_counted_again(level, cells, verified_study, judged_
 
 def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verified_study, judged_cells):
     verdict, _ = verified_study
-    listed_ = verdict.counterexamples
-    assert set(listed_["side"]) == {"motor"}
+    counterexamples = verdict.counterexamples
+    assert set(counterexamples["side"]) == {"motor"}
     sizes = []
     for (level, bound), rows in judged_cells.items():
         keys = KEYS[level]
@@ -162,26 +166,30 @@ def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(verifie
                 for row in rows
                 if row[LAMBDA] > row["demanded"][name] and not row["motor.converged"]
             }
-            part = listed_[(listed_["level"] == level) & (listed_["bound"] == bound) & (listed_["condition"] == name)]
+            part = counterexamples[
+                (counterexamples["level"] == level)
+                & (counterexamples["bound"] == bound)
+                & (counterexamples["condition"] == name)
+            ]
             level_data = list(part[keys].itertuples(index=False, name=None))
             assert len(level_data) == len(failed)
             assert set(level_data) == failed
             sizes.append(len(failed))
-    assert sum(sizes) == len(listed_)
+    assert sum(sizes) == len(counterexamples)
     assert np.sum(np.array(sizes) > 0) >= 5
 
 
 def test_every_counterexample_carries_its_point_and_a_cause(verified_study):
-    listed_ = verified_study[0].counterexamples
-    for level, part in listed_.groupby("level"):
+    counterexamples = verified_study[0].counterexamples
+    for level, part in counterexamples.groupby("level"):
         assert part[KEYS[level]].notna().all(axis=None)
-    assert listed_.loc[listed_["level"] == "drive", PERIOD].isna().all()
-    for cause in listed_["cause"]:
+    assert counterexamples.loc[counterexamples["level"] == "drive", PERIOD].isna().all()
+    for cause in counterexamples["cause"]:
         assert cause in WHOLE or set(cause.split(" or ")) <= CAUSES, cause
     # what is not there is no cause
-    assert not listed_["cause"].str.contains("quantisation").any()
+    assert not counterexamples["cause"].str.contains("quantisation").any()
     # of one run, one cause at the true bound
-    true = listed_[listed_["bound"] == "true"]
+    true = counterexamples[counterexamples["bound"] == "true"]
     # half a rad/s takes longer than there is time
     assert set(true.loc[true["level"] == "drive", "cause"]) == {"run too short"}
     assert (true.groupby(["level", *KEYS["sampled"]], dropna=False)["cause"].nunique() == 1).all()
@@ -191,9 +199,9 @@ def test_causes_in_the_summary_count_runs(verified_study):
     verdict, _ = verified_study
     for level, keys in KEYS.items():
         part = verdict.counterexamples[verdict.counterexamples["level"] == level]
-        counted = entries(verdict.summary, level).get("causes", {})
-        assert set(counted) == set(part["bound"])
-        for bound, causes in counted.items():
+        run_counts = entries(verdict.summary, level).get("causes", {})
+        assert set(run_counts) == set(part["bound"])
+        for bound, causes in run_counts.items():
             runs = part[part["bound"] == bound].drop_duplicates(keys)
             assert sum(causes.values()) == len(runs)
 
@@ -231,13 +239,13 @@ def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeyp
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
-    again = verify(VERIFIED, folder)
-    assert again.summary == verdict.summary
+    second = verify(VERIFIED, folder)
+    assert second.summary == verdict.summary
     for level, frame in verdict.levels.items():
-        pd.testing.assert_frame_equal(again.levels[level], frame)
-    pd.testing.assert_frame_equal(again.counterexamples, verdict.counterexamples)
-    after = contents(folder)
-    assert all(after[path] == stored for path, stored in results.items())
+        pd.testing.assert_frame_equal(second.levels[level], frame)
+    pd.testing.assert_frame_equal(second.counterexamples, verdict.counterexamples)
+    contents_after = contents(folder)
+    assert all(contents_after[path] == stored for path, stored in results.items())
 
 
 def test_another_studys_folder_is_left_as_it_is(verified_study):
@@ -268,14 +276,14 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(verified_at_rest, mo
     verdict, folder = verified_at_rest
     shutil.copytree(folder, tmp_path / "copy")
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
-    twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
-    again = verify(AT_REST | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
-    titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
+    equal_marks = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
+    second = verify(AT_REST | {"verify": ATLAS | {"q": 0.6, "marks": equal_marks}}, tmp_path / "copy")
+    titles = [level["conditions"][0]["title"] for level in second.summary["levels"]]
     assert titles == ["Davila-Fridman (32), q = 0.6"] * 3
-    least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (again, verdict))
+    least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (second, verdict))
     # (1 + q) / (1 - q) at 0.6 and at 0.3
     assert least / before == pytest.approx(4.0 / (13.0 / 7.0))
-    demands, same = again.summary["marks"]
+    demands, same = second.summary["marks"]
     assert demands | {"name": "the same"} == same
 
 
@@ -354,11 +362,12 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verif
     """Forward Euler chatters with period times alpha: a quarter of 16 ms would do, or no Euler."""
     verdict, folder = verified_study
     level_data = verdict.counterexamples
-    chosen = level_data[(level_data["level"] == "sampled") & (level_data[ALPHA] == 8.0) & (level_data[LAMBDA] == 12.0)]
-    assert set(chosen[PERIOD]) == {16e-3}
-    assert set(chosen["cause"]) == {"explicit discretisation", "period too long or explicit discretisation"}
+    point_row = level_data[(level_data["level"] == "sampled") & (level_data[ALPHA] == 8.0) & (level_data[LAMBDA] == 12.0)]
+    assert set(point_row[PERIOD]) == {16e-3}
+    assert set(point_row["cause"]) == {"explicit discretisation", "period too long or explicit discretisation"}
     periods = [
-        open_study(place).config.run.sample_period for place in (folder / "verify/causes").glob("sampled-*-period_too_long")
+        open_study(cause_folder).config.run.sample_period
+        for cause_folder in (folder / "verify/causes").glob("sampled-*-period_too_long")
     ]
     assert sorted(periods) == [0.25e-3, 4e-3]
 

@@ -18,11 +18,11 @@ LIMITS = {name: jax.jit(limit) for name, (_, limit) in conditions.CONDITIONS.ite
 LANES, CELLS = 300, 16_384
 
 
-def half(lambda_, alpha, f_plus=1.0, damping=0.0, speed=1.0, outward=1.0, homeward=-1.0, ray=0.0):
-    arguments = np.broadcast_arrays(lambda_, alpha, f_plus, damping, speed, outward, homeward, ray)
+def half(lambda_, alpha, f_plus=1.0, damping=0.0, speed=1.0, outward=1.0, inward=-1.0, ray=0.0):
+    arguments = np.broadcast_arrays(lambda_, alpha, f_plus, damping, speed, outward, inward, ray)
     shape, size = arguments[0].shape, arguments[0].size
-    *gains, damping, speed, outward, homeward, ray = (np.resize(x, LANES if size <= LANES else CELLS) for x in arguments)
-    half_cycles = HALF(*gains, damping=damping, speed=speed, outward=outward, homeward=homeward, ray=ray)
+    *gains, damping, speed, outward, inward, ray = (np.resize(x, LANES if size <= LANES else CELLS) for x in arguments)
+    half_cycles = HALF(*gains, damping=damping, speed=speed, outward=outward, homeward=inward, ray=ray)
     return HalfCycle(*(np.asarray(x)[:size].reshape(shape) for x in half_cycles))
 
 
@@ -37,7 +37,7 @@ def demand_lambda(name, alpha, f_plus):
     return np.asarray(LIMITS[name](np.resize(alpha, LANES), np.resize(f_plus, LANES)))[: np.size(alpha)]
 
 
-def reference(lambda_, alpha, f_plus, damping=0.0, speed=1.0, outward=1.0, homeward=-1.0, ray=0.0):
+def reference(lambda_, alpha, f_plus, damping=0.0, speed=1.0, outward=1.0, inward=-1.0, ray=0.0):
     """Ratio and time of a half cycle in the observer's own states."""
 
     def velocity(x1, x2):
@@ -56,16 +56,16 @@ def reference(lambda_, alpha, f_plus, damping=0.0, speed=1.0, outward=1.0, homew
     turns.direction = returns.direction = -1
     settings = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-15}
     # not so long that rounding at rest makes it turn
-    out = solve_ivp(right(outward), (0.0, 20.0), [0.0, speed], events=turns, **settings)
-    if out.status != 1:
+    outward_solution = solve_ivp(right(outward), (0.0, 20.0), [0.0, speed], events=turns, **settings)
+    if outward_solution.status != 1:
         return np.inf, np.inf
-    back = solve_ivp(right(homeward), (0.0, 200.0), out.y[:, -1], events=returns, **settings)
-    assert back.status == 1
-    return -back.y[1, -1] / speed, out.t[-1] + back.t[-1]
+    inward_solution = solve_ivp(right(inward), (0.0, 200.0), outward_solution.y[:, -1], events=returns, **settings)
+    assert inward_solution.status == 1
+    return -inward_solution.y[1, -1] / speed, outward_solution.t[-1] + inward_solution.t[-1]
 
 
 @pytest.fixture(scope="module")
-def plane():
+def gain_plane():
     """Gains over f_plus = 1, with simulated and closed-form ratio; about the sweep's range, but between its points."""
     alpha = 1.0 + np.geomspace(1e-3, 19.0, 128)
     lambda_ = np.geomspace(0.05, 60.0, 513)[1:]
@@ -75,8 +75,8 @@ def plane():
     return *(x.ravel() for x in cells), ratio, closed
 
 
-def test_ratio_is_the_closed_form_over_a_plane(plane):
-    lambda_, alpha, ratio, closed = plane
+def test_ratio_is_the_closed_form_over_a_plane(gain_plane):
+    lambda_, alpha, ratio, closed = gain_plane
     np.testing.assert_allclose(ratio, closed, rtol=1e-6, atol=1e-6)
     # what that covers: growing and falling peaks, and both double roots
     assert np.all(np.isfinite(ratio)) and ratio.max() > 10.0
@@ -85,8 +85,8 @@ def test_ratio_is_the_closed_form_over_a_plane(plane):
         assert np.sum(np.abs(lambda_ / np.sqrt(8.0 * c) - 1.0) < 0.01) > 90
 
 
-def test_no_counterexample_to_any_condition(plane):
-    lambda_, alpha, ratio, _ = plane
+def test_no_counterexample_to_any_condition(gain_plane):
+    lambda_, alpha, ratio, _ = gain_plane
     assert len(ratio) == 65_536
     alphas, index = np.unique(alpha, return_inverse=True)
     for name in LIMITS:
@@ -120,7 +120,7 @@ def test_a_constant_disturbance_only_changes_alpha(share):
     """x2 then falls at the constant rate alpha - d through the whole half cycle."""
     lambda_, alpha, f_plus = gains(1)
     speed = np.exp(np.random.default_rng(2).uniform(-3.0, 3.0, LANES))
-    half_cycles = half(lambda_, alpha, f_plus, speed=speed, outward=share, homeward=share)
+    half_cycles = half(lambda_, alpha, f_plus, speed=speed, outward=share, inward=share)
     rate = alpha - share * f_plus
     closed = np.asarray(RATIO(lambda_, rate, np.zeros(LANES)))
     assert 40 < np.sum(closed == 0.0) < 260
@@ -176,7 +176,7 @@ def test_other_disturbances_as_scipy(seed):
 def test_damped_time_to_the_origin():
     """Straight home under no disturbance, x2' = -alpha - damping x2 throughout."""
     damping = np.geomspace(1e-3, 1e3, 30)
-    half_cycles = half(20.0, 2.0, 1.0, damping=damping, speed=0.7, outward=0.0, homeward=0.0)
+    half_cycles = half(20.0, 2.0, 1.0, damping=damping, speed=0.7, outward=0.0, inward=0.0)
     np.testing.assert_array_equal(half_cycles.ratio, 0.0)
     np.testing.assert_allclose(half_cycles.time, np.log1p(damping * 0.7 / 2.0) / damping, rtol=1e-6)
 
@@ -210,7 +210,7 @@ def test_ratio_depends_on_three_numbers_only():
 
 
 @pytest.fixture(scope="module")
-def cube():
+def ratio_cube():
     """Ratios over alpha, damping and lambda at f_plus = 1 and unit speed."""
     alpha = 1.0 + np.geomspace(1e-2, 50.0, 20)
     damping = np.append(0.0, np.geomspace(1e-3, 100.0, 25))
@@ -219,17 +219,17 @@ def cube():
     return half(shape[2], shape[0], 1.0, damping=shape[1]).ratio
 
 
-def test_ratio_falls_with_lambda(cube):
-    step = np.diff(cube, axis=2)
+def test_ratio_falls_with_lambda(ratio_cube):
+    step = np.diff(ratio_cube, axis=2)
     assert np.all(step <= 0.0)
-    assert np.all(step[cube[:, :, 1:] > 0.1] < 0.0)
+    assert np.all(step[ratio_cube[:, :, 1:] > 0.1] < 0.0)
     # all the way down to the origin
-    assert np.all(cube[:, :, -1] == 0.0)
+    assert np.all(ratio_cube[:, :, -1] == 0.0)
 
 
-def test_ratio_falls_with_damping_where_it_is_not_small(cube):
+def test_ratio_falls_with_damping_where_it_is_not_small(ratio_cube):
     """Peaks that fall to a tenth anyway are slightly larger with damping, which turns the error back earlier."""
-    before, after = cube[:, :-1], cube[:, 1:]
+    before, after = ratio_cube[:, :-1], ratio_cube[:, 1:]
     assert np.sum(before > 0.1) > 5000
     assert np.all((after < before)[before > 0.1])
     assert np.all((after < 0.1)[before <= 0.1])

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from hidden_log import simulate_study
-from measured import EMPS, XL330, read_stretch, real
+from measured import EMPS, XL330, find_recording, read_stretch
 from small_study import rigid_study, small_study
 from trace_segment import segment_of
 
@@ -119,9 +119,9 @@ def test_model_runs_with_the_numbers_found(identification, tmp_path):
     for path in ("motor_inertia", "load_viscous"):
         assert getattr(identification.model.drive, path) == identification.summary["parameters"][f"drive.{path}"]["value"]
     (tmp_path / "model.toml").write_text(identification.model.to_toml())
-    again = read_config(tmp_path / "model.toml")
-    assert again == identification.model
-    assert again.effects[0].torque == identification.summary["parameters"]["effects.load.coulomb_friction.torque"]["value"]
+    model = read_config(tmp_path / "model.toml")
+    assert model == identification.model
+    assert model.effects[0].torque == identification.summary["parameters"]["effects.load.coulomb_friction.torque"]["value"]
 
 
 def test_report_has_every_number_and_figure(identification, tmp_path):
@@ -158,7 +158,7 @@ def sensor_logs(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def everything(sensor_logs):
+def full_identification(sensor_logs):
     """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
     study = open_ended(NOMINAL)
     # the log is sampled twice as often
@@ -169,38 +169,40 @@ def everything(sensor_logs):
     return identify(sensor_logs / "log0.csv", study, holdout=sensor_logs / "log1.csv", profile=True)
 
 
-def test_a_measured_torque_is_regressed_directly(everything):
-    regression = everything.summary["method"]["regression"]
+def test_a_measured_torque_is_regressed_directly(full_identification):
+    regression = full_identification.summary["method"]["regression"]
     assert regression["measured_transmitted_torque"]
     for path in ("transmission.stiffness", "transmission.half_gap"):
         parameters = regression["parameters"][path]
         assert abs(parameters["value"] - TRUTH[path]) < 4.0 * parameters["standard_error"], path
         assert parameters["standard_error"] < 0.01 * TRUTH[path]
     assert regression["torque"]["transmission"]["rms"] < 0.02
-    assert np.array_equal(everything.trace["transmitted"], everything.record.transmitted)
+    assert np.array_equal(full_identification.trace["transmitted"], full_identification.record.transmitted)
 
 
-def test_prediction_errors_find_the_numbers_too(everything):
-    assert everything.summary["method"]["trajectory"]["kind"] == "prediction_error"
-    for path, parameter in everything.summary["parameters"].items():
+def test_prediction_errors_find_the_numbers_too(full_identification):
+    assert full_identification.summary["method"]["trajectory"]["kind"] == "prediction_error"
+    for path, parameter in full_identification.summary["parameters"].items():
         assert abs(parameter["value"] - TRUTH[path]) < 4.0 * parameter["standard_error"], path
         low, high = parameter["interval"]
         np.testing.assert_allclose(parameter["profile_interval"], parameter["interval"], atol=0.1 * (high - low), rtol=0.0)
         assert len(parameter["profile"]) == 9
 
 
-def test_gains_are_chosen_on_the_log_where_the_study_has_none(everything):
+def test_gains_are_chosen_on_the_log_where_the_study_has_none(full_identification):
     for side, tolerance in (("motor", 0.3), ("load", 0.03)):
-        gains, table = everything.summary["gains"][side], getattr(everything.model.observer, side)
+        gains, table = full_identification.summary["gains"][side], getattr(full_identification.model.observer, side)
         assert (table.lambda_, table.alpha) == (gains["lambda_"], gains["alpha"])
         assert table.alpha > gains["f_plus"]
-        difference = (everything.trace[f"{side}.velocity_estimate"] - everything.trace[f"{side}.velocity"])[250:]
+        difference = (
+            full_identification.trace[f"{side}.velocity_estimate"] - full_identification.trace[f"{side}.velocity"]
+        )[250:]
         assert np.sqrt(np.mean(difference**2)) == pytest.approx(gains["velocity_error"], rel=0.01)
         assert gains["velocity_error"] < tolerance
 
 
-def test_numbers_are_tried_out_on_another_log(everything):
-    holdout = everything.summary["holdout"]
+def test_numbers_are_tried_out_on_another_log(full_identification):
+    holdout = full_identification.summary["holdout"]
     assert holdout["file"].endswith("log1.csv")
     for side, noise in (("motor", 1e-4), ("load", 2e-5)):
         position = holdout["position"][side]
@@ -210,14 +212,14 @@ def test_numbers_are_tried_out_on_another_log(everything):
     assert torque["relative"] < 0.3 * torque["nominal_relative"]
 
 
-def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp_path):
-    lines = "\n".join(write_identification_report(everything, tmp_path))
+def test_model_replays_the_log_where_the_study_has_no_excitation(full_identification, tmp_path):
+    lines = "\n".join(write_identification_report(full_identification, tmp_path))
     assert "On log1.csv, motor: position residual over 0.5 s" in lines
     assert "motor observer: lambda = " in lines
     assert "(transmission)" in lines
     excitation = prepare(read_config(tmp_path / "model.toml")).excitation
-    torque = jax.vmap(excitation)(jnp.asarray(everything.trace["t"]))
-    np.testing.assert_allclose(torque, everything.trace["u"], atol=1e-12)
+    torque = jax.vmap(excitation)(jnp.asarray(full_identification.trace["t"]))
+    np.testing.assert_allclose(torque, full_identification.trace["u"], atol=1e-12)
     page = (tmp_path / "report.html").read_text()
     assert "by profile from" in page
     assert "with the measured transmitted torque" in page
@@ -285,8 +287,8 @@ def test_a_direction_that_the_log_does_not_show_is_refused(tmp_path):
     assert set(refusal["direction"]) == scaled
     np.testing.assert_allclose([refusal["direction"][path] for path in torques], refusal["direction"][INERTIA], rtol=0.05)
     assert "what would help: " in refusal["why"] and "a load or an inertia that is known" in refusal["why"]
-    (held,) = summary["held"]
-    assert held in scaled and set(summary["parameters"]) == {*scaled, "effects.load.gravity.phase"} - {held}
+    (group,) = summary["held"]
+    assert group in scaled and set(summary["parameters"]) == {*scaled, "effects.load.gravity.phase"} - {group}
     # with that number held, the log shows all others
     for parameter in summary["parameters"].values():
         assert parameter["standard_error"] < 0.02
@@ -348,7 +350,7 @@ def test_xl330_pendulum_swings_freely():
         | {"absent": ["u"], "where": {"torque_enable": False}, "resample": 3.5e-3},
         identify={"starts": 1, "window": 3.9},
     )
-    logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
+    logs = [find_recording(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
     identification = identify(logs, study)
     assert identification.summary["residual"]["motor"]["rms"] < 0.019
     parameters = identification.summary["parameters"]

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 import pytest
-from measured import NOMINAL, axis
+from measured import NOMINAL, simulate_axis
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
@@ -19,11 +19,11 @@ MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4
 def write_log(path: Path, seed: int, zero: float) -> Path:
     """A log of a motor with cogging of 5 a turn, whose encoder has a zero of its own."""
     time = 1e-3 * np.arange(6000)
-    place = 20.0 * np.sin(1.5 * time + seed)
+    position = 20.0 * np.sin(1.5 * time + seed)
     speed, change = 30.0 * np.cos(1.5 * time + seed), -45.0 * np.sin(1.5 * time + seed)
-    torque = 4e-5 * change + 1e-4 * speed + 2e-3 * np.sin(5.0 * place)
+    torque = 4e-5 * change + 1e-4 * speed + 2e-3 * np.sin(5.0 * position)
     noise = np.random.default_rng(seed).standard_normal((2, len(time)))
-    pd.DataFrame({"t": time, "u": torque + 3e-4 * noise[0], "theta_e": place - zero + 1e-4 * noise[1]}).to_csv(path)
+    pd.DataFrame({"t": time, "u": torque + 3e-4 * noise[0], "theta_e": position - zero + 1e-4 * noise[1]}).to_csv(path)
     return path
 
 
@@ -47,8 +47,8 @@ def test_logs_with_other_zeros_are_turned_to_that_of_the_first(paths: list[Path]
     assert warning.startswith(
         "1.csv: theta_e counts from another zero than in 0.csv, by the torque that repeats 5 times a turn"
     )
-    held = read_logs(config, paths[2], like=record)
-    np.testing.assert_allclose(ahead(held, paths[2:]), [-0.2], atol=0.02)
+    holdout = read_logs(config, paths[2], like=record)
+    np.testing.assert_allclose(ahead(holdout, paths[2:]), [-0.2], atol=0.02)
 
 
 def test_an_offset_that_is_given_stands(paths: list[Path]):
@@ -85,23 +85,23 @@ GEARED = {
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_clock_that_one_log_is_sure_of_holds_for_all_and_for_the_held_out_log(tmp_path: Path, order: tuple[int, int]):
     """A machine's load has a late clock; one log has too much noise to show it."""
-    frames = [axis(skew=3e-3, seed=seed) for seed in range(3)]
+    frames = [simulate_axis(skew=3e-3, seed=seed) for seed in range(3)]
     frames[1]["theta_s"] += 0.1 * np.random.default_rng(0).standard_normal(len(frames[1]))
     for i, frame in enumerate(frames):
         frame.to_parquet(tmp_path / f"{i}.parquet")
     config, _ = read_model(GEARED)
-    alone = [read_logs(config, tmp_path / f"{i}.parquet") for i in range(3)]
-    assert [list(record.corrections) for record in alone] == [["skew"], [], ["skew"]]
-    record, held = read_with_holdout(config, [tmp_path / f"{i}.parquet" for i in order], tmp_path / "2.parquet")
-    assert held is not None
-    moved = f"theta_s: shifted by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
-    assert sum(moved in note for note in record.notes) == 2 and moved in held.notes
-    assert record.corrections == held.corrections == alone[0].corrections
+    single_records = [read_logs(config, tmp_path / f"{i}.parquet") for i in range(3)]
+    assert [list(record.corrections) for record in single_records] == [["skew"], [], ["skew"]]
+    record, holdout = read_with_holdout(config, [tmp_path / f"{i}.parquet" for i in order], tmp_path / "2.parquet")
+    assert holdout is not None
+    moved = f"theta_s: shifted by its skew of {1e3 * single_records[0].corrections['skew']:.4g} ms."
+    assert sum(moved in note for note in record.notes) == 2 and moved in holdout.notes
+    assert record.corrections == holdout.corrections == single_records[0].corrections
 
 
 def test_a_record_is_checked_as_a_file_is(tmp_path: Path):
     """It was read without the study, which may need what it lacks."""
-    axis().drop(columns="u").to_parquet(tmp_path / "free.parquet")
+    simulate_axis().drop(columns="u").to_parquet(tmp_path / "free.parquet")
     free = read_record(tmp_path / "free.parquet", {"absent": ["u"]}, gear_ratio=20.0)
     config, _ = read_model(GEARED)
     with pytest.raises(InputError, match=r"free\.parquet: without u a motion shows torques only as multiples"):
@@ -113,8 +113,8 @@ def test_a_record_is_checked_as_a_file_is(tmp_path: Path):
 
 
 def test_a_held_out_log_has_the_positions_of_the_log(tmp_path: Path):
-    axis().to_parquet(tmp_path / "both.parquet")
-    axis(seed=1).drop(columns="theta_s").to_parquet(tmp_path / "motor.parquet")
+    simulate_axis().to_parquet(tmp_path / "both.parquet")
+    simulate_axis(seed=1).drop(columns="theta_s").to_parquet(tmp_path / "motor.parquet")
     config, _ = read_model(GEARED)
     with pytest.raises(InputError, match=r"motor\.parquet: has no load position, which .*both\.parquet has"):
         read_with_holdout(config, tmp_path / "both.parquet", tmp_path / "motor.parquet")

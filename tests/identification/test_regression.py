@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from filtered_derivatives import differentiate
-from measured import EMPS, real
+from measured import EMPS, find_recording
 from scipy import signal
 from small_study import rigid_study, small_study
 
@@ -147,7 +147,7 @@ def test_emps_by_the_published_method_and_measure():
     paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque",
              "effects.motor.constant_torque.torque"]  # fmt: skip
     free = make_free_parameters(experiment, paths, 50.0)
-    records = [read_record(real(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
+    records = [read_record(find_recording(f"emps/DATA_EMPS{name}.mat"), config.log) for name in ("", "_PULSES")]
     parts = [differentiate(r.time, r.torque, r.positions, 100.0) for r in records]
     result = regress(experiment, free, parts[:1], 10)
     values = [float(number.value(result.theta[i])) for i, number in enumerate(free)]

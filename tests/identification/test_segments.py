@@ -23,7 +23,7 @@ LAG = {"kind": "actuator.lag", "time_constant": 0.05}
 
 
 @pytest.fixture(scope="module")
-def setting(tmp_path_factory):
+def lagged_log(tmp_path_factory):
     t = 2e-3 * np.arange(2000)
     path = tmp_path_factory.mktemp("log") / "axis.csv"
     simulate_direct_drive(0.5 * np.sin(2.0 * np.pi * 1.3 * t), [LAG], 3e-5, 1).write(path)
@@ -33,8 +33,8 @@ def setting(tmp_path_factory):
     return record, experiment, segments_of(record, experiment.sides)
 
 
-def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
-    record, experiment, segments = setting
+def test_windows_begin_with_the_torque_that_the_actuator_makes_then(lagged_log):
+    record, experiment, segments = lagged_log
     windows, firsts = windows_of(segments, experiment, 250)
     keep = np.exp(-2e-3 / LAG["time_constant"])
     actuator_torque = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
@@ -44,8 +44,8 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
     np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[jnp.asarray(firsts)])
 
 
-def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
-    full, _, _ = setting
+def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(lagged_log):
+    full, _, _ = lagged_log
     record = replace(full, segments=(slice(0, 100), slice(100, 900), slice(1000, 2000)))
     # nothing is known before the first part, which is too short to give up any; the others follow on known inputs
     assert led_in(record, False).segments == record.segments
@@ -63,9 +63,9 @@ def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
     assert led_in(free, False).segments == full.segments
 
 
-def test_effects_begin_with_what_the_inputs_before_left(setting):
+def test_effects_begin_with_what_the_inputs_before_left(lagged_log):
     """A dead time and a lag along a part of an input act as along the whole of it."""
-    record, _, _ = setting
+    record, _, _ = lagged_log
     late = [{"kind": "actuator.delay", "delay": 0.0246}, {"kind": "actuator.lag", "time_constant": 0.05}]
     experiment = on_record(read_model(nominal_study(effects=late))[0], record)
     still = {"motor": np.zeros(200)}

@@ -47,7 +47,7 @@ def logs(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def grown(logs):
+def growing_watch(logs):
     """The watch of the gap that grows, and the values it told of."""
     heard = []
     watch = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
@@ -55,7 +55,7 @@ def grown(logs):
 
 
 @pytest.fixture(scope="module")
-def same(logs):
+def steady_watch(logs):
     """The watch of the gap that stays."""
     return jaxbl.watch(logs / "same.csv", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, **WINDOW)
 
@@ -73,8 +73,8 @@ def command(*words):
     return end.value.code or 0
 
 
-def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
-    result, heard = grown
+def test_a_gap_that_grows_is_followed_and_raises_an_alarm(growing_watch):
+    result, heard = growing_watch
     values = result.values
     assert list(values.columns) == watch_columns(result.task)
     assert [row["t"] for row in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
@@ -95,15 +95,15 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
     assert result.summary["alarm"]["half_gap"] > LIMIT
 
 
-def test_a_gap_that_stays_raises_none(same):
-    assert same.summary["alarm"] is None
-    assert same.summary["determined"] == same.summary["values"] == 12
-    assert same.summary["samples"] == 10_000
-    assert same.summary["contradictions"] == 0
-    last = same.summary["last"]
+def test_a_gap_that_stays_raises_none(steady_watch):
+    assert steady_watch.summary["alarm"] is None
+    assert steady_watch.summary["determined"] == steady_watch.summary["values"] == 12
+    assert steady_watch.summary["samples"] == 10_000
+    assert steady_watch.summary["contradictions"] == 0
+    last = steady_watch.summary["last"]
     assert last["half_gap_from"] < HALF_GAP * 1.001
     assert last["half_gap_to"] > HALF_GAP * 0.999
-    assert same.summary["units"]["load"] == {
+    assert steady_watch.summary["units"]["load"] == {
         "half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad",
     }  # fmt: skip
 
@@ -169,8 +169,8 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
         assert values["half_gap"] == motor
 
 
-def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs, grown):
-    log, _ = grown
+def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs, growing_watch):
+    log, _ = growing_watch
     task = read_watch_task(logs / "grown.csv", logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
     live = run_watch(task, ended=looks(12))
     assert live.summary["samples"] == log.summary["samples"]
@@ -178,7 +178,7 @@ def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs, grown):
     pd.testing.assert_frame_equal(live.values, log.values, rtol=1e-6, atol=1e-9)
 
 
-def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, same):
+def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, steady_watch):
     rows = pd.read_csv(logs / "same.csv").to_numpy()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -205,7 +205,7 @@ def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, same):
     live = jaxbl.watch(f"udp://127.0.0.1:{port}", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, ended=ended, **WINDOW)
     sender[0].join()
     assert live.summary["left_out"] == {"malformed datagrams or lines": 101}
-    pd.testing.assert_frame_equal(live.values, same.values, rtol=1e-6, atol=1e-9)
+    pd.testing.assert_frame_equal(live.values, steady_watch.values, rtol=1e-6, atol=1e-9)
 
 
 def test_values_are_the_same_whatever_pieces_rows_come_in(logs):
@@ -393,12 +393,12 @@ def test_a_drive_by_another_simulator(tmp_path):
         assert last[f"{side}.coulomb"] == pytest.approx(friction["torque"], rel=0.15)
 
 
-def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(grown, logs, tmp_path):
+def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(growing_watch, logs, tmp_path):
     log = pd.read_csv(logs / "grown.csv")
     write_mcap(tmp_path / "grown.mcap", {"axis": zip(log.pop("t"), log.to_dict("records"), strict=True)})
     columns = {name: f"/axis.{name}" for name in ("u", "theta_e", "theta_s")}
     data = axis(log=columns)
     watch = jaxbl.watch(tmp_path / "grown.mcap", data, alarm_gap=LIMIT, **WINDOW)
-    pd.testing.assert_frame_equal(watch.values, grown[0].values, rtol=1e-6)
+    pd.testing.assert_frame_equal(watch.values, growing_watch[0].values, rtol=1e-6)
     with pytest.raises(InputError, match=r"grown\.mcap: .*follow"):
         jaxbl.watch(tmp_path / "grown.mcap", data, follow=True, **WINDOW)

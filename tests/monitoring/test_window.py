@@ -127,10 +127,10 @@ def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
     for side in ("motor", "load"):
         spoilt[f"{side}.torque"][12_000:12_090] += 100.0
     assert abs(window_of(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
-    again = Window(prepare_window(axis()), 10.0)
-    again.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
-    again.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
-    assert again.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
+    window = Window(prepare_window(axis()), 10.0)
+    window.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
+    window.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
+    assert window.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
 
 
 @pytest.mark.parametrize("data", [axis(), small_study()], ids=["dead_zone", "sigmoid_backlash"])

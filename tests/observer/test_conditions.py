@@ -74,9 +74,9 @@ def ratio_by_simulation(lambda_, alpha, f_plus):
     turns.terminal = returns.terminal = True
     turns.direction = returns.direction = -1
     settings = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-14}
-    out = solve_ivp(right(f_plus), (0.0, 100.0), [0.0, 1.0], events=turns, **settings)
-    back = solve_ivp(right(-f_plus), (0.0, 100.0), out.y[:, -1], events=returns, **settings)
-    return -back.y[1, -1]
+    outward = solve_ivp(right(f_plus), (0.0, 100.0), [0.0, 1.0], events=turns, **settings)
+    inward = solve_ivp(right(-f_plus), (0.0, 100.0), outward.y[:, -1], events=returns, **settings)
+    return -inward.y[1, -1]
 
 
 # complex and real roots of the first quadrant, below and above the boundary of convergence

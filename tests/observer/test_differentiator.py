@@ -35,20 +35,22 @@ BLOCK = 8000
 """Samples that the one program observes which all signals share: to compile it takes longer than to run it."""
 
 
-def observe(observer, measured, h, acceleration=0.0, velocity=0.0, further=None):
-    """Estimates, and states predicted from them, along measured positions and known accelerations; `further` states at the
-    start."""
+def observe(observer, measured, h, acceleration=0.0, velocity=0.0, higher_states=None):
+    """Estimates, and states predicted from them, along measured positions under known accelerations.
+
+    `higher_states` are the states at the start beyond position and velocity.
+    """
     dtype, count = measured.dtype, len(measured)
-    further = [0.0] * (observer.order - 1) if further is None else further
-    state = ObserverState(*(np.asarray(x, dtype) for x in (measured[0], velocity)), tuple(np.asarray(further, dtype)))
+    higher_states = [0.0] * (observer.order - 1) if higher_states is None else higher_states
+    state = ObserverState(*(np.asarray(x, dtype) for x in (measured[0], velocity)), tuple(np.asarray(higher_states, dtype)))
     length = -(-count // BLOCK) * BLOCK
     signals = (
         np.resize(np.broadcast_to(x, count).astype(dtype), length).reshape(-1, BLOCK) for x in (measured, acceleration)
     )
     blocks = []
     for signals_of_block in zip(*signals, strict=True):
-        state, along = observe_block(observer, state, *signals_of_block, np.asarray(h, dtype))
-        blocks.append(along)
+        state, block_estimates = observe_block(observer, state, *signals_of_block, np.asarray(h, dtype))
+        blocks.append(block_estimates)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
 
 
@@ -124,9 +126,9 @@ def backward_euler(order, lipschitz, h, measured):
             polynomial = np.polynomial.Polynomial([reach - abs(innovation), *(h**j * gains)[:n][::-1], 1.0])
             root = brentq(polynomial, 0.0, abs(innovation) ** (1 / (n + 1)), xtol=1e-300, rtol=1e-15)
             corrections = gains * root ** (n + 1 - j) * np.sign(innovation)
-        above = 0.0
+        next_derivative = 0.0
         for i in range(n, -1, -1):
-            above = z[i] = z[i] + h * (corrections[i] + above)
+            next_derivative = z[i] = z[i] + h * (corrections[i] + next_derivative)
         rows.append(outputs @ z)
     return np.array(rows)
 
@@ -152,14 +154,14 @@ def test_known_accelerations_leave_it_exact(order):
     """A polynomial, and beside it any known acceleration that is held over each period."""
     h, count = 1e-2, 3000
     t = h * np.arange(count)
-    added = np.random.default_rng(2).uniform(-30.0, 30.0, count)
+    acceleration = np.random.default_rng(2).uniform(-30.0, 30.0, count)
     # what the known acceleration makes of velocity and position at the samples
-    speed = np.concatenate([[0.0], h * np.cumsum(added)[:-1]])
-    place = np.concatenate([[0.0], np.cumsum(h * speed + 0.5 * h * h * added)[:-1]])
+    speed = np.concatenate([[0.0], h * np.cumsum(acceleration)[:-1]])
+    position = np.concatenate([[0.0], np.cumsum(h * speed + 0.5 * h * h * acceleration)[:-1]])
     polynomial = np.polynomial.Polynomial(0.5 ** np.arange(order + 1) / [factorial(i) for i in range(order + 1)])
     # acceleration of polynomials of degree 1 is zero: all of it is known
-    y = polynomial(t) + place
-    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(40.0)), y, h, added, velocity=0.3)
+    y = polynomial(t) + position
+    estimate, _ = observe(DIFFERENTIATORS[order](np.asarray(40.0)), y, h, acceleration, velocity=0.3)
     late = slice(-300, None)
     rounding = np.finfo(float).eps * np.abs(y).max()
     velocity = polynomial.deriv()(t) + speed
@@ -248,7 +250,7 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
 
     lanes = zip(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]), strict=True)
-    runs = [observe(observer, y, period, velocity=0.9, further=further) for y, period, *further in lanes]
+    runs = [observe(observer, y, period, velocity=0.9, higher_states=further) for y, period, *further in lanes]
     estimate, state = jax.tree.map(lambda *lanes: np.stack(lanes), *runs)
     estimates = [estimate.position, estimate.velocity]
     if n >= 2:

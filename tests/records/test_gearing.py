@@ -10,7 +10,7 @@ from jaxbl.records import inspect, read_record
 
 
 @pytest.fixture(scope="module")
-def wide():
+def wide_twist_log():
     """Table 1 of the paper under a slow sine: the twist ranges as far as the motor moves."""
     period, count = 1e-3, 20_000
     position, speed, load, load_speed = 0.0, 0.0, 0.0, 0.0
@@ -36,8 +36,8 @@ def looked_at(tmp_path, frame, gear_ratio, log=None):
     return inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio)
 
 
-def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide):
-    inspection = looked_at(tmp_path, wide, 5.0)
+def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide_twist_log):
+    inspection = looked_at(tmp_path, wide_twist_log, 5.0)
     gearing = inspection.record.statistics.gearing
     assert gearing.is_loose and gearing.skew is None
     assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
@@ -52,16 +52,16 @@ def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wi
     # the gap passes for friction in a rigid drive
     for quantity in ("inertia", "viscous friction", "Coulomb friction"):
         assert answers[quantity].answer == "weak" and "loosely" in answers[quantity].reason
-    assert looked_at(tmp_path, wide, None).record.notes == ()
+    assert looked_at(tmp_path, wide_twist_log, None).record.notes == ()
 
 
-def test_what_cannot_be_is_refused_even_then(tmp_path, wide):
+def test_what_cannot_be_is_refused_even_then(tmp_path, wide_twist_log):
     with pytest.raises(InputError, match=r"theta_e - 50 theta_s ranges over 1.9\d rad, .*: gear_ratio, or a unit") as error:
-        looked_at(tmp_path, wide, 50.0)
+        looked_at(tmp_path, wide_twist_log, 50.0)
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="gear_ratio, or a unit in"):
-        looked_at(tmp_path, wide, 5.0, {"theta_s": {"column": "theta_s", "unit": "turn"}})
-    notes = looked_at(tmp_path, wide, -5.0).record.notes
+        looked_at(tmp_path, wide_twist_log, 5.0, {"theta_s": {"column": "theta_s", "unit": "turn"}})
+    notes = looked_at(tmp_path, wide_twist_log, -5.0).record.notes
     assert any("perhaps the sign of one of them is wrong" in note for note in notes)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
-from measured import EMPS, GEAR_RATIO, SERVO, XL330, real, simulate_log
+from measured import EMPS, GEAR_RATIO, SERVO, XL330, find_recording, simulate_log
 
 from jaxbl.errors import InputError
 from jaxbl.records import inspect
@@ -171,12 +171,12 @@ def test_the_whole_as_plain_data(tmp_path):
 
 
 def test_real_machines(tmp_path):
-    inspection = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).identifiability}
+    inspection = {j.quantity: j.answer for j in inspect(find_recording("emps/DATA_EMPS.mat"), EMPS).identifiability}
     assert [inspection[q] for q in QUANTITIES] == ["yes"] * 4 + ["no"] + ["weak"] * 2
-    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    inspection = inspect(find_recording("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
     assert [j.answer for j in inspection.identifiability[:5]] == ["no"] * 4 + ["yes"]
     assert np.ptp(np.degrees(inspection.twist)) == pytest.approx(2.9, abs=0.5)
-    free = inspect(real("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
+    free = inspect(find_recording("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
     assert free.identifiability[0].answer == "weak"
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from measured import GEAR_RATIO, SERVO, real, simulate_log
+from measured import GEAR_RATIO, SERVO, find_recording, simulate_log
 
 from jaxbl.records import inspect, lost_motion
 from jaxbl.records.gearing import fit_gearing
@@ -106,7 +106,7 @@ def test_too_little_tells_nothing():
 
 def test_a_real_servo_whose_load_was_turned_around():
     """Published: the load's direction is reversed at 60 to 66 s, which shifts one encoder by 0.39 to 0.40 degrees."""
-    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    inspection = inspect(find_recording("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
     lost = inspection.record.statistics.gearing
     low, high = np.degrees(lost.lost_motion_interval)
     assert lost.flank == "load" and len(lost.flank_times) == 1

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from measured import INERTIA, VISCOUS, axis, real, simulate_log
+from measured import INERTIA, VISCOUS, find_recording, simulate_axis, simulate_log
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
@@ -57,7 +57,7 @@ def test_each_quantity_finds_its_column(names, tmp_path):
 
 def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
     """The proposed [log] reads the log, although an integral has no zero that it could name."""
-    frame = axis(3.04e-3, 0.379)
+    frame = simulate_axis(3.04e-3, 0.379)
     speed = np.gradient(frame["theta_e"], frame["t"])
     frame = frame.rename(columns={"theta_s": "load angle"}).drop(columns="theta_e").assign(**{"motor speed": speed})
     frame.to_csv(tmp_path / "log.csv", index=False)
@@ -102,7 +102,7 @@ def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
 
 
 def test_two_encoders_with_a_clock_and_a_zero_of_their_own(tmp_path):
-    axis(3.04e-3, 0.379).to_csv(tmp_path / "log.csv", index=False)
+    simulate_axis(3.04e-3, 0.379).to_csv(tmp_path / "log.csv", index=False)
     study, _, inspection = propose_study(tmp_path / "log.csv")
     config, _ = read_model(study)
     assert config.drive.gear_ratio == 20.0
@@ -125,7 +125,7 @@ def test_what_cannot_be_guessed_is_refused(tmp_path):
 
 
 def test_an_export_of_drive_software_gives_a_study():
-    study, guesses, _ = propose_study(real("screw_drives/experiments/driveNo2/start_stop/50.csv"))
+    study, guesses, _ = propose_study(find_recording("screw_drives/experiments/driveNo2/start_stop/50.csv"))
     assert study["log"]["omega_e"] == {"column": "Velocity actual value averaged", "unit": "rpm"}
     assert study["log"]["u"]["factor"] == 0.01 and any("of one %" in guess for guess in guesses)
     read_model(study)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
-from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, real, simulate_log
+from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, find_recording, simulate_log
 from small_study import small_study
 
 from jaxbl.errors import InputError
@@ -195,8 +195,8 @@ def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, 
 def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
     frame = simulate_log(uneven())
     kept_rows = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
-    again = pd.concat([kept_rows.iloc[:500], kept_rows.iloc[[499, 499]], kept_rows.iloc[500:]])
-    record = read_record(write_frame(tmp_path, again), gear_ratio=GEAR_RATIO)
+    repeated = pd.concat([kept_rows.iloc[:500], kept_rows.iloc[[499, 499]], kept_rows.iloc[500:]])
+    record = read_record(write_frame(tmp_path, repeated), gear_ratio=GEAR_RATIO)
     sampling = record.statistics.sampling
     assert (sampling.repeated, sampling.gaps, len(record.segments)) == (2, 2, 3)
     assert sampling.longest_interval == pytest.approx(0.21, rel=0.05)
@@ -619,7 +619,7 @@ def test_a_column_alone_stands_for_its_table_and_the_table_survives_toml():
 
 def test_emps_is_read_as_published():
     for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
-        record = read_record(real(f"emps/{name}"), EMPS)
+        record = read_record(find_recording(f"emps/{name}"), EMPS)
         assert (len(record.time), record.sample_period) == (24841, pytest.approx(1e-3))
         assert record.statistics.sampling.even and record.closed_loop
         assert record.notes == ("There is no theta_s (load position) in this log.",)
@@ -633,11 +633,11 @@ def test_emps_is_read_as_published():
 
 def test_emps_with_the_wrong_sign_is_refused():
     with pytest.raises(InputError, match="the torque has the wrong sign"):
-        read_record(real("emps/DATA_EMPS.mat"), EMPS | {"u": EMPS["u"] | {"sign": -1}})
+        read_record(find_recording("emps/DATA_EMPS.mat"), EMPS | {"u": EMPS["u"] | {"sign": -1}})
 
 
 def test_xl330_records_are_resampled():
-    files = sorted(real("bam_xl330").glob("*.json"))
+    files = sorted(find_recording("bam_xl330").glob("*.json"))
     assert len(files) == 8
     for file in files:
         record = read_record(file, XL330)
@@ -655,7 +655,7 @@ def test_xl330_records_are_resampled():
 
 
 def test_servoproject_has_two_encoders_and_no_torque():
-    path = real("servoproject_dual_encoder/outputEncoderData.txt")
+    path = find_recording("servoproject_dual_encoder/outputEncoderData.txt")
     record = read_record(path, SERVO, gear_ratio=1.0)
     assert (len(record.time), record.torque) == (42000, None)
     assert record.statistics.gearing.ratio == pytest.approx(1.0, abs=0.01)
@@ -681,7 +681,7 @@ def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_pa
 
 
 @pytest.fixture
-def logs(tmp_path):
+def write_and_read(tmp_path):
     def write(name, **how):
         simulate_log(**how).to_csv(tmp_path / name, index=False)
         return read_record(tmp_path / name)
@@ -689,8 +689,8 @@ def logs(tmp_path):
     return write
 
 
-def test_each_log_is_a_segment_with_its_own_rows(logs):
-    first, second = logs("a.csv", count=1500), logs("b.csv", count=2500, seed=1)
+def test_each_log_is_a_segment_with_its_own_rows(write_and_read):
+    first, second = write_and_read("a.csv", count=1500), write_and_read("b.csv", count=2500, seed=1)
     joined = join_records([first, second])
     assert len(joined.time) == 4000
     assert [(part.start, part.stop) for part in joined.segments] == [(0, 1500), (1500, 4000)]
@@ -703,8 +703,8 @@ def test_each_log_is_a_segment_with_its_own_rows(logs):
     assert join_records([first]) is first
 
 
-def test_logs_that_are_not_alike(logs, tmp_path):
-    first, slow = logs("a.csv"), logs("slow.csv", period=2e-3)
+def test_logs_that_are_not_alike(write_and_read, tmp_path):
+    first, slow = write_and_read("a.csv"), write_and_read("slow.csv", period=2e-3)
     with pytest.raises(
         InputError, match=r"slow\.csv: is sampled every 0\.002 s, .*a\.csv every 0\.001 s; set \[log\] resample = "
     ):
@@ -732,7 +732,7 @@ def test_a_speed_stands_for_a_position(tmp_path):
 def test_an_export_of_drive_software_is_read_as_it_is():
     """Screw drives (TRO 2021): remarks, names, units, speed in place of a position."""
     log = {"t": {"unit": "ms"}, "omega_e": {"column": 1, "unit": "rpm"}, "u": {"column": 2, "factor": 9.84e-5}}
-    record = read_record(real("screw_drives/experiments/driveNo2/start_stop/50.csv"), log)
+    record = read_record(find_recording("screw_drives/experiments/driveNo2/start_stop/50.csv"), log)
     assert record.sample_period == pytest.approx(0.04, rel=1e-7) and len(record.time) == 500
     speed = np.diff(record.positions["motor"]) / 0.04 * 30.0 / math.pi
     assert np.abs(speed).max() == pytest.approx(53.0, abs=3.0)

@@ -9,7 +9,7 @@ from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, SCAN_NAME, BenchResult, B
 
 
 @pytest.fixture
-def result():
+def bench_result():
     rows = []
     for precision, speed in (("float32", 2e9), ("float64", 5e8)):
         for name, share in ((CPP_NAME, 1.0), (FUSED_NAME, 0.8), (SCAN_NAME, 0.2), ("diffrax, Euler, one device", 1e-5)):
@@ -26,8 +26,8 @@ def result():
     return BenchResult(machine, rows, curve, study, [row], {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
 
 
-def test_files_and_figures(result, tmp_path):
-    write_bench_report(result, tmp_path)
+def test_files_and_figures(bench_result, tmp_path):
+    write_bench_report(bench_result, tmp_path)
     content = json.loads((tmp_path / "bench.json").read_text())
     row = next(r for r in content["rows"] if (r["name"], r["precision"]) == (FUSED_NAME, "float64"))
     assert row["lane_steps_per_second"] == pytest.approx(4e8)
@@ -36,8 +36,8 @@ def test_files_and_figures(result, tmp_path):
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["lanes.png", "throughput.png"]
 
 
-def test_the_table_says_who_where_and_how_far_from_the_ceiling(result):
-    lines = throughput_lines(result)
+def test_the_table_says_who_where_and_how_far_from_the_ceiling(bench_result):
+    lines = throughput_lines(bench_result)
     assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
     ours = next(line for line in lines if line.startswith(FUSED_NAME))
     assert lines[3].split() == ["float32", "lanes", "best", "median", "of", "C++", "first", "off", "by"]

@@ -31,7 +31,7 @@ AXES = [spaced_axis(ALPHA, 5.0, 20.0, 3), listed_axis(LAMBDA, 4.0, 8.0)]
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory):
+def studies_folder(tmp_path_factory):
     """Two studies, of which the second moves further at more points."""
     place = tmp_path_factory.mktemp("studies")
     more = [spaced_axis(ALPHA, 5.0, 80.0, 5), AXES[1]]
@@ -41,8 +41,8 @@ def folders(tmp_path_factory):
     return place
 
 
-def test_command_writes_text_json_and_figure(folders, run_command):
-    words = ["compare", str(folders / "before"), str(folders / "after"), "--out", str(folders / "both")]
+def test_command_writes_text_json_and_figure(studies_folder, run_command):
+    words = ["compare", str(studies_folder / "before"), str(studies_folder / "after"), "--out", str(studies_folder / "both")]
     code, output = run_command(*words)
     assert code == 0, output
     assert "excitation.amplitude: 0.1 -> 0.4" in output
@@ -51,27 +51,31 @@ def test_command_writes_text_json_and_figure(folders, run_command):
     assert "motor.f_plus_acceleration" in "".join(output.splitlines()[head:])
     assert "Points: 6 in both; 0 in the first alone, 4 in the second alone." in output
     assert "Noise: by differences seed by seed, 4 seeds" in output
-    data = json.loads((folders / "both" / "comparison.json").read_text())
+    data = json.loads((studies_folder / "both" / "comparison.json").read_text())
     assert data["config"]["excitation.amplitude"] == [0.1, 0.4]
     assert data["points"] == {"both": 6, "first_only": 0, "second_only": 4}
     sizes = next(metric for metric in data["metrics"] if metric["metric"] == "motor.f_plus_acceleration")
     # the acceleration of a linear drive is in proportion to its input
     assert (sizes["points"], sizes["differs"], sizes["up"]) == (6, 6, 6)
     assert sizes["moved"]["value"] == pytest.approx(4.0, rel=1e-6)
-    assert (folders / "both" / "figures" / "comparison.png").stat().st_size > 5000
+    assert (studies_folder / "both" / "figures" / "comparison.png").stat().st_size > 5000
     # again into the same folder, without a difference now: no figure is left
-    code, output = run_command("compare", str(folders / "before"), str(folders / "before"), "--out", str(folders / "both"))
+    code, output = run_command(
+        "compare", str(studies_folder / "before"), str(studies_folder / "before"), "--out", str(studies_folder / "both")
+    )
     assert code == 0, output
     assert "Config: no difference that decides a number." in output
     assert "metric  " not in output
-    assert not (folders / "both" / "figures" / "comparison.png").exists()
+    assert not (studies_folder / "both" / "figures" / "comparison.png").exists()
 
 
-def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, run_command):
-    shutil.copytree(folders / "before", tmp_path / "part")
+def test_unfinished_studies_are_compared_as_far_as_they_are(studies_folder, tmp_path, run_command):
+    shutil.copytree(studies_folder / "before", tmp_path / "part")
     manifest = tmp_path / "part" / "manifest.json"
     manifest.write_text(json_with_checksum(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
-    code, output = run_command("compare", str(folders / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out"))
+    code, output = run_command(
+        "compare", str(studies_folder / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out")
+    )
     assert code == 0, output
     assert "is not finished: 24 of 48 runs are compared." in " ".join(output.split())
 
@@ -83,8 +87,10 @@ def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, r
         ("after", "before", "before: is not empty and holds no comparison; choose another folder with --out"),
     ],
 )
-def test_bad_input(folders, run_command, second, out, message):
-    code, output = run_command("compare", str(folders / "before"), str(folders / second), "--out", str(folders / out))
+def test_bad_input(studies_folder, run_command, second, out, message):
+    code, output = run_command(
+        "compare", str(studies_folder / "before"), str(studies_folder / second), "--out", str(studies_folder / out)
+    )
     assert code == 2
     assert message in output
-    assert not (folders / "new").exists()
+    assert not (studies_folder / "new").exists()

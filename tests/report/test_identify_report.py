@@ -7,7 +7,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from matplotlib.figure import Figure
 from small_study import rigid_study, small_study
 
@@ -170,7 +170,7 @@ def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
 def test_the_page_in_a_browser(tmp_path):
     write_identification_report(make_identification(CASES["dead zone"][0], tmp_path), tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
-        check(page, len(GEARED))
+        check_figures(page, len(GEARED))
 
 
 def test_a_linear_axis_has_newtons_and_metres(tmp_path):

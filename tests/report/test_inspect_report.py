@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from browser import check, needs_chromium, open_pages
-from measured import GEAR_RATIO, SERVO, real, simulate_log
+from browser import check_figures, needs_chromium, open_pages
+from measured import GEAR_RATIO, SERVO, find_recording, simulate_log
 from test_page import Page
 
 from jaxbl.records import inspect
@@ -90,11 +90,11 @@ def test_the_page_in_a_browser(tmp_path):
     simulate_log(gap=0.1).to_parquet(tmp_path / "log.parquet")
     write_inspection_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
-        check(page, 4)
+        check_figures(page, 4)
 
 
 def test_a_real_log_with_two_encoders(tmp_path):
-    inspection = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    inspection = inspect(find_recording("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
     twist = draw_inspection(inspection)[-1]
     assert twist.name == "twist" and len(twist.figure.axes) == 1
     labels = [text.get_text() for text in twist.figure.axes[0].get_legend().get_texts()]

@@ -297,9 +297,9 @@ def test_more_parts_than_a_figure_can_have(figure, key, part):
     axes = [*GAINS, spaced_axis(NOISE, 1e-6, 1e-3, 61)]
     with pytest.raises(InputError) as error:
         draw(make_result(rigid_study(axes=axes, figures=[figure(**{key: NOISE})])))
-    output = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
-    output += "can be drawn; name another axis, or give it fewer values"
-    assert str(error.value) == output
+    message = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
+    message += "can be drawn; name another axis, or give it fewer values"
+    assert str(error.value) == message
     # a study that asks for no figures gets one all the same
     (drawing,) = draw(make_result(rigid_study(axes=axes[::-1])))
     assert drawing.caption.endswith(f"median over {NOISE}.")

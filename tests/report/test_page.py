@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pandas as pd
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.files import write_atomic
@@ -129,7 +129,7 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     long = NextStep(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
     write_sweep_report(result, tmp_path, [long])
     with open_pages(tmp_path / "report.html", color_scheme="dark") as (page,):
-        check(page, 1)
+        check_figures(page, 1)
         view, values = page.locator(".view"), page.locator(".values")
         panel = json.loads(page.locator("figure script").text_content())[0]
         left, top, width, height = panel["place"]
@@ -184,7 +184,7 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
     text = html(names[2], names, names, [(names[0], picture)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
     with open_pages(tmp_path / "page.html") as (page,):
-        check(page, 2)
+        check_figures(page, 2)
         page.locator(".view").first.hover()
         for name in names[:3]:
             assert page.get_by_text(name, exact=True).count() >= 3
@@ -217,7 +217,7 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
         write_sweep_report(make_result(rigid_study(**data), **columns), tmp_path / name)
     with open_pages(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
         for page in pages:
-            check(page, 1)
+            check_figures(page, 1)
         page_by_study = dict(zip(studies, pages, strict=True))
         assert page_by_study["texts"].locator("h1").text_content() == title
         assert page_by_study["texts"].get_by_text(title, exact=True).count() == 3

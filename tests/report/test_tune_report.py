@@ -8,7 +8,7 @@ import tomllib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm, to_rgb
 from small_study import small_study
@@ -35,21 +35,21 @@ def tuning():
 
 
 @pytest.fixture(scope="module")
-def folder(tuning, tmp_path_factory):
+def report_folder(tuning, tmp_path_factory):
     path = tmp_path_factory.mktemp("tuned")
     path.joinpath("lines").write_text("\n".join(write_tune_report(tuning, path)))
     return path
 
 
-def test_gains_can_be_included_and_run(folder, tuning):
-    text = (folder / "gains.toml").read_text(encoding="utf-8")
+def test_gains_can_be_included_and_run(report_folder, tuning):
+    text = (report_folder / "gains.toml").read_text(encoding="utf-8")
     # exact numbers, and what they are for
     assert {side: tomllib.loads(text)["observer"][side]["alpha"] for side in ("motor", "load")} == {
         side: gains["alpha"] for side, gains in tuning.summary["gains"].items()
     }
     assert "# Objective: worst velocity_rmse (rad/s) over seeds and scenarios; 1 noise seed and 1 drive." in text
     assert "two <b> sides" in text
-    study = small_study({"include": str(folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
+    study = small_study({"include": str(report_folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
     config = read_config(study)
     for side, gains in tuning.summary["gains"].items():
         observer = getattr(config.observer, side)
@@ -58,14 +58,14 @@ def test_gains_can_be_included_and_run(folder, tuning):
     assert run(study).summary["conditions"]["motor"]["alpha"] == tuning.summary["gains"]["motor"]["alpha"]
 
 
-def test_numbers_figures_and_page(folder, tuning):
-    assert json.loads((folder / "tuning.json").read_text(encoding="utf-8")) == tuning.summary
+def test_numbers_figures_and_page(report_folder, tuning):
+    assert json.loads((report_folder / "tuning.json").read_text(encoding="utf-8")) == tuning.summary
     names = ["limits_load", "limits_motor", "pareto_load", "pareto_motor", "tuning_holdout", "tuning_load", "tuning_motor"]
-    assert sorted(path.stem for path in (folder / "figures").iterdir()) == names
+    assert sorted(path.stem for path in (report_folder / "figures").iterdir()) == names
     assert plt.get_fignums() == []
-    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    page = Page((report_folder / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == 7
-    lines = (folder / "lines").read_text().splitlines()
+    lines = (report_folder / "lines").read_text().splitlines()
     for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
         assert text in page.text
     assert lines[0].startswith(f"motor: lambda = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
@@ -169,9 +169,9 @@ def test_comparison_draws_what_the_numbers_say(tuning):
 
 
 @needs_chromium
-def test_bars_have_the_names_beside_them(folder, tuning):
-    with open_pages(folder / "report.html") as (page,):
-        check(page, 7)
+def test_bars_have_the_names_beside_them(report_folder, tuning):
+    with open_pages(report_folder / "report.html") as (page,):
+        check_figures(page, 7)
         figure = page.locator("figure[data-name=tuning_holdout]")
         panel = json.loads(figure.locator("script").text_content())[0]
         left, bottom, width, height = panel["bars"][0]

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import tomli_w
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from shared_results import VERIFIED
 
 from jaxbl.report.verify import draw_verdict, write_verify_report
@@ -91,7 +91,7 @@ def test_tuning_rules_in_figure_page_and_lines(verify_report):
 @needs_chromium
 def test_the_page_in_a_browser(verify_report):
     with open_pages(verify_report[1] / "report.html") as (page,):
-        check(page, 7)
+        check_figures(page, 7)
 
 
 def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):

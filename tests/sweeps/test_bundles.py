@@ -28,14 +28,14 @@ _submit = Cluster._submit
 
 
 def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path, client, computed_chunks):
-    alone = sweep(thirty_run_study(), tmp_path / "alone")
+    expected = sweep(thirty_run_study(), tmp_path / "alone")
     count = len(computed_chunks)
     computed_chunks.clear()
     calls = []
     result = sweep(thirty_run_study(), tmp_path / "cluster", scheduler=client, progress=lambda *done: calls.append(done))
     assert sorted(computed_chunks) == list(range(count)) and count == 8
     assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
-    pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
+    pd.testing.assert_frame_equal(result.frame, expected.frame, check_exact=True)
     assert result.cost["lanes"] == 30 and result.cost["run_seconds"] > 0.0
     assert calls[-1] == (30, 30) and calls == sorted(calls)
     # what is there is left out
@@ -77,12 +77,12 @@ def test_workers_of_a_client_that_was_lost_are_waited_for(tmp_path, client):
 
 def test_a_refined_study_on_a_cluster(tmp_path, client):
     axes = [spaced_axis(ALPHA, 5.0, 20.0, 9), spaced_axis(LAMBDA, 0.3, 5.0, 9)]
-    changed = thirty_run_study(axes=axes, sweep={"seeds": 2, "chunk": 16, "refine": 2})
-    alone = sweep(changed, tmp_path / "alone")
-    sweep(changed, tmp_path / "cluster", scheduler=client)
+    refined_data = thirty_run_study(axes=axes, sweep={"seeds": 2, "chunk": 16, "refine": 2})
+    expected = sweep(refined_data, tmp_path / "alone")
+    sweep(refined_data, tmp_path / "cluster", scheduler=client)
     assert read_parts(tmp_path / "cluster") == read_parts(tmp_path / "alone")
     # grids of 9 x 9 and 33 x 33
-    assert 2 * 9**2 < len(alone.frame) < 2 * 33**2
+    assert 2 * 9**2 < len(expected.frame) < 2 * 33**2
 
 
 def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed_chunks, monkeypatch):

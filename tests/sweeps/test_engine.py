@@ -40,15 +40,15 @@ def study():
 
 
 @pytest.fixture(scope="module")
-def reference(study):
+def reference_frame(study):
     """All 36 lanes in one chunk on one device."""
     engine = Engine(study, Layout(3, 12), jax.devices()[:1])
     assert len(engine) == 1
     return by_point(engine.run(engine.chunk(0)))
 
 
-def test_a_lane_is_the_single_run_of_its_point(study, reference):
-    lane = reference.loc[23]
+def test_a_lane_is_the_single_run_of_its_point(study, reference_frame):
+    lane = reference_frame.loc[23]
     values = {path: float(lane[path]) for path in (NOISE, ALPHA, LAMBDA)}
     metrics = run(with_values(study, values), seed=int(lane["seed"])).summary["metrics"]
     assert metrics["motor.velocity_rmse"] > 0.0
@@ -62,15 +62,15 @@ def test_a_lane_is_the_single_run_of_its_point(study, reference):
 
 
 @pytest.mark.parametrize(("chunk", "devices"), [(36, 2), (25, 2), (10, 1), (1, 2)])
-def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference, chunk, devices):
+def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference_frame, chunk, devices):
     config = with_chunk(study, chunk)
     engine = Engine(config, devices=jax.devices()[:devices])
     # padded: the last chunk of points is not full, or there are more seeds than are left
     assert len(engine) == 1 if chunk == 36 else len(engine) > 1
     frame = by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())]))
     exact = [column for column in frame if engine.layout.seeds > 1 or column not in BOUND]
-    assert_equal(frame[exact], reference[exact])
-    assert_equal(frame, reference, rtol=1e-15)
+    assert_equal(frame[exact], reference_frame[exact])
+    assert_equal(frame, reference_frame, rtol=1e-15)
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -212,11 +212,11 @@ def test_seeds_of_one_point_share_chunks():
     assert frame["motor.velocity_rmse"].nunique() == 10
 
 
-def test_a_seed_is_the_same_noise_for_all_points(reference):
+def test_a_seed_is_the_same_noise_for_all_points(reference_frame):
     # the load's observer does not know the gains of the motor's
-    for _, group in reference.groupby([NOISE, "seed"]):
+    for _, group in reference_frame.groupby([NOISE, "seed"]):
         assert group["load.velocity_rmse"].nunique() == 1
-    assert reference["load.velocity_rmse"].nunique() == 4
+    assert reference_frame["load.velocity_rmse"].nunique() == 4
 
 
 def test_memory_grows_neither_with_points_nor_with_duration():
@@ -284,15 +284,17 @@ def unstable(*values, precision="float64"):
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_diverging_lanes_are_flagged_and_leave_their_neighbours_alone(precision):
     result = sweep(unstable(0.0, 0.01, 1e4, 0.02, precision=precision))
-    wild = result.frame[VISCOUS] == 1e4
-    assert wild.sum() == 2
-    assert (result.frame["finite"] == ~wild).all()
-    assert not result.frame.loc[wild, "motor.converged"].any()
-    assert result.frame.loc[wild, ["motor.velocity_rmse", "motor.f_plus", "motor.convergence_time"]].isna().all(axis=None)
+    diverged = result.frame[VISCOUS] == 1e4
+    assert diverged.sum() == 2
+    assert (result.frame["finite"] == ~diverged).all()
+    assert not result.frame.loc[diverged, "motor.converged"].any()
+    assert (
+        result.frame.loc[diverged, ["motor.velocity_rmse", "motor.f_plus", "motor.convergence_time"]].isna().all(axis=None)
+    )
     assert "2 runs diverged" in headline(result)[1]
-    alone = sweep(unstable(0.0, 0.01, 0.02, precision=precision)).frame
-    assert_equal(result.frame[~wild].reset_index(drop=True), alone)
-    assert len(headline(StudyResult(result.config, alone))) == 2
+    stable_frame = sweep(unstable(0.0, 0.01, 0.02, precision=precision)).frame
+    assert_equal(result.frame[~diverged].reset_index(drop=True), stable_frame)
+    assert len(headline(StudyResult(result.config, stable_frame))) == 2
 
 
 # ---------------------------------------------------------------- structural axes
@@ -307,12 +309,12 @@ def test_structural_axes_end_to_end(tmp_path):
     assert list(result.frame.columns[:4]) == [ALPHA, period, kind, "seed"]
     for h, name in ((1e-3, "implicit"), (2e-3, "explicit")):
         group = result.frame.query(f"`{period}` == @h and `{kind}` == @name")
-        alone = sweep(rigid_study({period: h, kind: name}, axes=axes[:1])).frame
-        assert_equal(group[alone.columns].reset_index(drop=True), alone)
+        single_frame = sweep(rigid_study({period: h, kind: name}, axes=axes[:1])).frame
+        assert_equal(group[single_frame.columns].reset_index(drop=True), single_frame)
     assert result.frame.groupby([period, kind])["motor.velocity_rmse"].sum().nunique() == 4
-    again = sweep(rigid_study(axes=axes), tmp_path / "study")
-    assert again.cost["lanes"] == 0
-    assert_equal(again.frame, result.frame)
+    second = sweep(rigid_study(axes=axes), tmp_path / "study")
+    assert second.cost["lanes"] == 0
+    assert_equal(second.frame, result.frame)
 
 
 # ---------------------------------------------------------------- precision
@@ -356,9 +358,9 @@ def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
     if backend == "scan":
         return
     # none of these follows from gains
-    engine, alone = run(metrics=["converged"])
-    assert list(alone)[4:] == ["finite", "motor.converged"]
-    assert_equal(alone, full[list(alone)])
+    engine, single_metric = run(metrics=["converged"])
+    assert list(single_metric)[4:] == ["finite", "motor.converged"]
+    assert_equal(single_metric, full[list(single_metric)])
     assert engine._gain_metric_dtypes == set()
     # the scan computes the others all the same
     assert engine._operations["fused"].carried < engine._operations["scan"].carried

@@ -43,7 +43,7 @@ def _share(folder, position):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
+def undisturbed_run(tmp_path_factory):
     """Parts of the study that was left alone, and the seconds that it took."""
     folder = tmp_path_factory.mktemp("alone") / "study"
     times = []
@@ -83,8 +83,8 @@ def check(folder, expected):
     assert not list(folder.rglob(".*")) and not (folder / "damaged").exists()
 
 
-def test_killed_at_random_moments(tmp_path, alone, repeats):
-    expected, seconds = alone
+def test_killed_at_random_moments(tmp_path, undisturbed_run, repeats):
+    expected, seconds = undisturbed_run
     rng = random.Random(0)
     kills = rounds = 0
     while kills < repeats(4, 200):
@@ -104,8 +104,8 @@ def test_killed_at_random_moments(tmp_path, alone, repeats):
         check(folder, expected)
 
 
-def test_shares_of_which_one_is_killed(tmp_path, alone):
-    expected, seconds = alone
+def test_shares_of_which_one_is_killed(tmp_path, undisturbed_run):
+    expected, seconds = undisturbed_run
     processes = [start_process(_share, tmp_path / "study", (number, 3)) for number in (1, 2, 3)]
     time.sleep(0.7 * seconds)
     processes[1].kill()
@@ -155,8 +155,8 @@ def count(folder):
     return len(list((folder / "points").glob("part-*"))) if (folder / "points").is_dir() else 0
 
 
-def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, alone):
-    expected, _ = alone
+def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, undisturbed_run):
+    expected, _ = undisturbed_run
     folder = tmp_path / "study"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

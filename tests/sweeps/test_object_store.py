@@ -36,7 +36,7 @@ def bucket():
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
+def disk_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone") / "study"
     return folder, sweep(thirty_run_study(), folder)
 
@@ -49,8 +49,8 @@ def keys(address):
     return {name.removeprefix(f"{prefix}/"): client.get_object(Bucket=bucket, Key=name)["Body"].read() for name in names}
 
 
-def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed_chunks):
-    folder, result = alone
+def test_a_study_in_a_store_is_that_of_a_disk(bucket, disk_study, computed_chunks):
+    folder, result = disk_study
     address = f"{bucket}/a/study"
     first = share(thirty_run_study(), address, (1, 2))
     assert (first.parts, first.finished) == (4, False)
@@ -73,7 +73,7 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed_chunks):
     assert set(keys(address)) == {"manifest.json", "study.toml", *(f"points/part-0000{seed}.parquet" for seed in (0, 1))}
 
 
-def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed_chunks):
+def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_chunks):
     address = f"{bucket}/b"
     sweep(thirty_run_study(), address)
     computed_chunks.clear()
@@ -89,7 +89,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed_chunks)
     with pytest.raises(InputError, match="has lost its manifest"):
         open_study(address)
     assert repair(address)[0] == 8
-    pd.testing.assert_frame_equal(open_study(address).frame, alone[1].frame, check_exact=True)
+    pd.testing.assert_frame_equal(open_study(address).frame, disk_study[1].frame, check_exact=True)
 
 
 def test_a_report_in_a_store(bucket):

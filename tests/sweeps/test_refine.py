@@ -29,16 +29,16 @@ def trace_boundary(function, grid):
     """Simulated vertices as a mask of the fine grid, the function on all of it, and the sizes of the batches."""
     places = [np.linspace(0.0, 1.0, size) for size in grid.sizes]
     full = np.asarray(function(*np.meshgrid(*places, indexing="ij")))
-    batches, asked = [], []
+    batches, requests = [], []
 
     def evaluate(vertices):
         assert (np.diff(vertices) > 0).all()
         batches.append(len(vertices))
-        asked.append(vertices)
+        requests.append(vertices)
         return full.ravel()[vertices]
 
     vertices, values = refine_boundary(grid, evaluate, lambda a, b: a != b)
-    stride = np.concatenate(asked)
+    stride = np.concatenate(requests)
     assert len(np.unique(stride)) == len(stride)
     np.testing.assert_array_equal(vertices, np.sort(stride))
     np.testing.assert_array_equal(values, full.ravel()[vertices])
@@ -59,8 +59,8 @@ def corners(values):
 
 def find_boundary_cells(full):
     """Cells whose corners disagree."""
-    result = corners(full)
-    return (result != result[0]).any(axis=0)
+    corner_values = corners(full)
+    return (corner_values != corner_values[0]).any(axis=0)
 
 
 def simulated_cells(mask):
@@ -481,10 +481,12 @@ def test_every_point_has_all_seeds_and_one_that_disagrees_is_enough():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_first_seed_shifts_the_noise(backend):
     axes = [listed_axis(ALPHA, 5.0, 9.0)]
-    four = sweep(rigid_study(axes=axes, sweep={"seeds": 4}), backend=backend).frame
-    last = sweep(rigid_study(axes=axes, sweep={"seeds": 2, "first_seed": 2}), backend=backend).frame
-    exact = [name for name in four if not name.endswith("convergence_time_bound")]
-    pd.testing.assert_frame_equal(four[four["seed"] >= 2].reset_index(drop=True)[exact], last[exact], check_exact=True)
+    four_seeds = sweep(rigid_study(axes=axes, sweep={"seeds": 4}), backend=backend).frame
+    last_seeds = sweep(rigid_study(axes=axes, sweep={"seeds": 2, "first_seed": 2}), backend=backend).frame
+    exact = [name for name in four_seeds if not name.endswith("convergence_time_bound")]
+    pd.testing.assert_frame_equal(
+        four_seeds[four_seeds["seed"] >= 2].reset_index(drop=True)[exact], last_seeds[exact], check_exact=True
+    )
 
 
 def test_a_number_as_metric_and_one_axis():
@@ -506,10 +508,10 @@ def test_groups_and_listed_axes_are_refined_each_by_itself():
     data = study(refine=2, axes=[structure, *study()["axes"], noise])
     result = sweep(data)
     for period in (1e-3, 2e-3):
-        alone = sweep(study({"run.sample_period": period}, refine=2, axes=[*study()["axes"], noise])).frame
+        single_frame = sweep(study({"run.sample_period": period}, refine=2, axes=[*study()["axes"], noise])).frame
         part = result.frame[result.frame["run.sample_period"] == period].reset_index(drop=True)
-        exact = [name for name in alone if not name.endswith("convergence_time_bound")]
-        pd.testing.assert_frame_equal(part[exact], alone[exact], check_exact=True)
+        exact = [name for name in single_frame if not name.endswith("convergence_time_bound")]
+        pd.testing.assert_frame_equal(part[exact], single_frame[exact], check_exact=True)
     counts = result.frame.groupby(["run.sample_period", NOISE]).size()
     assert (counts > 25).all() and counts.nunique() > 1
 
@@ -544,8 +546,8 @@ def test_a_refined_study_in_a_folder(refined_study, computed_chunks):
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
     computed_chunks.clear()
     before = files(folder)
-    again = sweep(study(), folder)
-    assert (computed_chunks, again.cost["lanes"]) == ([], 0)
+    second = sweep(study(), folder)
+    assert (computed_chunks, second.cost["lanes"]) == ([], 0)
     assert files(folder) == before
     lines = headline(open_study(folder))
     share = f"{100 * len(result.frame) / 33**2:.2g}"

@@ -16,13 +16,13 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
 def test_shares_are_the_whole_study(tmp_path, computed_chunks):
-    alone = sweep(thirty_run_study(), tmp_path / "alone")
+    expected = sweep(thirty_run_study(), tmp_path / "alone")
     computed_chunks.clear()
     folder, calls = tmp_path / "shares", []
     last = share(thirty_run_study(), folder, (3, 3), progress=lambda *done: calls.append(done))
     assert len(computed_chunks) == 2 and not last.complete
     # progress of a share is of its own lanes
-    assert calls[-1][0] == calls[-1][1] == sum(Engine(alone.config).chunk(index).lanes for index in computed_chunks)
+    assert calls[-1][0] == calls[-1][1] == sum(Engine(expected.config).chunk(index).lanes for index in computed_chunks)
     assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
     with lock_folder(folder, shared=True):
         # another one is at work
@@ -36,7 +36,7 @@ def test_shares_are_the_whole_study(tmp_path, computed_chunks):
     result = sweep(thirty_run_study(), folder)
     assert sorted(computed_chunks) == list(range(8))
     assert read_parts(folder) == read_parts(tmp_path / "alone")
-    pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
+    pd.testing.assert_frame_equal(result.frame, expected.frame, check_exact=True)
     assert status(folder).finished
     assert not list(folder.rglob(".*"))
     # more shares than chunks

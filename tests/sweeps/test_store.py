@@ -44,7 +44,7 @@ def finished_study(tmp_path_factory):
 
 
 @pytest.fixture
-def copy(finished_study, tmp_path):
+def study_copy(finished_study, tmp_path):
     """A copy of the finished study's folder."""
     for name, content in files(finished_study[0]).items():
         (tmp_path / "study" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -66,14 +66,14 @@ def test_what_a_study_leaves(finished_study):
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
 
 
-def test_finished_study_is_only_read(copy, finished_study, computed_chunks):
-    before = files(copy)
-    result = sweep(study(), copy)
+def test_finished_study_is_only_read(study_copy, finished_study, computed_chunks):
+    before = files(study_copy)
+    result = sweep(study(), study_copy)
     assert computed_chunks == []
     assert result.cost["lanes"] == 0
-    assert files(copy) == before
+    assert files(study_copy) == before
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
+    pd.testing.assert_frame_equal(open_study(study_copy).frame, finished_study[1].frame)
 
 
 def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, computed_chunks):
@@ -96,8 +96,8 @@ def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished_study, co
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "draft only"])
-def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, computed_chunks, damage):
-    part = copy / "points" / "part-00001.parquet"
+def test_a_chunk_that_is_not_whole_is_computed_again(study_copy, finished_study, computed_chunks, damage):
+    part = study_copy / "points" / "part-00001.parquet"
     content = part.read_bytes()
     part.unlink()
     if damage == "truncated":
@@ -108,17 +108,17 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished_study, compu
         part.with_name(f".{part.name}.1").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(.*\); run 'jaxbl sweep' again"):
-            _ = open_study(copy).frame
+            _ = open_study(study_copy).frame
     else:
-        assert len(open_study(copy).frame) == 6
-    result = sweep(study(), copy)
+        assert len(open_study(study_copy).frame) == 6
+    result = sweep(study(), study_copy)
     assert computed_chunks == [1]
     if damage in ("truncated", "empty"):
         (reason,) = result.damaged
         assert reason.startswith("points/part-00001.parquet") and reason.endswith("it is kept as damaged/part-00001.parquet")
-        assert len(list((copy / "damaged").iterdir())) == 1
+        assert len(list((study_copy / "damaged").iterdir())) == 1
     # drafts of processes that were killed are gone
-    assert not list(copy.rglob(".*"))
+    assert not list(study_copy.rglob(".*"))
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
 
 
@@ -132,26 +132,26 @@ OTHER = {
 
 
 @pytest.mark.parametrize("case", OTHER)
-def test_another_study_in_the_folder_stays_as_it_is(copy, case):
-    before = files(copy)
+def test_another_study_in_the_folder_stays_as_it_is(study_copy, case):
+    before = files(study_copy)
     with pytest.raises(InputError, match=r"holds another study \('small'") as error:
-        sweep(study(**OTHER[case]), copy)
-    assert str(copy) in str(error.value)
-    assert files(copy) == before
+        sweep(study(**OTHER[case]), study_copy)
+    assert str(study_copy) in str(error.value)
+    assert files(study_copy) == before
 
 
-def test_only_title_notes_and_figures_changed_is_the_same_study(copy, computed_chunks):
+def test_only_title_notes_and_figures_changed_is_the_same_study(study_copy, computed_chunks):
     config = read_config(study({"title": "other", "notes": ["a"]}, figures=[FIGURE]))
-    sweep(config, copy)
+    sweep(config, study_copy)
     assert computed_chunks == []
-    assert open_study(copy).config.to_dict() == config.to_dict()
+    assert open_study(study_copy).config.to_dict() == config.to_dict()
 
 
-def test_overwriting_is_asked_for(copy, computed_chunks):
-    result = sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
+def test_overwriting_is_asked_for(study_copy, computed_chunks):
+    result = sweep(study(OTHER["other number"]["changes"]), study_copy, overwrite=True)
     assert computed_chunks == [0, 1, 2]
-    assert len(open_study(copy).frame) == len(result.frame) == 9
-    sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
+    assert len(open_study(study_copy).frame) == len(result.frame) == 9
+    sweep(study(OTHER["other number"]["changes"]), study_copy, overwrite=True)
     assert computed_chunks == [0, 1, 2]
 
 
@@ -165,9 +165,9 @@ MANIFESTS = {
 
 @pytest.mark.parametrize("case", MANIFESTS)
 def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(
-    copy, finished_study, computed_chunks, case
+    study_copy, finished_study, computed_chunks, case
 ):
-    file, content = copy / "manifest.json", MANIFESTS[case]
+    file, content = study_copy / "manifest.json", MANIFESTS[case]
     if content is None:
         file.unlink()
     elif isinstance(content, str):
@@ -176,31 +176,31 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
         data = json.loads(file.read_text())
         content(data)
         file.write_text(json.dumps(data))
-    before = files(copy)
+    before = files(study_copy)
     with pytest.raises(InputError, match=r"lost its manifest\.json; 'jaxbl repair|manifest\.json: is") as error:
-        open_study(copy)
+        open_study(study_copy)
     assert "\n" not in str(error.value)
-    assert files(copy) == before
+    assert files(study_copy) == before
     # as many chunks as there were, whatever is asked for now
-    result = sweep(study(sweep={"seeds": 3, "chunk": 100}), copy)
+    result = sweep(study(sweep={"seeds": 3, "chunk": 100}), study_copy)
     assert computed_chunks == [] and result.damaged == ()
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
-    assert len(list((copy / "points").iterdir())) == 3
+    pd.testing.assert_frame_equal(open_study(study_copy).frame, finished_study[1].frame)
+    assert len(list((study_copy / "points").iterdir())) == 3
 
 
-def test_a_damaged_manifest_without_parts(copy):
-    (copy / "manifest.json").write_text("{")
-    for part in (copy / "points").iterdir():
+def test_a_damaged_manifest_without_parts(study_copy):
+    (study_copy / "manifest.json").write_text("{")
+    for part in (study_copy / "points").iterdir():
         part.unlink()
     with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite"):
-        sweep(study(), copy)
-    assert len(sweep(study(), copy, overwrite=True).frame) == 9
+        sweep(study(), study_copy)
+    assert len(sweep(study(), study_copy, overwrite=True).frame) == 9
 
 
-def test_manifest_of_another_version(copy):
-    (copy / "manifest.json").write_text(json_with_checksum(read_json(copy / "manifest.json") | {"format": 99}))
+def test_manifest_of_another_version(study_copy):
+    (study_copy / "manifest.json").write_text(json_with_checksum(read_json(study_copy / "manifest.json") | {"format": 99}))
     with pytest.raises(InputError, match="has format 99; this version reads 4"):
-        open_study(copy)
+        open_study(study_copy)
 
 
 def flip_bit(folder, random):
@@ -214,84 +214,84 @@ def flip_bit(folder, random):
     return path
 
 
-def test_flipped_bits_are_noticed_and_healed(copy, finished_study, repeats):
+def test_flipped_bits_are_noticed_and_healed(study_copy, finished_study, repeats):
     """None gives other numbers in silence, and one more sweep makes all well."""
-    random, noticed, flips = Random(7), 0, repeats(20, 1000)
-    before = files(copy)
+    random, damaged_count, flips = Random(7), 0, repeats(20, 1000)
+    before = files(study_copy)
     for _ in range(flips):
-        path = flip_bit(copy, random)
+        path = flip_bit(study_copy, random)
         with suppress(InputError):
-            pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
-        result = sweep(study(), copy)
+            pd.testing.assert_frame_equal(open_study(study_copy).frame, finished_study[1].frame)
+        result = sweep(study(), study_copy)
         pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
-        noticed += len(result.damaged)
-        shutil.rmtree(copy / "damaged", ignore_errors=True)
-        healed = files(copy)
-        assert healed.keys() == before.keys()
-        assert {name for name in healed if healed[name] != before[name]} <= {"manifest.json"}, path
-    assert noticed > flips / 2
+        damaged_count += len(result.damaged)
+        shutil.rmtree(study_copy / "damaged", ignore_errors=True)
+        contents = files(study_copy)
+        assert contents.keys() == before.keys()
+        assert {name for name in contents if contents[name] != before[name]} <= {"manifest.json"}, path
+    assert damaged_count > flips / 2
 
 
-def test_parts_that_changed_places_are_computed_anew(copy, finished_study, computed_chunks):
-    first, third = (copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
+def test_parts_that_changed_places_are_computed_anew(study_copy, finished_study, computed_chunks):
+    first, third = (study_copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
     content = first.read_bytes(), third.read_bytes()
     first.write_bytes(content[1])
     third.write_bytes(content[0])
     with pytest.raises(InputError, match=r"part-00000\.parquet: is damaged \(is part 2 of this study\)"):
-        _ = open_study(copy).frame
-    assert len(sweep(study(), copy).damaged) == 2
+        _ = open_study(study_copy).frame
+    assert len(sweep(study(), study_copy).damaged) == 2
     assert computed_chunks == [0, 2]
-    pd.testing.assert_frame_equal(open_study(copy).frame, finished_study[1].frame)
+    pd.testing.assert_frame_equal(open_study(study_copy).frame, finished_study[1].frame)
 
 
-def test_an_edited_part_is_kept_aside(copy, finished_study, computed_chunks):
-    part = copy / "points" / "part-00001.parquet"
+def test_an_edited_part_is_kept_aside(study_copy, finished_study, computed_chunks):
+    part = study_copy / "points" / "part-00001.parquet"
     frame = pd.read_parquet(part)
     frame["motor.velocity_rmse"] *= 1.01
     frame.to_parquet(part, index=False)
     with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(has no header"):
-        _ = open_study(copy).frame
-    sweep(study(), copy)
+        _ = open_study(study_copy).frame
+    sweep(study(), study_copy)
     assert computed_chunks == [1]
-    stored_frame = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
+    stored_frame = pd.read_parquet(study_copy / "damaged" / "part-00001.parquet")
     pd.testing.assert_frame_equal(stored_frame, frame)
 
 
-def test_a_part_of_another_study_is_refused(copy, tmp_path):
+def test_a_part_of_another_study_is_refused(study_copy, tmp_path):
     sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
-    manifest = read_json(copy / "manifest.json")
-    (copy / "manifest.json").write_text(json_with_checksum(manifest | {"checksums": {}, "finished": False}))
-    part = copy / "points" / "part-00001.parquet"
+    manifest = read_json(study_copy / "manifest.json")
+    (study_copy / "manifest.json").write_text(json_with_checksum(manifest | {"checksums": {}, "finished": False}))
+    part = study_copy / "points" / "part-00001.parquet"
     part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
-    before = files(copy)
-    for read in (lambda: sweep(study(), copy), lambda: open_study(copy).frame, lambda: repair(copy)):
+    before = files(study_copy)
+    for read in (lambda: sweep(study(), study_copy), lambda: open_study(study_copy).frame, lambda: repair(study_copy)):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is of another study \('small', other numbers\)"):
             read()
-    assert {name: content for name, content in files(copy).items() if name != "manifest.json"} == {
+    assert {name: content for name, content in files(study_copy).items() if name != "manifest.json"} == {
         name: content for name, content in before.items() if name != "manifest.json"
     }
 
 
 @pytest.mark.parametrize("name", ["part-00099.parquet", "part-3.parquet", "part-copy.parquet"])
-def test_a_part_too_many_is_refused(copy, computed_chunks, name):
-    (copy / "points" / name).write_bytes((copy / "points" / "part-00001.parquet").read_bytes())
-    for read in (lambda: open_study(copy).frame, lambda: sweep(study(), copy)):
+def test_a_part_too_many_is_refused(study_copy, computed_chunks, name):
+    (study_copy / "points" / name).write_bytes((study_copy / "points" / "part-00001.parquet").read_bytes())
+    for read in (lambda: open_study(study_copy).frame, lambda: sweep(study(), study_copy)):
         with pytest.raises(InputError, match=f"{name}: is no part of this study, which has 3; move it away"):
             read()
     assert computed_chunks == []
 
 
-def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed_chunks):
-    (copy / "manifest.json").unlink()
-    (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
-    whole_part_count, store = repair(copy)
+def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(study_copy, computed_chunks):
+    (study_copy / "manifest.json").unlink()
+    (study_copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
+    whole_part_count, store = repair(study_copy)
     assert whole_part_count == 2 and len(store.damaged) == 1 and computed_chunks == []
-    assert not open_study(copy).source.manifest["finished"]
-    assert len(open_study(copy).frame) == 6
-    sweep(copy / "study.toml", copy)
+    assert not open_study(study_copy).source.manifest["finished"]
+    assert len(open_study(study_copy).frame) == 6
+    sweep(study_copy / "study.toml", study_copy)
     assert computed_chunks == [0]
     with pytest.raises(InputError, match=r"holds no study \(no study\.toml\)"):
-        repair(copy / "points")
+        repair(study_copy / "points")
 
 
 def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, computed_chunks):
@@ -305,41 +305,41 @@ def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, comput
     (tmp_path / "study" / "manifest.json").unlink()
     whole_part_count, store = repair(tmp_path / "study")
     assert (whole_part_count, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
-    again = sweep(refined, tmp_path / "study")
+    second = sweep(refined, tmp_path / "study")
     assert computed_chunks == parts and files(tmp_path / "study" / "points") == points
-    pd.testing.assert_frame_equal(again.frame, result.frame)
+    pd.testing.assert_frame_equal(second.frame, result.frame)
 
 
-def test_all_of_it_is_read_where_it_is_asked_for(copy, computed_chunks):
+def test_all_of_it_is_read_where_it_is_asked_for(study_copy, computed_chunks):
     """A part that agrees with a manifest that is wrong as well."""
-    part = copy / "points" / "part-00001.parquet"
+    part = study_copy / "points" / "part-00001.parquet"
     frame = pd.read_parquet(part)
     frame.to_parquet(part, index=False)
-    manifest = read_json(copy / "manifest.json")
+    manifest = read_json(study_copy / "manifest.json")
     manifest["checksums"]["1"] = file_checksum(part)
-    (copy / "manifest.json").write_text(json_with_checksum(manifest))
-    assert sweep(study(), copy).damaged == ()
-    assert len(sweep(study(), copy, verify_store=True).damaged) == 1
+    (study_copy / "manifest.json").write_text(json_with_checksum(manifest))
+    assert sweep(study(), study_copy).damaged == ()
+    assert len(sweep(study(), study_copy, verify_store=True).damaged) == 1
     assert computed_chunks == [1]
 
 
-def test_two_processes_do_not_write_into_one_folder(copy):
+def test_two_processes_do_not_write_into_one_folder(study_copy):
     program = (
         "import sys, pathlib\nfrom jaxbl.files import lock_folder\nwith lock_folder(pathlib.Path(sys.argv[1])):\n"
         "    print('has it', flush=True)\n    sys.stdin.readline()\n"
     )
     other = subprocess.Popen(
-        [sys.executable, "-c", program, str(copy)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", program, str(study_copy)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert other.stdout.readline() == "has it\n"
     with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing into it; wait until it has ended"):
-        sweep(study(), copy)
+        sweep(study(), study_copy)
     # a process that is killed leaves no lock
     other.kill()
     other.communicate()
-    assert (copy / ".lock").exists()
-    sweep(study(), copy)
-    assert not (copy / ".lock").exists()
+    assert (study_copy / ".lock").exists()
+    sweep(study(), study_copy)
+    assert not (study_copy / ".lock").exists()
 
 
 def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished_study):
@@ -379,14 +379,14 @@ def test_unwritable_folder(tmp_path, monkeypatch):
         sweep(study(), tmp_path / "study")
 
 
-def test_folders_without_a_study_or_without_points(tmp_path, copy):
+def test_folders_without_a_study_or_without_points(tmp_path, study_copy):
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(InputError, match="holds no study"):
             Store.open(folder)
-    for part in (copy / "points").iterdir():
+    for part in (study_copy / "points").iterdir():
         part.unlink()
     with pytest.raises(InputError, match="holds no points yet"):
-        _ = open_study(copy).frame
+        _ = open_study(study_copy).frame
 
 
 def test_a_record_is_known_by_its_content(tmp_path):
@@ -410,17 +410,17 @@ def test_files_of_others_are_never_removed(tmp_path):
 
 def test_rows_are_read_as_they_are_asked_for(finished_study):
     folder, result = finished_study
-    opened, full_frame = open_study(folder), result.frame
-    assert len(list(opened.batches(["seed"]))) == 3
+    stored_study, full_frame = open_study(folder), result.frame
+    assert len(list(stored_study.batches(["seed"]))) == 3
     columns = ["motor.f_plus", ALPHA]
-    pd.testing.assert_frame_equal(opened.read(columns), full_frame[columns])
+    pd.testing.assert_frame_equal(stored_study.read(columns), full_frame[columns])
     selected = full_frame[(full_frame["seed"] > 0) & (full_frame[ALPHA] < 20.0)]
-    content = opened.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)])
+    content = stored_study.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)])
     pd.testing.assert_frame_equal(content, selected[columns].reset_index(drop=True))
-    either = opened.read(["seed"], [[("seed", "==", 0)], [(ALPHA, "in", [5.0, 9.0])]])
-    assert len(either) == ((full_frame["seed"] == 0) | full_frame[ALPHA].isin([5.0, 9.0])).sum()
+    either_condition = stored_study.read(["seed"], [[("seed", "==", 0)], [(ALPHA, "in", [5.0, 9.0])]])
+    assert len(either_condition) == ((full_frame["seed"] == 0) | full_frame[ALPHA].isin([5.0, 9.0])).sum()
     # the same of a result in memory
-    memory = StudyResult(opened.config, full_frame)
+    memory = StudyResult(stored_study.config, full_frame)
     pd.testing.assert_frame_equal(memory.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)]), content)
 
 
@@ -440,24 +440,24 @@ def test_a_dataset_of_the_rows(finished_study, check):
     assert memory.to_table().to_pandas().equals(result.frame)
 
 
-def test_a_dataset_of_damaged_or_foreign_parts_is_refused(copy, tmp_path):
-    part = copy / "points" / "part-00001.parquet"
+def test_a_dataset_of_damaged_or_foreign_parts_is_refused(study_copy, tmp_path):
+    part = study_copy / "points" / "part-00001.parquet"
     content = bytearray(part.read_bytes())
     column = pq.read_metadata(part).row_group(0).column(4)
     # the last byte of the column's values
     content[column.data_page_offset + column.total_compressed_size - 1] ^= 1
     part.write_bytes(content)
     with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(does not agree with its checksum"):
-        open_study(copy).dataset()
+        open_study(study_copy).dataset()
     # what is not looked at first is found where it is read
-    dataset = open_study(copy).dataset(check=False)
+    dataset = open_study(study_copy).dataset(check=False)
     with pytest.raises(OSError, match=r"CRC|checksum|corrupt"):
         dataset.to_table()
     sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
     shutil.copy(tmp_path / "other" / "points" / part.name, part)
     for check in (True, False):
         with pytest.raises(InputError, match=r"is of another study|is damaged"):
-            open_study(copy).dataset(check=check)
+            open_study(study_copy).dataset(check=check)
 
 
 def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
@@ -467,20 +467,22 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     for index in (99_999, 100_000, 2):
         store.write_part(index, rows.assign(seed=index))
     store.update_manifest()
-    opened = open_study(tmp_path)
-    assert opened.frame["seed"].drop_duplicates().tolist() == [2, 99_999, 100_000]
-    assert opened.dataset().to_table(columns=["seed"]).to_pandas()["seed"].tolist() == opened.frame["seed"].tolist()
+    stored_study = open_study(tmp_path)
+    assert stored_study.frame["seed"].drop_duplicates().tolist() == [2, 99_999, 100_000]
+    assert (
+        stored_study.dataset().to_table(columns=["seed"]).to_pandas()["seed"].tolist() == stored_study.frame["seed"].tolist()
+    )
     assert open_study(tmp_path).source.has_part(100_000)
 
 
 def test_a_study_in_an_object_store_is_read_alike(finished_study):
-    place = UPath("memory://reading/study")
+    address = UPath("memory://reading/study")
     for name, content in files(finished_study[0]).items():
-        (place / name).write_bytes(content)
-    opened = open_study("memory://reading/study")
-    pd.testing.assert_frame_equal(opened.frame, finished_study[1].frame)
+        (address / name).write_bytes(content)
+    stored_study = open_study("memory://reading/study")
+    pd.testing.assert_frame_equal(stored_study.frame, finished_study[1].frame)
     for check in (True, False):
-        table = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
+        table = stored_study.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
         pd.testing.assert_frame_equal(table, finished_study[1].frame[[ALPHA, "seed"]])
 
 

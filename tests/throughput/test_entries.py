@@ -84,7 +84,7 @@ def test_a_wrong_result_is_not_timed():
 
 
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
-    used, parts, asked, curve = [], [], [], run._measure_curve
+    used, parts, thread_counts, curve = [], [], [], run._measure_curve
 
     def only_ours(folder, count, devices):
         used.append(count)
@@ -93,18 +93,18 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
         ]
 
     def few(able, lanes, *remainder):
-        asked.append(lanes)
+        thread_counts.append(lanes)
         return curve(able, min(lanes, 128), *remainder)
 
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setattr(run, "make_entries", only_ours)
     monkeypatch.setattr(run, "_measure_curve", few)
-    result = run.bench(quick=True, progress=lambda done, all_: parts.append((done, all_)))
+    result = run.bench(quick=True, progress=lambda done, total: parts.append((done, total)))
     assert set(used) == {result.machine["cores"]} == {count_cores()}
     assert parts[-1][0] == parts[-1][1]
     assert all(row.lane_steps_per_second >= row.median_lane_steps_per_second > 0 for row in result.rows)
-    assert asked == [2**k for k in range(6, 19, 3)]
-    assert [point["lanes"] for point in result.curve] == [min(lanes, 128) for lanes in asked]
+    assert thread_counts == [2**k for k in range(6, 19, 3)]
+    assert [point["lanes"] for point in result.curve] == [min(lanes, 128) for lanes in thread_counts]
     assert len(result.study) == 1
 
 

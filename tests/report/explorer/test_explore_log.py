@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 
 from jaxbl.errors import InputError
 from jaxbl.files import json_with_checksum
@@ -163,4 +163,4 @@ def test_lines_coordinates_and_moments(tmp_path):
         assert page.locator("#state").inner_text().startswith("From 10000")
         page.click("#play")
         page.locator("#play:text-is('pause')").wait_for()
-        check(page, 0)
+        check_figures(page, 0)

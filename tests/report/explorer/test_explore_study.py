@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from browser import check, needs_chromium, open_pages
+from browser import check_figures, needs_chromium, open_pages
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config
@@ -129,7 +129,7 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         assert read_pointer_values(values) == pytest.approx(
             [alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3
         )
-        check(page, 0)
+        check_figures(page, 0)
         # of what is true or false, the share
         page.select_option("#metric", "motor.converged")
         page.wait_for_selector("body[data-drawn^='motor.converged ']")
@@ -327,7 +327,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
             figures.first.locator(".plane").focus()
             page.keyboard.press("ArrowRight")
             assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
-            check(page, 0)
+            check_figures(page, 0)
             # a run that the sweep has no figures of
             missing_metric = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
             reply = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {missing_metric})")
@@ -408,5 +408,5 @@ def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
         with page.expect_download() as download:
             page.click("#point")
         (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
-        check(page, 0)
+        check_figures(page, 0)
     assert read_config(tmp_path / "out" / "point.toml").observer.motor.alpha == pytest.approx(alpha, rel=1e-12)
