@@ -12,8 +12,7 @@ from sphinx.util import logging
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
-# cells of tutorials call `jaxbl`; what they compile is kept as for the tests
-os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+# what tutorials and the gallery compile is kept as for the tests
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(HERE.parent / ".cache" / "jax" / sys.implementation.cache_tag))
 
 project = "jaxbl"
@@ -38,6 +37,7 @@ nb_custom_formats = {
     f"{HERE.name}/{name}.md": ["page_notebook.read_page", {"name": name, "study": study}]
     for name, study in TUTORIALS.items()
 }
+os.environ["PYTHONSTARTUP"] = str(HERE / "command_line.py")
 nb_output_stderr = "remove"  # progress
 nb_execution_mode = "force"
 nb_execution_in_temp = True

@@ -13,17 +13,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1] / "docs"))
 
-def run_command(words):
-    """A command line of `jaxbl`; an error ends the process as it ends the command."""
-    from jaxbl.__main__ import program
-
-    sys.argv = words
-    try:
-        program()
-    except SystemExit as end:
-        if end.code:
-            raise
+from command_line import run_commands
 
 
 def run_block(language, text):
@@ -33,8 +25,7 @@ def run_block(language, text):
         if language == "python":
             exec(compile(text, "page", "exec"), {"__name__": "__main__"})
         elif language == "sh" and all(words[:1] in ([], ["jaxbl"]) for words in lines):
-            for words in filter(None, lines):
-                run_command(words)
+            run_commands(text)
         elif language == "sh":
             print(subprocess.run(["sh", "-e", "-c", text], stdout=subprocess.PIPE, text=True, check=True).stdout)
         else:
