@@ -11,10 +11,10 @@ class Block(NamedTuple):
     text: str
 
 
-def blocks_of(page):
+def read_blocks(page):
     return [Block(*match) for match in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)]
 
 
-def without_numbers(text):
+def zero_numbers(text):
     """Lines with 0 for each number: last digits differ from machine to machine."""
     return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "0", text).splitlines()

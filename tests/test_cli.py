@@ -55,13 +55,13 @@ def jaxbl(*arguments, cwd, **environment):
     )  # fmt: skip
 
 
-def write(folder, data=None, name="study.toml"):
+def write_study(folder, data=None, name="study.toml"):
     path = folder / name
     path.write_text(tomli_w.dumps(data or rigid_study(axes=AXES, figures=[FIGURE])))
     return path
 
 
-def left(folder):
+def list_files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
@@ -83,13 +83,13 @@ def test_help_does_not_wait_for_jax(tmp_path):
 
 
 def test_a_sweep_and_its_second_call(tmp_path):
-    """As a user sees it: what is printed, what is left, no progress bar in a pipe, no work done twice."""
-    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 2}))
+    """A user sees what is printed and left: no progress bar in a pipe, no work done twice."""
+    write_study(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 2}))
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study"
-    assert left(folder) == [
+    assert list_files(folder) == [
         "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
@@ -103,7 +103,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
 def test_interrupted_sweep_says_how_to_go_on(tmp_path):
     """SIGINT while chunks are computed; the line that it prints finishes the study."""
     axes = [listed_axis("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
-    study = write(tmp_path, rigid_study(axes=axes), "a study.toml")
+    study = write_study(tmp_path, rigid_study(axes=axes), "a study.toml")
     folder = tmp_path / "out"
     with start_command("sweep", study.name, "--out", "out", cwd=tmp_path) as process:
         for _ in range(3600):
@@ -254,21 +254,23 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     arguments, message = BAD[case]
-    write(tmp_path)
-    write(tmp_path, rigid_study(), "plain.toml")
-    write(tmp_path, rigid_study(sweep={"seeds": 2}), "seeds.toml")
-    write(tmp_path, rigid_study({"run.durations": 1.0}), "wrong.toml")
-    write(tmp_path, rigid_study(axes=[listed_axis("observer.motor.alfa", 1.0)]), "axis.toml")
-    write(tmp_path, rigid_study(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
+    write_study(tmp_path)
+    write_study(tmp_path, rigid_study(), "plain.toml")
+    write_study(tmp_path, rigid_study(sweep={"seeds": 2}), "seeds.toml")
+    write_study(tmp_path, rigid_study({"run.durations": 1.0}), "wrong.toml")
+    write_study(tmp_path, rigid_study(axes=[listed_axis("observer.motor.alfa", 1.0)]), "axis.toml")
+    write_study(tmp_path, rigid_study(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
     still = {"excitation.amplitude": 0.0, "observer.motor.velocity_error": 0.0}
-    write(tmp_path, rigid_study(still), "rest.toml")
-    write(tmp_path, rigid_study(axes=GAINS), "gains.toml")
-    write(tmp_path, rigid_study(axes=GAINS, verify={"q": 1.2}), "q.toml")
-    write(tmp_path, rigid_study(axes=GAINS, verify={"alpha_ratio": {"start": 0.9, "stop": 2.0, "num": 4}}), "below.toml")
+    write_study(tmp_path, rigid_study(still), "rest.toml")
+    write_study(tmp_path, rigid_study(axes=GAINS), "gains.toml")
+    write_study(tmp_path, rigid_study(axes=GAINS, verify={"q": 1.2}), "q.toml")
+    write_study(
+        tmp_path, rigid_study(axes=GAINS, verify={"alpha_ratio": {"start": 0.9, "stop": 2.0, "num": 4}}), "below.toml"
+    )
     (tmp_path / "part.toml").write_text('include = "none.toml"')
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
-    before = left(tmp_path)
+    before = list_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
@@ -276,7 +278,7 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
         cli.main()
     assert end.value.code == 2
     assert capsys.readouterr() == ("", f"jaxbl: {message}\n")
-    assert left(tmp_path) == before
+    assert list_files(tmp_path) == before
 
 
 @pytest.mark.parametrize("arguments", [["sweep"], ["sweep", "study.toml", "--outt", "a"], ["swep", "study.toml"]])
@@ -291,17 +293,17 @@ def test_wrong_usage_exits_2(arguments, monkeypatch, capsys):
 
 
 def test_dry_run_says_the_cost_and_writes_nothing(call, tmp_path):
-    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}))
+    write_study(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}))
     code, lines, _ = call("sweep", "study.toml", "--dry-run")
     assert code == 0
-    assert left(tmp_path) == ["study.toml"]
+    assert list_files(tmp_path) == ["study.toml"]
     assert lines[0] == "points       3 (12 runs with all seeds)"
     assert lines[1] == "chunks       4 of 4 lanes"
     assert [line.split()[0] for line in lines[2:]] == ["memory", "compilation", "run"]
 
 
 def test_shares_and_how_far_they_are(call, tmp_path):
-    write(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}, title="small [red]"))
+    write_study(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 4, "chunk": 4}, title="small [red]"))
     code, lines, _ = call("sweep", "study.toml", "--share", "2/2", "--out", "a")
     assert code == 0
     assert lines[0] == "a: 'small [red]', 2 of 4 parts (50 %) of 12 runs"
@@ -312,37 +314,37 @@ def test_shares_and_how_far_they_are(call, tmp_path):
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2", "--out", "a")
     assert code == 0 and lines[0].startswith("12 runs.") and lines[-1] == "a/report.html"
     assert call("status", "a")[1] == ["a: 'small [red]', 4 of 4 parts (100 %) of 12 runs", "  finished"]
-    assert len(left(tmp_path / "a" / "points")) == 4 and (tmp_path / "a" / "report.html").is_file()
+    assert len(list_files(tmp_path / "a" / "points")) == 4 and (tmp_path / "a" / "report.html").is_file()
 
 
 def test_a_sweep_is_explored(call, tmp_path):
-    write(tmp_path, rigid_study(axes=GAINS))
+    write_study(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
     assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
     assert {"index.html", "map.js", "plot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
-        left(Path("page"))
+        list_files(Path("page"))
     )
     with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
         call("explore", "out", "--static", "out")
 
 
 def test_explore_serves_until_it_is_interrupted(call, tmp_path):
-    write(tmp_path, rigid_study(axes=GAINS))
+    write_study(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
     with start_command("explore", "out", "--json", cwd=tmp_path, TMPDIR=str(tmp_path)) as process:
         (url,) = (line.split()[1] for line in iter(process.stderr.readline, "Ctrl+C ends it.\n") if line.startswith("Open "))
         with urllib.request.urlopen(url) as answer:
             assert b"jaxbl explore" in answer.read()
-        assert any(file.startswith("jaxbl-explore-") for file in left(tmp_path))
+        assert any(file.startswith("jaxbl-explore-") for file in list_files(tmp_path))
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=60)
     assert process.returncode == 0 and errors == "" and json.loads(output)["exit"] == 0
-    assert not any(file.startswith("jaxbl-explore-") for file in left(tmp_path))
+    assert not any(file.startswith("jaxbl-explore-") for file in list_files(tmp_path))
 
 
 def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeypatch):
-    study = write(tmp_path)
+    study = write_study(tmp_path)
     call("sweep", study, "--out", "out")
     folder = tmp_path / "out"
     monkeypatch.setattr(Engine, "__init__", lambda *_: pytest.fail("plot simulates"))
@@ -352,30 +354,30 @@ def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeyp
     assert code == 0
     assert lines[-1] == str(folder / "report.html")
     assert [path.name for path in folder.glob("figures/*")] == ["line_motor_velocity_rmse.png"]
-    write(
+    write_study(
         tmp_path, rigid_study({"title": "other title"}, axes=AXES, figures=[FIGURE | {"value": "motor.chatter"}]), "b.toml"
     )
     call("plot", folder, "--config", "b.toml")
     assert "other title" in (folder / "report.html").read_text()
     assert (folder / "figures" / "line_motor_chatter.png").exists()
-    write(tmp_path, rigid_study({"run.duration": 0.3}, axes=AXES), "c.toml")
+    write_study(tmp_path, rigid_study({"run.duration": 0.3}, axes=AXES), "c.toml")
     with pytest.raises(InputError, match=r"c\.toml: is not the study in .*; only title, notes and figures may differ"):
         call("plot", folder, "--config", "c.toml")
 
 
 def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
-    write(tmp_path, rigid_study(axes=AXES))
+    write_study(tmp_path, rigid_study(axes=AXES))
     code, lines, _ = call("simulate", "study.toml", "--every", 10, "--seed", 3)
     folder = tmp_path / "results" / "study"
     assert code == 0
     assert lines[-1] == "results/study/report.html"
-    assert {"trace.parquet", "summary.json", "report.html", "figures/torque.png"} <= set(left(folder))
+    assert {"trace.parquet", "summary.json", "report.html", "figures/torque.png"} <= set(list_files(folder))
     assert len(pd.read_parquet(folder / "trace.parquet")) == 20
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
 
 
 def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):
-    write(tmp_path, rigid_study(axes=GAINS, verify=ATLAS))
+    write_study(tmp_path, rigid_study(axes=GAINS, verify=ATLAS))
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
     assert code == 130
@@ -386,14 +388,14 @@ def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypat
 TUNE = {"num": 3, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lambda_ratio": {"start": 0.5, "stop": 10.0}}
 
 
-def tunable(**table):
+def tunable_study(**table):
     """A drive under a constant torque, its observer starting 0.1 rad/s off."""
     changes = {"encoders.noise": 1e-5, "observer.motor.velocity_error": 0.1, "run.position_tolerance": 0.01}
     return rigid_study(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
 
 
 def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_path):
-    write(tmp_path, small_study(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
+    write_study(tmp_path, small_study(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
     assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
     assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
@@ -407,12 +409,12 @@ def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_pat
 
 
 def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatch):
-    write(tmp_path, tunable())
+    write_study(tmp_path, tunable_study())
     code, lines, _ = call("tune", "study.toml")
     folder = tmp_path / "results" / "study"
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
-    assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(left(folder))
+    assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(list_files(folder))
     assert lines[0].startswith("motor: lambda = ")
     assert re.fullmatch(r"Compiled in [\d.]+ s, ran 24 lanes in [\d.]+ s\.", lines[-2])
     assert lines[-1] == "results/study/report.html"
@@ -421,13 +423,13 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     assert call("tune", "study.toml")[:2] == (0, [*lines[:-2], lines[-1]])
     # other commands may share the folder, another study may not
     assert call("simulate", "study.toml")[0] == 0
-    write(tmp_path, tunable(margin_exact=1.5), "b.toml")
+    write_study(tmp_path, tunable_study(margin_exact=1.5), "b.toml")
     with pytest.raises(InputError, match="holds another study"):
         call("tune", "b.toml", "--out", folder)
 
 
 def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monkeypatch, capsys):
-    write(tmp_path, tunable(margin_exact=1e4))
+    write_study(tmp_path, tunable_study(margin_exact=1e4))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", "tune", "study.toml"])
@@ -443,7 +445,7 @@ def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monke
 
 
 def test_an_interrupted_search_says_how_to_go_on(call, tmp_path, monkeypatch):
-    write(tmp_path, tunable())
+    write_study(tmp_path, tunable_study())
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("tune", "study.toml", "--out", "out")
     assert code == 130
@@ -451,7 +453,7 @@ def test_an_interrupted_search_says_how_to_go_on(call, tmp_path, monkeypatch):
 
 
 def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
-    write(tmp_path, rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
+    write_study(tmp_path, rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
     code, lines, _ = call("simulate", "study.toml")
     assert code == 1
     assert any(line.startswith("The run diverged") for line in lines)
@@ -459,9 +461,9 @@ def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
 
 
 def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_path):
-    write(tmp_path)
+    write_study(tmp_path)
     call("sweep", "study.toml", "--out", "out")
-    write(tmp_path, rigid_study({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
+    write_study(tmp_path, rigid_study({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
     for command in ("sweep", "simulate"):
         with pytest.raises(InputError, match=r"out: holds another study \('small', other numbers\)"):
             call(command, "b.toml", "--out", "out")
@@ -570,7 +572,7 @@ def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
     for name in SHIPPED:
         study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
         shorten_study(study)
-        write(tmp_path, study, f"{name}.toml")
+        write_study(tmp_path, study, f"{name}.toml")
     done = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
     assert (done.returncode, without_progress(done.stderr)) == (0, "")
     results = json.loads(done.stdout.splitlines()[-1])
@@ -582,7 +584,7 @@ def test_inspect_writes_a_first_model(call, tmp_path):
     simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
     assert code == 0 and "axis.toml: a first model." in lines
-    assert [command for command, _ in steps_in(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
+    assert [command for command, _ in read_steps(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
     text = (tmp_path / "axis.toml").read_text()
     assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
     assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
@@ -600,11 +602,11 @@ def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(cal
     assert [line.split()[0] for line in lines[4:7]] == ["theta_e", "theta_s", "u"]
     assert lines[-1] == "results/axis/report.html" and len(lines) <= 26
     figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
-    assert {"inspection.json", "report.html"} | figures <= set(left(folder))
+    assert {"inspection.json", "report.html"} | figures <= set(list_files(folder))
     assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
     # again, and with a gear ratio that it contradicts
     assert call("inspect", "axis.csv")[:2] == (0, lines)
-    write(tmp_path, small_study({"drive.gear_ratio": 5.0}), "model.toml")
+    write_study(tmp_path, small_study({"drive.gear_ratio": 5.0}), "model.toml")
     with pytest.raises(InputError, match=r"axis.csv: theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
         call("inspect", "axis.csv", "--model", "model.toml")
 
@@ -615,7 +617,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     assert call("inspect", "axis.parquet", "--model", "log.toml")[0] == 0
     (tmp_path / "part.toml").write_text('include = "log.toml"\ntitle = "my axis"\n')
     assert call("inspect", "axis.parquet", "--model", "part.toml")[0] == 0
-    write(tmp_path, rigid_study(log={"theta_e": "x"}), "study.toml")
+    write_study(tmp_path, rigid_study(log={"theta_e": "x"}), "study.toml")
     assert call("inspect", "axis.parquet", "--model", "study.toml")[0] == 0
     (tmp_path / "wrong.toml").write_text('[log]\ntheta_e = { colum = "x" }\n')
     with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
@@ -639,7 +641,7 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
     u = 500.0 * (x - np.clip(x, -0.005, 0.005)) + 0.01 * np.random.default_rng(0).standard_normal(1200)
     for name in ("rig.csv", "again.csv"):
         pd.DataFrame({"t": t, "x": 1e3 * x, "force": u}).to_csv(tmp_path / name, index=False)
-    model = write(tmp_path, {"log": {"kind": "element", "theta_e": {"column": "x", "unit": "mm"}, "u": "force"}})
+    model = write_study(tmp_path, {"log": {"kind": "element", "theta_e": {"column": "x", "unit": "mm"}, "u": "force"}})
     code, out, _ = call("inspect", "rig.csv", "--model", model, "--out", "seen")
     assert code == 0 and any(line.startswith("gap") and " yes " in line for line in out)
     code, out, err = call("identify", "rig.csv", "--model", model, "--out", "found", "--holdout", "again.csv")
@@ -648,7 +650,7 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
     assert json.loads(Path("found/identification.json").read_text())["title"] == "Transmission of rig.csv"
     assert parameters["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
     assert tomllib.loads(Path("found/model.toml").read_text())["transmission"]["law"] == "dead_zone"
-    assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(left(Path("found")))
+    assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(list_files(Path("found")))
     with pytest.raises(InputError, match=r"study.toml: log.kind: 'element' is a transmission alone, without the drive"):
         call("diagnose", "rig.csv", "--model", model)
     for extra, message in (
@@ -676,7 +678,7 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     axes = [spaced_axis(LAMBDA, 0.5, 40.0, 3), spaced_axis(ALPHA, 2.0, 200.0, 3)]
     figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.converged"}
     explicit = {"observer.discretisation": "explicit", "run.duration": 0.1, "run.velocity_tolerance": 0.1}
-    write(tmp_path, rigid_study(explicit, axes=axes, figures=[figure], sweep={"refine": 3, "chunk": 32}))
+    write_study(tmp_path, rigid_study(explicit, axes=axes, figures=[figure], sweep={"refine": 3, "chunk": 32}))
     code, lines, _ = call("sweep", "study.toml", "--dry-run")
     assert code == 0
     assert lines[:3] == [
@@ -703,7 +705,7 @@ AXIS = rigid_study(
 
 
 def test_a_log_is_identified(call, tmp_path):
-    write(tmp_path, AXIS, "axis.toml")
+    write_study(tmp_path, AXIS, "axis.toml")
     assert call("simulate", "axis.toml", "--out", "made")[0] == 0
     pd.read_parquet("made/trace.parquet")[["t", "u", "theta_e"]].to_csv("axis.csv", index=False)
     code, lines, _ = call("identify", "axis.csv", "--model", "axis.toml")
@@ -717,7 +719,7 @@ def test_a_log_is_identified(call, tmp_path):
     assert call("identify", "axis.csv", "--model", "axis.toml") == (code, lines, [])
     assert (tmp_path / "results/axis/identification.json").stat().st_mtime_ns == finished
     assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
-    write(tmp_path, AXIS | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
+    write_study(tmp_path, AXIS | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
     with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
         call("identify", "axis.csv", "--model", "wrong.toml", "--out", "new")
     with pytest.raises(InputError, match=r"^none\.csv: no such file"):
@@ -733,7 +735,7 @@ IDENTIFY = ["identify", "an axis.csv", "--model", "axis.toml"]
 @pytest.fixture
 def axis_log(tmp_path):
     """A log and its study."""
-    write(tmp_path, AXIS, "axis.toml")
+    write_study(tmp_path, AXIS, "axis.toml")
     time = np.arange(600) * 1e-3
     log = pd.DataFrame(
         {"t": time, "u": np.cos(20.0 * time), "theta_e": -0.05 * np.cos(20.0 * time) + 1e-5 * np.cos(1e6 * time)}
@@ -748,7 +750,7 @@ def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, t
     monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
     more = ["--holdout", "an axis.csv", "--profile"]
     assert call(*IDENTIFY, *more) == (130, [], [f"{AGAIN} {shlex.join(more)} --out 'results/an axis'"])
-    assert left(tmp_path / "results") == []
+    assert list_files(tmp_path / "results") == []
 
 
 def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log, call, tmp_path, monkeypatch):
@@ -757,11 +759,11 @@ def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log,
         assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
         assert not (tmp_path / "out").exists()
     assert call(*IDENTIFY, "--out", "out")[0] == 0
-    before = {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")}
-    write(tmp_path, AXIS | {"title": "another"}, "axis.toml")
+    before = {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")}
+    write_study(tmp_path, AXIS | {"title": "another"}, "axis.toml")
     monkeypatch.setattr("jaxbl.report.page.html", interrupt)
     assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
-    assert {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")} == before
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")} == before
 
 
 def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
@@ -858,7 +860,7 @@ def test_a_log_is_diagnosed_once(axis_log, quick_tasks, call, tmp_path):
     index = lines.index("Next:")
     assert lines[index - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
-    assert [command for command, _ in steps_in(lines)] == [run, "jaxbl explore 'results/an axis'"]
+    assert [command for command, _ in read_steps(lines)] == [run, "jaxbl explore 'results/an axis'"]
     assert lines[-1] == "results/an axis/report.html"
     assert call(*DIAGNOSE) == (0, [*lines[: index - 1], *lines[index:]], [])
     assert len(quick_tasks) == 1
@@ -929,14 +931,16 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis_log, qu
 
 
 def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, monkeypatch, capsys):
-    write(tmp_path)
+    write_study(tmp_path)
     code, lines, _ = call("sweep", "study.toml", "--json", "--out", "out")
     content = json.loads("\n".join(lines))
     assert (code, content["command"], content["exit"]) == (0, "sweep", 0)
     assert content["summary"] == {"title": "small", "runs": 3, "finished": True}
     assert content["found"][0].startswith("3 runs.") and content["open"] == "out/report.html"
     assert [step["command"].split()[1] for step in content["next"]] == ["explore", "tune", "simulate"]
-    assert set(content["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
+    assert set(content["files"]) == {
+        f"out/{name}" for name in list_files(tmp_path / "out") if not name.startswith("points/")
+    }
     assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
     monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
     with pytest.raises(SystemExit) as end:
@@ -962,7 +966,7 @@ def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
     assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
 
 
-def steps_in(lines):
+def read_steps(lines):
     """Command lines under "Next:", each with its question."""
     index = lines.index("Next:") + 1
     rows = lines[index : index + 2 * sum(line.startswith("  jaxbl ") for line in lines[index:])]
@@ -971,11 +975,11 @@ def steps_in(lines):
 
 
 def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
-    study = write(tmp_path, tunable() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
+    study = write_study(tmp_path, tunable_study() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
     monkeypatch.setattr(setup, "_find_shipped_study", lambda name: study)
     code, lines, _ = call("demo", "--out", "results/a map")
     assert code == 0 and lines[-1] == "results/a map/report.html"
-    steps = steps_in(lines)
+    steps = read_steps(lines)
     assert [shlex.split(command)[1] for command, _ in steps] == ["explore", "tune", "simulate", "init"]
     page = unescape(Path("results/a map/report.html").read_text(encoding="utf-8"))
     studied = (
@@ -985,7 +989,7 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
         text in page for text in (lines[0], studied, "The question: which gains?", "What to try next", *chain(*steps))
     )
     # another page of the same study says the same
-    assert steps_in(call("plot", "results/a map")[1]) == steps[:-1]
+    assert read_steps(call("plot", "results/a map")[1]) == steps[:-1]
     for command, _ in steps[:-1]:
         words = shlex.split(command)[1:]
         # else it serves the page until it is ended
@@ -994,38 +998,40 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
     # the last one asks; who has such a file is not told to write it
     with pytest.raises(InputError, match="numbers are missing"):
         call(*shlex.split(steps[-1][0])[1:])
-    write(tmp_path, name="drive.toml")
-    assert len(steps_in(call("demo", "--out", "results/a map")[1])) == 3
+    write_study(tmp_path, name="drive.toml")
+    assert len(read_steps(call("demo", "--out", "results/a map")[1])) == 3
 
 
 def test_after_logs_what_is_open_by_what_was_found():
     logs, model, folder = [Path("a b.csv")], Path("m.toml"), Path("out")
     command = ["diagnose", "a b.csv", "--model", "m.toml", "--out", "out"]
 
-    def task(samples, parts=1, missing=("excitation",)):
+    def make_task(samples, parts=1, missing=("excitation",)):
         cut = tuple(slice(i * samples // parts, (i + 1) * samples // parts) for i in range(parts))
         return SimpleNamespace(record=SimpleNamespace(segments=cut), missing=frozenset(missing))
 
-    def commands(steps):
+    def list_commands(steps):
         assert all(len(line) <= 80 for line in format_steps(steps) if line.startswith("    "))
         assert steps[-1].command == "jaxbl explore out"
         return [step.command for step in steps[:-1]]
 
     def identify_steps(rms, done=None, holdout=None, planned_file=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
-        return commands(
-            after_identification(done or task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file))
+        return list_commands(
+            after_identification(
+                done or make_task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file)
+            )
         )
 
     diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
     simulate = "jaxbl simulate out/model.toml --out out_run"
     assert identify_steps(3.0) == [f"{diagnose} --out out_diagnosed"]
     # too short to hold a quarter out, but for another log
-    assert identify_steps(3.0, task(300)) == []
-    assert identify_steps(3.0, task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
+    assert identify_steps(3.0, make_task(300)) == []
+    assert identify_steps(3.0, make_task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
     assert identify_steps(1.0) == [simulate]
     # the input of a log with gaps cannot be played back; that of the study can
-    assert identify_steps(1.0, task(1000, 2)) == [] and identify_steps(1.0, task(1000, 2, ())) == [simulate]
+    assert identify_steps(1.0, make_task(1000, 2)) == [] and identify_steps(1.0, make_task(1000, 2, ())) == [simulate]
     unseen = {"backlash": {"shown": False}}
     assert identify_steps(1.0, **unseen) == [simulate, f"{diagnose} --out out --next-experiment out_next.csv"]
     assert (
@@ -1035,8 +1041,8 @@ def test_after_logs_what_is_open_by_what_was_found():
     )
 
     def diagnose_steps(planned_file=None, **more):
-        return commands(
-            after_diagnosis(task(1000), DIAGNOSED | more, command, folder, LogCall(logs, model, None, planned_file))
+        return list_commands(
+            after_diagnosis(make_task(1000), DIAGNOSED | more, command, folder, LogCall(logs, model, None, planned_file))
         )
 
     assert diagnose_steps() == [simulate]

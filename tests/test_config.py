@@ -514,18 +514,18 @@ JUNK = st.one_of(
 COMPLETE = read_config(tomllib.loads(EXAMPLE)).to_dict()
 
 
-def places(data, prefix=()):
+def list_keys(data, prefix=()):
     """Every key and index of a nested config."""
     for key, value in data.items() if isinstance(data, dict) else enumerate(data):
         yield (*prefix, key)
         if isinstance(value, dict | list):
-            yield from places(value, (*prefix, key))
+            yield from list_keys(value, (*prefix, key))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(
-        st.tuples(st.sampled_from(list(places(COMPLETE))), JUNK, st.none() | st.text(max_size=3)), min_size=1, max_size=3
+        st.tuples(st.sampled_from(list(list_keys(COMPLETE))), JUNK, st.none() | st.text(max_size=3)), min_size=1, max_size=3
     )
 )
 def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
@@ -564,7 +564,7 @@ def test_a_delay_lasts_no_longer_than_what_is_kept():
         read_config(rigid_study({"run.sample_period": 1e-3}, effects=delay))
 
 
-def files(folder, **texts):
+def write_files(folder, **texts):
     """TOML files by name; `base` has the rigid drive without gains."""
     data = rigid_study({"observer": None})
     for name, text in {"base": tomli_w.dumps(data), **texts}.items():
@@ -575,7 +575,7 @@ def files(folder, **texts):
 
 
 def test_included_tables_are_merged_key_by_key(tmp_path):
-    files(
+    write_files(
         tmp_path,
         gains="[observer.motor]\nlambda = 1.0\nalpha = 2.0\n[run]\nduration = 0.3\n",
         later="[observer.motor]\nalpha = 3.0\n",
@@ -591,7 +591,7 @@ def test_included_tables_are_merged_key_by_key(tmp_path):
 
 
 def test_keys_of_the_including_file_win_and_tables_of_another_kind_replace(tmp_path):
-    files(
+    write_files(
         tmp_path,
         main='include = "base.toml"\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n'
         '[excitation]\nkind = "prbs"\namplitude = 0.3\nhold = 0.01\n[run]\nduration = 0.4\n',
@@ -609,7 +609,7 @@ def test_files_of_an_included_file_are_relative_to_it(tmp_path, monkeypatch):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "log.csv").write_text("t,u\n0,0\n1,1\n")
     recorded = 'kind = "recorded"\nfile = "log.csv"\n'
-    files(
+    write_files(
         tmp_path,
         **{"parts/input": f"[excitation]\n{recorded}[tune.holdout]\n{recorded}"},
         main='include = ["base.toml", "parts/input.toml"]\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n',
@@ -677,7 +677,7 @@ BAD_INCLUDES = {
 @pytest.mark.parametrize("case", BAD_INCLUDES)
 def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
     texts, message = BAD_INCLUDES[case]
-    files(tmp_path, **texts)
+    write_files(tmp_path, **texts)
     with pytest.raises(InputError) as error:
         read_config(tmp_path / "main.toml")
     assert message.format(tmp_path) in str(error.value)

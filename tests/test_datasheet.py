@@ -130,11 +130,11 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
     questions = []
     answers = iter(["light", "0.5 kg cm²", ""])
 
-    def prompt(text, default, err):
+    def answer_prompt(text, default, err):
         questions.append((text, default))
         return next(answers) or default
 
-    monkeypatch.setattr("typer.prompt", prompt)
+    monkeypatch.setattr("typer.prompt", answer_prompt)
     assert setup._ask_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
     assert setup._ask_number(BY_NAME["sample_period"]).text == "not given"
     assert questions[0] == questions[1] and questions[2][1] == "1 ms"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from command_server import run_python
-from markdown_blocks import blocks_of, without_numbers
+from markdown_blocks import read_blocks, zero_numbers
 from progress_lines import without_progress
 from test_public import FLOORS
 from typer.main import get_command
@@ -28,7 +28,7 @@ TEXTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), ROOT / "be
 SCRIPTS = [*sorted(ROOT.glob("docs/*.py")), *sorted(ROOT.glob("benchmarks/**/*.py"))]
 
 
-def name(path):
+def page_name(path):
     return str(path.relative_to(ROOT))
 
 
@@ -85,19 +85,19 @@ def test_log_examples_are_valid():
         read_log_table(tomllib.loads(block)["log"])
 
 
-def anchors(page):
+def heading_anchors(page):
     """Those of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", TEXTS, ids=name)
+@pytest.mark.parametrize("page", TEXTS, ids=page_name)
 def test_links_lead_somewhere(page):
     for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             file = page.parent / target if target else page
             assert file.exists(), target
-            assert not anchor or anchor in anchors(file), f"{target}#{anchor}"
+            assert not anchor or anchor in heading_anchors(file), f"{target}#{anchor}"
 
 
 # names
@@ -125,7 +125,7 @@ GROUPS = {
 }
 
 
-@pytest.mark.parametrize("page", TEXTS + SCRIPTS, ids=name)
+@pytest.mark.parametrize("page", TEXTS + SCRIPTS, ids=page_name)
 def test_names_of_modules_and_files_exist(page):
     text = page.read_text(encoding="utf-8")
     paths = re.findall(r"(?<![\w./-])(?:jaxbl|benchmarks|docs(?!/_build)|sweeps|tests)/[\w./-]*\w/?", text)
@@ -136,7 +136,7 @@ def test_names_of_modules_and_files_exist(page):
         resolve(dotted)
 
 
-@pytest.mark.parametrize("page", TEXTS, ids=name)
+@pytest.mark.parametrize("page", TEXTS, ids=page_name)
 def test_commands_in_text_exist_with_their_options(page):
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     commands = get_command(app).commands
@@ -203,11 +203,11 @@ EXTRAS = {"cluster.md": "distributed", "fmu.md": "fmu", "mujoco.md": "mujoco"}
 PAGES = [
     page
     for page in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))
-    if not page.stem.endswith("tutorial") and any(block.language in ("sh", "python") for block in blocks_of(page))
+    if not page.stem.endswith("tutorial") and any(block.language in ("sh", "python") for block in read_blocks(page))
 ]
 
 
-def imports_of(requirement):
+def import_name(requirement):
     """A requirement's import name: of those that only development needs."""
     return {"pytest-xdist": "xdist"}.get(package := re.match(r"[\w-]+", requirement)[0], package)
 
@@ -229,9 +229,9 @@ def make_environment(folder, clone, extra=None):
     """Return that of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
-    importable = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
+    importable = {"jaxbl", *map(import_name, optional[extra] if extra else [])}
     # pages install packages of their own
-    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - importable - {"hatchling"})
+    hidden = sorted(set(map(import_name, chain.from_iterable(optional.values()))) - importable - {"hatchling"})
     site = folder / "site"
     site.mkdir()
     # a module of None would do for most, but SciPy looks whether sphinx is among those that are loaded
@@ -251,7 +251,7 @@ def test_demo_is_this_command():
     assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
 
 
-@pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
+@pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(read_blocks(page))), ids=page_name)
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that
     file."""
@@ -269,7 +269,7 @@ def test_page_runs_as_written(page, tmp_path):
             smaller = "\n".join(lines.get(line, line) for line in text)
             (clone / "sweeps" / study).write_text(smaller, encoding="utf-8")
     blocks = []
-    for language, text in blocks_of(page):
+    for language, text in read_blocks(page):
         file = re.match(r"# (\w+\.(?:toml|py))\n", text)
         if file is not None:
             language = file[1]
@@ -284,4 +284,4 @@ def test_page_runs_as_written(page, tmp_path):
     assert (done.returncode, without_progress(done.stderr)) == (0, ""), done.stderr
     for (language, text), printed in zip(blocks, json.loads(done.stdout), strict=True):
         if language == "output":
-            assert set(without_numbers(text)) <= set(without_numbers(printed)), printed
+            assert set(zero_numbers(text)) <= set(zero_numbers(printed)), printed

@@ -9,11 +9,11 @@ WORDS = st.text("abc_.", min_size=1, max_size=30)
 TEXTS = st.lists(WORDS, min_size=1, max_size=30).map(" ".join)
 
 
-def rows_of(*cells):
+def row_lists(*cells):
     return st.lists(st.tuples(*cells), min_size=1, max_size=5)
 
 
-@given(st.integers(2, 12).flatmap(lambda count: rows_of(*[WORDS] * count)), st.booleans())
+@given(st.integers(2, 12).flatmap(lambda count: row_lists(*[WORDS] * count)), st.booleans())
 def test_a_table_holds_every_cell_once_within_80_columns(rows, numbers):
     lines = format_table(rows, numbers=numbers)
     assert all(len(line) <= TERMINAL_WIDTH for line in lines)
@@ -24,7 +24,7 @@ def test_a_table_holds_every_cell_once_within_80_columns(rows, numbers):
         assert {part.split()[0] for part in parts} == {row[0]}
 
 
-@given(rows_of(WORDS, WORDS, TEXTS))
+@given(row_lists(WORDS, WORDS, TEXTS))
 def test_texts_go_on_below_themselves_within_80_columns(rows):
     lines = format_descriptions(rows)
     assert all(len(line) <= TERMINAL_WIDTH for line in lines)

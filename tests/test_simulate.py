@@ -19,27 +19,27 @@ from jaxbl.sweeps.metrics import ALL_METRICS
 SEED = jnp.asarray(3)
 
 
-def everything(state, signals):
+def record_signals(state, signals):
     return signals
 
 
 @jit
-def figures(experiment, seed=SEED):
+def scan_metrics(experiment, seed=SEED):
     return scan(experiment, seed, (ALL_METRICS,))[0]
 
 
 @jit
 def run_whole(experiment, seed=SEED):
     """Figures and trace by one program."""
-    return scan(experiment, seed, (ALL_METRICS,), record=everything)
+    return scan(experiment, seed, (ALL_METRICS,), record=record_signals)
 
 
 draw_noise = jax.jit(unit_noise, static_argnums=2)
 
 
 @jit
-def trace(experiment, seed=SEED, stride=1):
-    return scan(experiment, seed, record=everything, stride=stride)[1]
+def scan_trace(experiment, seed=SEED, stride=1):
+    return scan(experiment, seed, record=record_signals, stride=stride)[1]
 
 
 def identification_errors(result):
@@ -58,7 +58,7 @@ def test_torque_of_the_implicit_observer_needs_no_low_pass():
 
 @pytest.mark.parametrize(("discretisation", "time_constant"), [("implicit", 0.0), ("implicit", 0.02), ("explicit", 0.02)])
 def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
-    errors = identification_errors(figures(paper_experiment(discretisation, time_constant=time_constant)))
+    errors = identification_errors(scan_metrics(paper_experiment(discretisation, time_constant=time_constant)))
     assert max(errors["stiffness_error"]) < 0.01
     assert max(errors["dead_zone_error"]) < 0.005
 
@@ -66,14 +66,14 @@ def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_matched_regressor_beats_none_in_the_dead_zone(discretisation):
     matched, none = (
-        identification_errors(figures(paper_experiment(discretisation, time_constant=0.02, regressor_filter=kind)))
+        identification_errors(scan_metrics(paper_experiment(discretisation, time_constant=0.02, regressor_filter=kind)))
         for kind in ("matched", "none")
     )
     for ours, papers in zip(matched["dead_zone_error"], none["dead_zone_error"], strict=True):
         assert 5.0 * ours < papers
 
 
-def independent(experiment, noise, steps):
+def simulate_independently(experiment, noise, steps):
     """The implicit chain again, of SciPy's parts: integrator on the smooth law, root finder, filter, least squares."""
     h, time_constant, start = 1e-3, 0.01, 100
     je, fe, js, fs, n0 = 0.05, 0.15, 7.0, 16.0, 5.0
@@ -145,7 +145,9 @@ def test_whole_trace_against_an_independent_copy():
     )
     result, signals = run_whole(experiment)
     noise = draw_noise(SEED, jnp.arange(steps), experiment.sides)
-    truth, measured, torque, expected = independent(experiment, np.stack([noise["motor"], noise["load"]], 1), steps)
+    truth, measured, torque, expected = simulate_independently(
+        experiment, np.stack([noise["motor"], noise["load"]], 1), steps
+    )
     np.testing.assert_allclose(signals.time, 1e-3 * np.arange(steps), rtol=1e-14)
     np.testing.assert_allclose(signals.input, 0.1 * np.sin(2.0 * np.pi * 0.16 * signals.time), rtol=1e-12)
     # the plant's own second order, at 0.1 ms, is what differs
@@ -187,7 +189,7 @@ def test_unit_noise_is_a_function_of_seed_and_index():
 
 def test_noise_is_the_same_in_runs_of_any_length_precision_and_level():
     def noise_of(steps, dtype, level):
-        signals = trace(paper_experiment(noise=level, steps=steps, substeps=1, dtype=dtype))
+        signals = scan_trace(paper_experiment(noise=level, steps=steps, substeps=1, dtype=dtype))
         return [
             np.asarray(signals.side(s).measured - signals.side(s).true.position, float) * gain / level
             for s, gain in (("motor", 1.0), ("load", 5.0))
@@ -217,7 +219,7 @@ def test_lanes_equal_single_runs():
     for values in (lane_values(7), dict(list(lane_values(7).items())[:3])):
         lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (ALL_METRICS,))[0]))(values)
         for i in (0, 3, 6):
-            single = figures(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
+            single = scan_metrics(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
             for name, value in single.items():
                 # so short a run hardly determines the parameters: their rounding errors are magnified
                 tolerance = 1e-5 if name.endswith(("stiffness_error", "dead_zone_error")) else 1e-6
@@ -268,7 +270,7 @@ def test_rigid_drive_observes_what_resists_beyond_the_model(discretisation):
 @pytest.mark.parametrize("stride", [7, 64, 100, 1000])
 def test_record_keeps_every_so_many_samples(stride):
     experiment = paper_experiment(time_constant=0.01, noise=1e-4, steps=523, substeps=1)
-    full, thin = trace(experiment), trace(experiment, stride=stride)
+    full, thin = scan_trace(experiment), scan_trace(experiment, stride=stride)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x[::stride], rtol=1e-9, atol=1e-12), full, thin)
 
 
@@ -279,7 +281,7 @@ def test_reducers_see_every_sample_whatever_is_recorded():
         lambda experiment, carry, state: {"sum": carry},
     )
     experiment = paper_experiment(steps=523, substeps=1)
-    for record, stride in ((None, 1), (everything, 10)):
+    for record, stride in ((None, 1), (record_signals, 10)):
         out, _ = jit(lambda e, record=record, stride=stride: scan(e, SEED, (count,), record, stride))(experiment)
         assert out == {"sum": 523 * 522 // 2}
 
@@ -290,7 +292,7 @@ def test_derivatives_through_the_run(discretisation):
     experiment = paper_experiment(discretisation, time_constant=0.01, steps=200, substeps=2)
 
     def run(stiffness):
-        signals = scan(set_leaves(experiment, {"transmission.stiffness": stiffness}), SEED, record=everything)[1]
+        signals = scan(set_leaves(experiment, {"transmission.stiffness": stiffness}), SEED, record=record_signals)[1]
         motor = signals.motor
         return motor.true.position, motor.position_estimate, motor.velocity_estimate, motor.torque_estimate
 
@@ -307,12 +309,12 @@ def test_derivatives_through_the_run(discretisation):
 def test_one_compilation_serves_all_values():
     traces = 0
 
-    def counted(experiment):
+    def count_and_scan(experiment):
         nonlocal traces
         traces += 1
         return scan(experiment, SEED)[0]
 
-    compiled = jit(counted)
+    compiled = jit(count_and_scan)
     for noise in (0.0, 1e-4, 1e-3):
         compiled(paper_experiment(noise=noise, steps=64, substeps=1))
     assert traces == 1
@@ -321,9 +323,9 @@ def test_one_compilation_serves_all_values():
 @pytest.mark.parametrize("stride", [1, 7])
 def test_a_replayed_record_gives_what_the_observers_gave(stride):
     experiment = paper_experiment(noise=1e-4, start=0.1, steps=700)
-    signals = trace(experiment)
+    signals = scan_trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
-    run = jit(lambda *columns: replay(*columns, record=everything, stride=stride, state=initial_state(experiment)))
+    run = jit(lambda *columns: replay(*columns, record=record_signals, stride=stride, state=initial_state(experiment)))
     _, replayed = run(experiment, signals.input, measured)
     for side in experiment.sides:
         replayed_side, original_side = replayed.side(side), signals.side(side)
@@ -339,13 +341,13 @@ def test_a_replayed_record_gives_what_the_observers_gave(stride):
 
 def test_what_observers_are_told_is_not_in_their_equivalent_control():
     experiment = paper_experiment(noise=0.0, steps=2000)
-    signals = trace(experiment)
+    signals = scan_trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
     # of the true acceleration, its mean over each sampling period
     perturbations = {side: signals.side(side).true.perturbation for side in experiment.sides}
     run = jit(
         lambda *columns: replay(
-            *columns, record=everything, state=initial_state(experiment), added_accelerations=perturbations
+            *columns, record=record_signals, state=initial_state(experiment), added_accelerations=perturbations
         )
     )
     _, with_perturbations = run(experiment, signals.input, measured)
@@ -356,7 +358,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
 
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
     experiment = paper_experiment(steps=300)
-    signals = trace(experiment)
+    signals = scan_trace(experiment)
     states = jit(lambda u: plant_trajectory(experiment, experiment.plant.init(experiment.initial), u))(signals.input)
     for side in experiment.sides:
         np.testing.assert_allclose(states.position[side], signals.side(side).true.position, rtol=1e-12, atol=1e-14)

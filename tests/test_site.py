@@ -12,7 +12,7 @@ from urllib.parse import unquote, urldefrag, urlsplit
 import nbformat
 import pytest
 from browser import assert_accessible, assert_readable, needs_chromium, open_pages
-from markdown_blocks import blocks_of, without_numbers
+from markdown_blocks import read_blocks, zero_numbers
 from progress_lines import without_progress
 
 ROOT = Path(__file__).parents[1]
@@ -61,9 +61,9 @@ def test_every_link_leads_somewhere(pages):
 def test_tutorials_print_what_their_texts_say(pages, name):
     """The site ran the page: its `output` blocks are what was printed, but for the numbers."""
     page = (SITE / "docs" / f"{name}.html").read_text(encoding="utf-8")
-    printed = set(without_numbers(unescape(re.sub(r"<[^>]*>", "", page))))
-    blocks = blocks_of(ROOT / "docs" / f"{name}.md")
-    expected = [line for block in blocks if block.language == "output" for line in without_numbers(block.text)]
+    printed = set(zero_numbers(unescape(re.sub(r"<[^>]*>", "", page))))
+    blocks = read_blocks(ROOT / "docs" / f"{name}.md")
+    expected = [line for block in blocks if block.language == "output" for line in zero_numbers(block.text)]
     assert [line for line in expected if line not in printed] == []
     notebook = nbformat.read(SITE.parent / "jupyter_execute" / "docs" / f"{name}.ipynb", as_version=4)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]

@@ -21,15 +21,15 @@ def square(x):
     return x * x
 
 
-def fails(x):
+def raise_error(x):
     raise ValueError(f"not {x}")
 
 
-def is_killed(x):
+def kill_itself(x):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def lasts(folder):
+def wait_a_minute(folder):
     try:
         # within: an interrupt may come as soon as the file is there
         (folder / f"{os.getpid()}").touch()
@@ -39,7 +39,7 @@ def lasts(folder):
         raise
 
 
-def alive(process):
+def is_alive(process):
     try:
         state = Path(f"/proc/{process}/stat").read_text()
     except FileNotFoundError:
@@ -51,12 +51,12 @@ def alive(process):
 def test_results_come_in_order(processes):
     assert list(map_jobs(square, [3, 1, 2], processes)) == [9, 1, 4]
     with pytest.raises(ValueError, match="not 7"):
-        list(map_jobs(fails, [7], processes))
+        list(map_jobs(raise_error, [7], processes))
 
 
 def test_a_killed_process_is_told():
     with pytest.raises(NoResult, match="a worker process was killed"):
-        list(map_jobs(is_killed, [1, 2], 2))
+        list(map_jobs(kill_itself, [1, 2], 2))
 
 
 def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, default_interrupt):
@@ -68,20 +68,20 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, default_interrupt):
     start = time.monotonic()
     threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        list(map_jobs(lasts, [tmp_path] * 9, 2))
+        list(map_jobs(wait_a_minute, [tmp_path] * 9, 2))
     assert (tmp_path / "interrupted").exists() and time.monotonic() - start < 50.0
     assert len(list(tmp_path.iterdir())) <= 3
 
 
 def test_processes_end_with_the_one_they_work_for(tmp_path):
-    code = "import sys, pathlib, test_workers as t; list(t.map_jobs(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
+    code = "import sys, pathlib, test_workers as t; list(t.map_jobs(t.wait_a_minute, [pathlib.Path(sys.argv[1])], 2))"
     with Process(["-c", code, str(tmp_path)], Path(__file__).parent, dict(os.environ)) as parent:
         while not (files := list(tmp_path.iterdir())) and parent.poll() is None:
             time.sleep(0.05)
         parent.kill()
     child = int(files[0].name)
     for _ in range(200):
-        if not alive(child):
+        if not is_alive(child):
             return
         time.sleep(0.05)
     raise AssertionError("it still runs")

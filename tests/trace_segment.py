@@ -4,7 +4,7 @@ from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import smooth
 
 
-def segment_of(trace, period=1e-3, torque=None, transmitted=None):
+def make_segment(trace, period=1e-3, torque=None, transmitted=None):
     """The readings of a run; with another input, or with a measured torque."""
     sides = {"motor": "theta_e", "load": "theta_s"}
     readings = {side: trace[name].to_numpy() for side, name in sides.items() if name in trace}

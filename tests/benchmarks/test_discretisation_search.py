@@ -16,13 +16,13 @@ def _double():
         yield
 
 
-def largest(kind, gains, noise, paths):
+def largest_error(kind, gains, noise, paths):
     return float(jax.vmap(lambda x: audit.simulate_errors(kind, gains, noise, x))(paths).max())
 
 
 def test_the_worst_error_is_the_larger_of_search_and_pairs():
     kind, gains, noise = ImplicitSuperTwisting, (1.5, 1.1), 2.0
-    pairs = [largest(kind, gains, noise, x[None]) for x in audit.pairs(noise, audit.horizon(noise))]
+    pairs = [largest_error(kind, gains, noise, x[None]) for x in audit.pairs(noise, audit.horizon(noise))]
     worst = audit.search_worst(kind, gains, noise)
     assert worst > max(pairs)
     assert audit.worst(kind, gains, noise, audit.horizon(noise)) == worst
@@ -44,7 +44,7 @@ def test_a_linear_observer_has_its_worst_case_in_closed_form():
     sensitivity = jax.grad(lambda x: audit.error(kind(*gains), noise, x))(jnp.zeros((2, samples)))
     assert worst_linear == pytest.approx(float(audit.simulate_errors(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
     random = np.random.default_rng(0).choice([-1.0, 1.0], (500, 2, samples))
-    assert largest(kind, gains, noise, jnp.asarray(random)) < worst_linear
+    assert largest_error(kind, gains, noise, jnp.asarray(random)) < worst_linear
 
 
 @pytest.mark.parametrize("order", range(1, 6))

@@ -215,10 +215,10 @@ def test_a_wrong_answer_is_counted_where_it_belongs(hidden_cases):
 
 
 def test_a_diagnosis_that_fails_is_an_outcome(hidden_cases, capsys):
-    def fails(logs, model, holdout):
+    def fail_to_diagnose(logs, model, holdout):
         raise RuntimeError("no")
 
-    outcomes = run(hidden_cases[:2], fails)
+    outcomes = run(hidden_cases[:2], fail_to_diagnose)
     assert scores(outcomes)["failed"]["value"] == 1.0
     assert "RuntimeError: no" in markdown(outcomes)
 

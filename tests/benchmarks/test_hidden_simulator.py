@@ -105,7 +105,7 @@ BRISTLES_MACHINE = Machine(
 )  # fmt: skip
 
 
-def reference(torques, inertias, half, start, commands, lag):
+def integrate_modes(torques, inertias, half, start, commands, lag):
     """States at the samples, shape (4, samples), and how many times the mode changed."""
     state, changes, last_input = np.array([*start, 0.0]), 0, 0.0
     states = np.zeros((4, len(commands)))
@@ -186,9 +186,9 @@ GEARED_START, RIGID_START = (0.05, 2.0, 0.01, 0.3), (0.3, 0.5, 0.0, 0.0)
 def true_states():
     limited = np.clip(1.1 * np.append(np.zeros(3), RIGID_INPUT[:-3]), -0.25, 0.25)
     return {
-        "geared": reference(gear_torques, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
-        "rigid": reference(rigid_torques, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
-        "bristles": reference(bristle_torques, (0.05, 7.0), 0.0, GEARED_START, GEARED_INPUT, 0.0),
+        "geared": integrate_modes(gear_torques, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
+        "rigid": integrate_modes(rigid_torques, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
+        "bristles": integrate_modes(bristle_torques, (0.05, 7.0), 0.0, GEARED_START, GEARED_INPUT, 0.0),
     }
 
 
@@ -222,7 +222,7 @@ def test_simulator_agrees_with_scipy_about_what_has_a_memory_in_the_gear_and_beh
         {"kind": "motor.cogging_harmonics", "harmonic": 3.0, "sine": 0.2, "cosine_2": -0.3, "sine_3": 0.1},
     )
 
-    def right(t, y, u):
+    def derivatives(t, y, u):
         x, v, q, w, h, twist, third = y
         rate = v - 5.0 * w
         transmitted = 60.0 * (x - 5.0 * q) + 1.5 * h
@@ -235,7 +235,7 @@ def test_simulator_agrees_with_scipy_about_what_has_a_memory_in_the_gear_and_beh
     state, truth = np.array([*GEARED_START, 0.0, 0.0, 0.0]), np.zeros((4, SAMPLES))
     for k, u in enumerate(GEARED_INPUT):
         truth[:, k] = state[:4]
-        state = solve_ivp(right, (0.0, PERIOD), state, "DOP853", rtol=1e-10, atol=1e-13, args=(u,)).y[:, -1]
+        state = solve_ivp(derivatives, (0.0, PERIOD), state, "DOP853", rtol=1e-10, atol=1e-13, args=(u,)).y[:, -1]
     run = Run(Machine(GEARED, {"law": "linear_shaft", "stiffness": 60.0}, effects), PERIOD, GEARED_INPUT)
     run.initial = GEARED_START
     # hysteresis has a kink at each reversal, which is no event: of second order there

@@ -17,10 +17,10 @@ _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damp
 
 def run_search(case, tmp_path):
     case.log.write(tmp_path / "log.csv")
-    return search(tmp_path / "log.csv", case.model).run()
+    return prepare_search(tmp_path / "log.csv", case.model).run()
 
 
-def search(log, study):
+def prepare_search(log, study):
     task = read_identification_task(log, study)
     nominal = on_record(task.config, task.record)
     free = make_free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
@@ -63,7 +63,7 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     keep = (log.t < 1.2) | (log.t > 2.0)
     table = np.column_stack([log.t, log.u, log.theta_e])[keep]
     np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    effect_search = search(tmp_path / "log.csv", nominal_study())
+    effect_search = prepare_search(tmp_path / "log.csv", nominal_study())
     assert len(effect_search.segments) == 2
     explanation = effect_search.run()
     assert explanation.verdict == "explained"
@@ -85,7 +85,7 @@ def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
     simulate_direct_drive(simulate_multisine_log().u[:1000], [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(
         tmp_path / "log.csv"
     )
-    explanation = search(tmp_path / "log.csv", nominal_study()).run()
+    explanation = prepare_search(tmp_path / "log.csv", nominal_study()).run()
     assert explanation.verdict == "explained"
     assert [finding.effect for finding in explanation.findings] == [name]
     for key, value in HIDDEN[name].items():

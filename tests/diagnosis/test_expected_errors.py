@@ -15,7 +15,7 @@ from jaxbl.diagnosis.proof import fit_model
 from jaxbl.diagnosis.setup import set_up
 
 
-def errors_of(folder, log, effects, noise=None):
+def compare_with_expected(folder, log, effects, noise=None):
     """Errors of a model with some effects on the last quarter of a log, and what is expected of a complete one; `noise`: of
     the readings as a smoother would have it, rad."""
     log.write(folder / "axis.csv")
@@ -38,7 +38,7 @@ def errors_of(folder, log, effects, noise=None):
 @pytest.mark.parametrize("torque_noise", [0.0, 0.02])
 def test_a_complete_model_passes_and_an_incomplete_one_fails(torque_noise, tmp_path):
     log = simulate_multisine_log(torque_noise=torque_noise)
-    errors, expected = errors_of(tmp_path, log, {"motor.coulomb_friction": {"torque": FRICTION["torque"]}})
+    errors, expected = compare_with_expected(tmp_path, log, {"motor.coulomb_friction": {"torque": FRICTION["torque"]}})
     assert {name.partition(" below ")[0] for name in expected} == {"theta_e", "torque_motor"}
     assert failed(errors, expected) == []
     # an input with noise that the drive has not felt moves the model, by as much as is expected
@@ -46,12 +46,12 @@ def test_a_complete_model_passes_and_an_incomplete_one_fails(torque_noise, tmp_p
     if torque_noise:
         assert errors["theta_e"] > 3.0 * position.noise
         assert errors["theta_e"] == pytest.approx(position.open, rel=0.6)
-    errors, expected = errors_of(tmp_path, log, {})
+    errors, expected = compare_with_expected(tmp_path, log, {})
     assert "torque_motor" in failed(errors, expected)
 
 
 def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
-    errors, expected = errors_of(
+    errors, expected = compare_with_expected(
         tmp_path, simulate_multisine_log(), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     )
     assert expected["torque_motor"].least == pytest.approx(0.5e-3)
@@ -72,7 +72,7 @@ def test_the_quantile_is_that_of_sums_of_squares(freedom):
 def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
     log = simulate_multisine_log(noise=3e-4)
     slow = 0.03 * np.sin(2.0 * np.pi * 0.4 * log.t)
-    errors, expected = errors_of(
+    errors, expected = compare_with_expected(
         tmp_path, dataclasses.replace(log, u=log.u - slow), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     )
     failures = failed(errors, expected)
@@ -82,5 +82,5 @@ def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
 def test_noise_that_a_smoother_takes_for_motion_is_seen_in_the_errors(tmp_path):
     """A smoother finds too little noise of a rough motion; the errors of the model have no motion in them."""
     friction = {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
-    _, expected = errors_of(tmp_path, simulate_multisine_log(noise=1e-4), friction, noise=2e-5)
+    _, expected = compare_with_expected(tmp_path, simulate_multisine_log(noise=1e-4), friction, noise=2e-5)
     assert expected["theta_e"].noise == pytest.approx(1e-4, rel=0.15)

@@ -20,14 +20,14 @@ NOISE = {"theta_e": 1e-4, "torque_motor": 0.01}
 BEFORE = {"theta_e": 0.1, "torque_motor": 0.01}
 
 
-def fit(log_likelihood, log_evidence, name=NAME):
+def make_fit(log_likelihood, log_evidence, name=NAME):
     numbers = {name: {"torque": 0.2}}
     return SimpleNamespace(names=(name,), numbers=numbers, log_likelihood=log_likelihood, log_evidence=log_evidence)
 
 
 def make_search_result(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
     finding = Finding(NAME, 0.98, {"torque": 0.1}, (("motor.inertia", 0.02),))
-    model, wrong = fit(0.0, 0.0), fit(-fit_gain, -fit_gain - prior_gain, rival)
+    model, wrong = make_fit(0.0, 0.0), make_fit(-fit_gain, -fit_gain - prior_gain, rival)
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
 
 
@@ -186,18 +186,18 @@ def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete
     experiment = SimpleNamespace(sides=["motor", "load"], drive=SimpleNamespace(ratio={"motor": 1.0, "load": 5.0}.get))
     limits = {f"torque_{side}": Expected(0.3, 0.4, 0.0, 9.0) for side in experiment.sides}
 
-    def share(before, after):
+    def share_between(before, after):
         pair = (
             {f"torque_{side}": value for side, value in zip(experiment.sides, torques, strict=True)}
             for torques in (before, after)
         )
         return explained_share(experiment, *pair, limits)  # type: ignore[arg-type]
 
-    assert share((np.sqrt(1.25), 0.5), (0.5, 0.5)) == pytest.approx(1.0)
+    assert share_between((np.sqrt(1.25), 0.5), (0.5, 0.5)) == pytest.approx(1.0)
     # at the motor the load's counts for a twenty-fifth
-    assert share((np.sqrt(1.25), np.sqrt(25.25)), (np.sqrt(1.25), 0.5)) == pytest.approx(0.5)
-    assert share((np.sqrt(1.25), 0.5), (np.sqrt(2.25), 0.5)) == pytest.approx(-1.0)
-    assert share((0.5, 0.4), (0.6, 0.5)) is None
+    assert share_between((np.sqrt(1.25), np.sqrt(25.25)), (np.sqrt(1.25), 0.5)) == pytest.approx(0.5)
+    assert share_between((np.sqrt(1.25), 0.5), (np.sqrt(2.25), 0.5)) == pytest.approx(-1.0)
+    assert share_between((0.5, 0.4), (0.6, 0.5)) is None
 
 
 def test_no_effect_is_surer_than_that_its_torque_is_not_zero():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hidden_log import simulate_study
 from small_study import rigid_study, small_study
-from trace_segment import segment_of
+from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
@@ -34,7 +34,7 @@ def simulate_segment(sides):
         data = small_study(settings, excitation=excitation, transmission=SHAFT, observer=OBSERVER)
     else:
         data = rigid_study(settings, excitation=excitation, observer={"motor": OBSERVER["motor"]})
-    return prepare(read_config(data)), segment_of(simulate_study(data, seed=8))
+    return prepare(read_config(data)), make_segment(simulate_study(data, seed=8))
 
 
 def linearise(sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):

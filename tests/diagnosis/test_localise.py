@@ -8,7 +8,7 @@ import pytest
 from hidden_log import simulate_study
 from scipy.signal import lfilter
 from small_study import rigid_study, small_study
-from trace_segment import segment_of
+from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.coordinates import CoordinateValues, all_coordinates, coordinates_of
@@ -25,7 +25,7 @@ VELOCITY = np.sum(SIZE * RATE * np.cos(RATE * TIME[:, None] + [0.0, 1.0, 2.0]), 
 POLE = 0.9
 
 
-def coordinates(**more):
+def make_coordinates(**more):
     crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
     near = np.zeros(COUNT, int)
     for row in crossing:
@@ -45,19 +45,19 @@ def coordinates(**more):
     return values | more
 
 
-def noise(seed, pole=0.0):
+def draw_noise(seed, pole=0.0):
     random = np.random.default_rng(seed)
     white = random.standard_normal(COUNT + 500)
     return lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white)[500:]
 
 
-def residual(torque, pole=0.0, level=0.1):
+def make_residual(torque, pole=0.0, level=0.1):
     correlation = pole ** np.arange(120.0) if pole else np.ones(1)
     return Residual("motor", TIME, torque, np.full(COUNT, level), correlation, 0.5 / PERIOD)
 
 
 def locate_torque(torque, seed=0, pole=0.0, **more):
-    return locate([residual(torque + 0.1 * noise(seed, pole), pole)], [coordinates(**more)])
+    return locate([make_residual(torque + 0.1 * draw_noise(seed, pole), pole)], [make_coordinates(**more)])
 
 
 @pytest.mark.parametrize("pole", [0.0, POLE], ids=["white", "correlated"])
@@ -82,7 +82,7 @@ def test_a_slow_disturbance_is_no_function_of_the_motion(repeats):
     """Noise that the stated level does not know of, over half a second: power is missing, but at no place of the motion."""
     count, false = repeats(6, 20), 0
     for seed in range(count):
-        location = locate_torque(0.2 * noise(100 + seed, 0.99), seed)
+        location = locate_torque(0.2 * draw_noise(100 + seed, 0.99), seed)
         assert location.significant and location.excess_z > SIGNIFICANT
         for name in ("direction", "reversals", "|speed|", "speed", "turn"):
             assert location.coordinates[name].explained < 0.25
@@ -149,20 +149,20 @@ def test_weak_torques_are_found_below_the_noise_of_a_sample():
     assert backward.mean == pytest.approx(0.03, abs=4.0 * backward.mean_error)
     assert forward.mean == pytest.approx(-0.03, abs=4.0 * forward.mean_error)
     # a torque below the floor is not spoken of
-    torque = -0.03 * np.sign(VELOCITY) + 0.1 * noise(0)
-    assert not locate([residual(torque)], [coordinates()], floor=0.1).significant
+    torque = -0.03 * np.sign(VELOCITY) + 0.1 * draw_noise(0)
+    assert not locate([make_residual(torque)], [make_coordinates()], floor=0.1).significant
 
 
 def test_parts_of_a_record_are_counted_together():
-    torque = -0.1 * np.sign(VELOCITY) + 0.1 * noise(3)
-    full_residual = residual(torque)
+    torque = -0.1 * np.sign(VELOCITY) + 0.1 * draw_noise(3)
+    full_residual = make_residual(torque)
     rows = slice(0, 1500), slice(1700, COUNT)
     parts = [
         dataclasses.replace(full_residual, time=TIME[r], torque=torque[r], deviation=full_residual.deviation[r])
         for r in rows
     ]  # fmt: skip
     part_coordinates = [
-        {name: location._replace(values=location.values[r]) for name, location in coordinates().items()} for r in rows
+        {name: location._replace(values=location.values[r]) for name, location in make_coordinates().items()} for r in rows
     ]
     location = locate(parts, part_coordinates)
     assert location.coordinates["direction"].explained > 0.85
@@ -178,15 +178,15 @@ GEARED = {
 }
 
 
-def residuals_of(true, model):
-    segment = segment_of(simulate_study(true))
+def simulate_residuals(true, model):
+    segment = make_segment(simulate_study(true))
     experiment = prepare(read_config(model))
     return experiment, residual_torques(experiment, [segment]), segment
 
 
 def test_a_geared_drive_with_hidden_friction_on_its_load():
     hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
-    experiment, residuals, segment = residuals_of(
+    experiment, residuals, segment = simulate_residuals(
         small_study(SETTINGS, effects=hidden, **GEARED), small_study(SETTINGS, **GEARED)
     )
     location = localise(experiment, residuals, [segment], all_coordinates(experiment, [segment], residuals, ()))
@@ -200,7 +200,7 @@ def test_a_geared_drive_with_hidden_friction_on_its_load():
 
 def test_coordinates_know_turning_from_sliding():
     moving = rigid_study(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
-    experiment, residuals, segment = residuals_of(moving, moving)
+    experiment, residuals, segment = simulate_residuals(moving, moving)
     turning = coordinates_of(experiment, segment, residuals["motor"][0])
     sliding = coordinates_of(experiment, segment, residuals["motor"][0], ["motor"])
     assert turning["speed"].unit == "rad/s" and sliding["speed"].unit == "m/s"

@@ -50,14 +50,14 @@ EXACT = STUDY | {"drive": GEARED, "transmission": SHAFT}
 ONE_CYCLE = 5.0 * np.sin(2.0 * np.pi * 0.5 * 2e-3 * np.arange(1000))
 
 
-def driven(torque, law, noise):
+def simulate_motor_log(torque, law, noise):
     (trace,) = simulate([Run(Machine(GEARED, law, []), 2e-3, torque, motor_noise=noise, seed=1)])
     return Log(trace.t, trace.u, trace.theta_e, None)
 
 
 def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     t = 2e-3 * np.arange(1310)
-    log = driven(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
+    log = simulate_motor_log(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
     # the first part is too short to be fitted, and stays in the trace; the other one gives up its beginning
     path, other = tmp_path / "motor.csv", tmp_path / "other.csv"
     select_samples(log, np.r_[0:50, 60:1060]).write(path)
@@ -74,7 +74,7 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
 
 def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
     """Numbers 12 to 20 % off: a plain fit ends beside the least error, and leaves a torque of 0.5 N m."""
-    log = driven(
+    log = simulate_motor_log(
         3.0 * np.sin(2 * np.pi * 0.5 * 2e-3 * np.arange(1000)),
         {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08},
         1e-5,
@@ -91,7 +91,7 @@ def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
 
 def test_one_crossing_shows_a_gap(tmp_path):
     path = tmp_path / "motor.csv"
-    driven(ONE_CYCLE, GAP, 1e-5).write(path)
+    simulate_motor_log(ONE_CYCLE, GAP, 1e-5).write(path)
     summary = diagnose(path, EXACT).summary
     assert summary["backlash"]["crossings"] == 1
     (finding,) = summary["findings"]
@@ -101,7 +101,7 @@ def test_one_crossing_shows_a_gap(tmp_path):
 
 def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
     path = tmp_path / "motor.csv"
-    driven(ONE_CYCLE, GAP, 1e-5).write(path)
+    simulate_motor_log(ONE_CYCLE, GAP, 1e-5).write(path)
     monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
     summary = diagnose(path, EXACT).summary
     assert (summary["verdict"], summary["findings"]) == ("unknown_effect", [])

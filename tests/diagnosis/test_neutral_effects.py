@@ -20,14 +20,14 @@ reads beside the position moves no drive."""
 KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
-def model(sides):
+def prepare_model(sides):
     data = small_study() if sides == 2 else rigid_study()
     return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
 def test_neutral_effects_do_nothing(sides):
-    bare = model(sides)
+    bare = prepare_model(sides)
     full = complete(bare, candidates(bare))
     torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
     runs = []
@@ -43,7 +43,7 @@ def test_neutral_effects_do_nothing(sides):
 
 @pytest.mark.parametrize("sides", [1, 2])
 def test_all_effects_are_there_once(sides):
-    bare = model(sides)
+    bare = prepare_model(sides)
     lacking = candidates(bare)
     stateful = [name for name in lacking if has_state(name)]
     assert "actuator.lag" in stateful and not has_state("motor.cogging")

@@ -20,17 +20,17 @@ DRIVE = {
 STUDY = {"drive": DRIVE, "transmission": {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.01}}
 
 
-def task(transmission=STUDY["transmission"], sides=("motor",)):
+def make_task(transmission=STUDY["transmission"], sides=("motor",)):
     record = SimpleNamespace(path=Path("log.csv"), positions=dict.fromkeys(sides), sample_period=1e-3)
     return SimpleNamespace(config=read_model(STUDY | {"transmission": transmission})[0], record=record)
 
 
 def test_a_move_that_shows_a_gap_is_for_the_motor_alone_and_a_model_with_one():
-    check_gap_sought(task())  # type: ignore[arg-type]
+    check_gap_sought(make_task())  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"log\.csv: .* this log has theta_s; jaxbl diagnose --next-experiment"):
-        check_gap_sought(task(sides=("motor", "load")))  # type: ignore[arg-type]
+        check_gap_sought(make_task(sides=("motor", "load")))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"log\.csv: .* a half_gap \(or dead_zone\) in \[transmission\]"):
-        check_gap_sought(task({"law": "linear_shaft", "stiffness": 60.0}))  # type: ignore[arg-type]
+        check_gap_sought(make_task({"law": "linear_shaft", "stiffness": 60.0}))  # type: ignore[arg-type]
 
 
 def test_a_diagnosis_that_seeks_no_gap_writes_no_experiment(tmp_path):

@@ -22,9 +22,9 @@ class Torques:
 
     segments: tuple
     truth: tuple
-    turned: float = 1.0
+    motion_scale: float = 1.0
     noise: float = 1e-4
-    rough: float = 1.0
+    noise_scale: float = 1.0
 
     def missing(self, experiment, name="torque"):
         if name == "deviation":
@@ -33,8 +33,11 @@ class Torques:
         for segment in self.segments:
             i = segment.rows.start // SAMPLES
             time = 1e-3 * np.arange(SAMPLES)
-            speed, change = self.turned * 30.0 * np.sin(5.0 * time + i), self.turned * 150.0 * np.cos(5.0 * time + i)
-            noise = self.rough * self.noise * np.random.default_rng(i).standard_normal(SAMPLES)
+            speed, change = (
+                self.motion_scale * 30.0 * np.sin(5.0 * time + i),
+                self.motion_scale * 150.0 * np.cos(5.0 * time + i),
+            )
+            noise = self.noise_scale * self.noise * np.random.default_rng(i).standard_normal(SAMPLES)
             drive = experiment.drive
             result.append(
                 (self.truth[i] - float(drive.motor_inertia)) * change
@@ -47,11 +50,11 @@ class Torques:
 def compare_logs(
     first: float,
     second: float,
-    turned: float = 1.0,
+    motion_scale: float = 1.0,
     separate: bool = False,
     files: tuple = ("a.csv", "b.csv"),
     noise: float = 1e-4,
-    rough: float = 1.0,
+    noise_scale: float = 1.0,
 ):
     rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
     names = list(zip(map(Path, files), rows, strict=True))
@@ -66,8 +69,8 @@ def compare_logs(
         experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
         free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
-        log = Torques(segments[: 1 if separate else 2], (first, second), turned, noise, rough)
-        holdout = Torques(segments[1:], (first, second), turned, noise, rough)
+        log = Torques(segments[: 1 if separate else 2], (first, second), motion_scale, noise, noise_scale)
+        holdout = Torques(segments[1:], (first, second), motion_scale, noise, noise_scale)
         return contradictions(task, fitted, log, holdout, 5e-3)  # type: ignore[arg-type]
 
 
@@ -95,7 +98,7 @@ def test_logs_of_one_machine_agree():
 
 
 def test_a_difference_without_torque_is_no_contradiction():
-    assert compare_logs(INERTIA, 1.5 * INERTIA, turned=0.05) == []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, motion_scale=0.05) == []
 
 
 def test_a_motion_that_noise_all_but_hides_says_nothing_of_an_inertia():
@@ -106,5 +109,5 @@ def test_a_motion_that_noise_all_but_hides_says_nothing_of_an_inertia():
 
 def test_blocks_that_agree_beyond_what_noise_allows_have_measured_nothing():
     # of a drive that stands still a model says both sides of the equation
-    assert compare_logs(INERTIA, 1.5 * INERTIA, rough=0.1) != []
-    assert compare_logs(INERTIA, 1.5 * INERTIA, rough=1e-5) == []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, noise_scale=0.1) != []
+    assert compare_logs(INERTIA, 1.5 * INERTIA, noise_scale=1e-5) == []

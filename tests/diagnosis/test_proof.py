@@ -88,11 +88,11 @@ def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, dra
     """Beside a delay that stands for it a ripple seems needless."""
     shares = {"actuator.delay": 0.01, "motor.cogging": 0.2, "motor.coulomb_friction": 0.9}
 
-    def gain(name, names):
+    def gain_of_effect(name, names):
         alone = "actuator.delay" not in names
         return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
 
-    accepted = accept_effects(monkeypatch, draw_errors, shares, gain)
+    accepted = accept_effects(monkeypatch, draw_errors, shares, gain_of_effect)
     assert accepted.withdrawn == ["actuator.delay"]
     assert accepted.fitted.names == ("motor.cogging", "motor.coulomb_friction")
 

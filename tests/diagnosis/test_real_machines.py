@@ -18,7 +18,7 @@ VISCOUS = {"kind": "motor.viscous_friction", "viscous": 206.0}
 OFFSET = {"kind": "motor.constant_torque", "torque": -3.2}
 
 
-def emps(*effects):
+def emps_study(*effects):
     """The positioning system as a mass, with some of its effects; linear: kg, N, m."""
     study = rigid_study(
         {"drive.motor_inertia": 95.0, "drive.motor_viscous": 0.0, "run.substeps": 2},
@@ -40,7 +40,9 @@ def search_effects(log, study):
 def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     """Published: M 95.1 kg, F_v 203.5 N s/m, F_c 20.39 N, and F_v 166.7 N s/m forwards, 240.4 backwards; force error 66 %
     with the mass alone, 4.7 % with all of these."""
-    diagnosis = diagnose(find_recording("emps/DATA_EMPS.mat"), emps(), holdout=find_recording("emps/DATA_EMPS_PULSES.mat"))
+    diagnosis = diagnose(
+        find_recording("emps/DATA_EMPS.mat"), emps_study(), holdout=find_recording("emps/DATA_EMPS_PULSES.mat")
+    )
     summary = diagnosis.summary
     numbers = {finding["effect"]: finding["parameters"] for finding in summary["findings"]}
     assert set(numbers) == {"motor.viscous_friction", "motor.coulomb_friction", "motor.asymmetric_friction"}
@@ -64,7 +66,7 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
 
 def test_emps_an_effect_that_is_taken_out_is_named_again(monkeypatch):
     monkeypatch.setattr(effect_search, "_MOST", 1)
-    (finding,) = search_effects(find_recording("emps/DATA_EMPS.mat"), emps(VISCOUS, OFFSET)).findings
+    (finding,) = search_effects(find_recording("emps/DATA_EMPS.mat"), emps_study(VISCOUS, OFFSET)).findings
     assert finding.effect == COULOMB["kind"]
     assert finding.numbers["torque"] == pytest.approx(COULOMB["torque"], rel=0.1)
 

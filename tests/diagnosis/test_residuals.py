@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hidden_log import simulate_study
 from small_study import rigid_study, small_study
-from trace_segment import segment_of
+from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrowed, noise_spectrum, residual_torques
@@ -28,7 +28,7 @@ def simulate_record(data, seed=0, transmitted=None):
     """Simulate a study, and return the trace and its segment."""
     trace = simulate_study(data, seed)
     measured = None if transmitted is None else trace["torque"].to_numpy() + transmitted
-    return trace, segment_of(trace, transmitted=measured)
+    return trace, make_segment(trace, transmitted=measured)
 
 
 def rms(values):

@@ -11,7 +11,7 @@ from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_regression import _proposals, _replaced
 
 
-def proposals(folder, *effects):
+def propose_effects(folder, *effects):
     simulate_multisine_log(effects).write(folder / "axis.csv")
     task = read_diagnosis_task(folder / "axis.csv", nominal_study())
     with jax.enable_x64(True):
@@ -23,7 +23,7 @@ def proposals(folder, *effects):
 
 
 def test_the_effect_that_takes_most_of_the_missing_torque_is_proposed_with_its_number(tmp_path):
-    first, *further = proposals(tmp_path, "friction")
+    first, *further = propose_effects(tmp_path, "friction")
     names = [first.name, *(proposal.name for proposal in further)]
     # friction that falls with speed, or bends, contains it
     assert "motor.coulomb_friction" in names[:3] and first.gain > 0.7
@@ -33,7 +33,7 @@ def test_the_effect_that_takes_most_of_the_missing_torque_is_proposed_with_its_n
 
 
 def test_nothing_is_proposed_where_nothing_is_missing(tmp_path):
-    assert proposals(tmp_path) == []
+    assert propose_effects(tmp_path) == []
 
 
 def test_an_effect_takes_the_place_of_its_special_case():

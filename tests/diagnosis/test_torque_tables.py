@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hidden_log import nominal_study, simulate_direct_drive, simulate_study
 from small_study import rigid_study
-from trace_segment import segment_of
+from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.diagnosis_summary import extended_study
@@ -27,9 +27,9 @@ def study(*effects):
     return rigid_study(SETTINGS, excitation=excitation, observer=OBSERVER, effects=list(effects))
 
 
-def tables(*effects):
+def find_tables(*effects):
     """Return the tables of what a model without these effects lacks on a run with them."""
-    segment = segment_of(simulate_study(study(*effects)))
+    segment = make_segment(simulate_study(study(*effects)))
     experiment = prepare(read_config(study()))
     lacking = residual_torques(experiment, [segment])["motor"]
     log = ReferenceLog([segment], {"motor": 20.0})
@@ -37,7 +37,7 @@ def tables(*effects):
 
 
 def test_a_torque_over_position_is_found_with_its_error():
-    found_tables = tables(WAVE)
+    found_tables = find_tables(WAVE)
     assert set(found_tables) in ({"position"}, {"turn"})
     (table,) = found_tables.values()
     truth = 0.05 * np.sin(3.0 * table.points + 0.4)
@@ -48,14 +48,14 @@ def test_a_torque_over_position_is_found_with_its_error():
 
 
 def test_a_torque_over_speed_is_found():
-    found_tables = tables(DRAG)
+    found_tables = find_tables(DRAG)
     assert set(found_tables) == {"speed"}
     table = found_tables["speed"]
     np.testing.assert_allclose(table.torques[1:-1], (0.004 * table.points * np.abs(table.points))[1:-1], atol=0.01)
 
 
 def test_nothing_is_tabulated_where_nothing_is_missing():
-    assert tables() == {}
+    assert find_tables() == {}
 
 
 def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):

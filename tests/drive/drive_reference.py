@@ -18,38 +18,38 @@ HOLD = 0.125
 TORQUES = np.array([0.4, -0.1, 0.5, 0.1, -0.3, 0.6, 0.2, 0.3])
 
 
-def sigmoid(z):
+def sigmoid_torque(z):
     """Law (3) with the constants of `SIGMOID`, in the paper's exponential form."""
     return 3.0 * (z - 4.0 * 0.02 * (1.0 - np.exp(-20.0 * z)) / (1.0 + np.exp(-20.0 * z)))
 
 
-def right_side(t, y, u, law, effects, drive):
+def derivatives(t, y, u, law, effects, drive):
     """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque, bristles of motor and load, hysteresis, twist and velocity
     of a third inertia) under a commanded torque u, sliding forwards only."""
 
-    def value(effect, key):
+    def number_of(effect, key):
         return effects.get(effect, {}).get(key, 0.0)
 
-    def side(name, v):
+    def side_torque(name, v):
         stribeck = f"{name}.stribeck_friction"
-        falling = (value(stribeck, "breakaway_torque") - value(stribeck, "torque")) * np.exp(
+        falling = (number_of(stribeck, "breakaway_torque") - number_of(stribeck, "torque")) * np.exp(
             -((v / effects[stribeck]["stribeck_velocity"]) ** 2) if stribeck in effects else 0.0
         )
-        dry = value(f"{name}.coulomb_friction", "torque") + value(stribeck, "torque") + falling
+        dry = number_of(f"{name}.coulomb_friction", "torque") + number_of(stribeck, "torque") + falling
         if (drifting := effects.get(f"{name}.drifting_friction")) is not None:
             cold, warm = drifting["initial_torque"], drifting["torque"]
             dry += warm + (cold - warm) * np.exp(-t / drifting["time_constant"])
         differs = f"{name}.asymmetric_friction"
         half_sign = 0.5 if v > 0.0 else -0.5
-        dry += half_sign * value(differs, "torque_difference")
+        dry += half_sign * number_of(differs, "torque_difference")
         return (
             dry * np.sign(v)
-            + (value(f"{name}.viscous_friction", "viscous") + half_sign * value(differs, "viscous_difference")) * v
-            + value(f"{name}.quadratic_drag", "drag") * abs(v) * v
-            + value(f"{name}.constant_torque", "torque")
+            + (number_of(f"{name}.viscous_friction", "viscous") + half_sign * number_of(differs, "viscous_difference")) * v
+            + number_of(f"{name}.quadratic_drag", "drag") * abs(v) * v
+            + number_of(f"{name}.constant_torque", "torque")
         )
 
-    def bristle(name, v, z):
+    def bristle_torque(name, v, z):
         """Torque of LuGre's model and dz/dt, in its own numbers sigma_0, sigma_1, g."""
         numbers = effects.get(f"{name}.presliding_friction")
         if numbers is None:
@@ -69,65 +69,68 @@ def right_side(t, y, u, law, effects, drive):
         return position_torque + (np.interp(v, table["speeds"], table["speed_torques"]) if "speeds" in table else 0.0)
 
     theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s, w, twist, third = y
-    u = u * (1.0 + value("actuator.gain_error", "relative"))
+    u = u * (1.0 + number_of("actuator.gain_error", "relative"))
     if "actuator.saturation" in effects:
-        u = min(max(u, -value("actuator.saturation", "limit")), value("actuator.saturation", "limit"))
+        u = min(max(u, -number_of("actuator.saturation", "limit")), number_of("actuator.saturation", "limit"))
     u_dot = 0.0
     if "actuator.lag" in effects:
-        u, u_dot = lagged, (u - lagged) / value("actuator.lag", "time_constant")
+        u, u_dot = lagged, (u - lagged) / number_of("actuator.lag", "time_constant")
     if "actuator.back_emf" in effects:
         winding = effects["actuator.back_emf"]
         u = winding["torque_constant"] * (u - winding["torque_constant"] * omega_e) / winding["resistance"]
 
-    amplitude, n, phase = (value("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
+    amplitude, n, phase = (number_of("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
     ratio = drive["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
     z = theta_e - drive["gear_ratio"] * theta_s + amplitude * np.sin(n * theta_s + phase)
     z_dot = omega_e - ratio * omega_s
-    half_gap = value("transmission.backlash", "half_gap")
+    half_gap = number_of("transmission.backlash", "half_gap")
     if abs(z) < half_gap:
         z, z_dot = 0.0, 0.0
     else:
         z -= half_gap * np.sign(z)
     torque = law(z)
-    torque += value("transmission.hardening", "cubic_stiffness") * z**3 + value("transmission.damping", "damping") * z_dot
-    torque += value("transmission.hysteresis", "torque") * w
+    torque += (
+        number_of("transmission.hardening", "cubic_stiffness") * z**3 + number_of("transmission.damping", "damping") * z_dot
+    )
+    torque += number_of("transmission.hysteresis", "torque") * w
     w_dot = z_dot - 0.5 * (abs(z_dot) * abs(w) * w + z_dot * w * w)
     w_dot /= effects.get("transmission.hysteresis", {"length": 1.0})["length"]
 
-    at_motor = side("motor", omega_e) + value("motor.cogging", "amplitude") * np.sin(
-        value("motor.cogging", "harmonic") * theta_e + value("motor.cogging", "phase")
+    at_motor = side_torque("motor", omega_e) + number_of("motor.cogging", "amplitude") * np.sin(
+        number_of("motor.cogging", "harmonic") * theta_e + number_of("motor.cogging", "phase")
     )
     at_motor += interpolate_tables("motor", theta_e, omega_e)
-    at_load = side("load", omega_s) + interpolate_tables("load", theta_s, omega_s)
+    at_load = side_torque("load", omega_s) + interpolate_tables("load", theta_s, omega_s)
     for k, name in ((1, ""), (2, "_2"), (3, "_3")):
-        turn = k * value("motor.cogging_harmonics", "harmonic") * theta_e
-        at_motor += value("motor.cogging_harmonics", f"sine{name}") * np.sin(turn)
-        at_motor += value("motor.cogging_harmonics", f"cosine{name}") * np.cos(turn)
-    rate = 2.0 * np.pi * value("load.flexibility", "frequency")
-    third_dot = -(rate**2) * twist - 2.0 * value("load.flexibility", "damping_ratio") * rate * (third - omega_s)
-    at_load += value("load.flexibility", "inertia") * third_dot
-    at_load += value("load.gravity", "torque") * np.sin(theta_s - value("load.gravity", "phase"))
-    at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
-        2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")
+        turn = k * number_of("motor.cogging_harmonics", "harmonic") * theta_e
+        at_motor += number_of("motor.cogging_harmonics", f"sine{name}") * np.sin(turn)
+        at_motor += number_of("motor.cogging_harmonics", f"cosine{name}") * np.cos(turn)
+    rate = 2.0 * np.pi * number_of("load.flexibility", "frequency")
+    third_dot = -(rate**2) * twist - 2.0 * number_of("load.flexibility", "damping_ratio") * rate * (third - omega_s)
+    at_load += number_of("load.flexibility", "inertia") * third_dot
+    at_load += number_of("load.gravity", "torque") * np.sin(theta_s - number_of("load.gravity", "phase"))
+    at_load += number_of("load.periodic_disturbance", "amplitude") * np.sin(
+        2.0 * np.pi * number_of("load.periodic_disturbance", "frequency") * t
+        + number_of("load.periodic_disturbance", "phase")
     )
     if "motor.torque_ripple" in effects:
         ripple = effects["motor.torque_ripple"]
         u *= 1.0 + ripple["amplitude"] * np.sin(ripple["harmonic"] * theta_e + ripple["phase"])
-    at_motor += value("transmission.load_friction", "coefficient") * abs(torque) * np.sign(omega_e)
-    bent_e, z_e_dot = bristle("motor", omega_e, z_e)
-    bent_s, z_s_dot = bristle("load", omega_s, z_s)
+    at_motor += number_of("transmission.load_friction", "coefficient") * abs(torque) * np.sign(omega_e)
+    bent_e, z_e_dot = bristle_torque("motor", omega_e, z_e)
+    bent_s, z_s_dot = bristle_torque("load", omega_s, z_s)
     at_motor, at_load = at_motor + bent_e, at_load + bent_s
     omega_e_dot = (u - torque - drive["motor_viscous"] * omega_e - at_motor) / (
-        drive["motor_inertia"] + value("motor.inertia", "inertia")
+        drive["motor_inertia"] + number_of("motor.inertia", "inertia")
     )
     omega_s_dot = (ratio * torque - drive["load_viscous"] * omega_s - at_load) / (
-        drive["load_inertia"] + value("load.inertia", "inertia")
+        drive["load_inertia"] + number_of("load.inertia", "inertia")
     )
     twist_rate = third - omega_s
     return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot, w_dot, twist_rate, third_dot]
 
 
-def integrate_reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
+def integrate_reference(law=sigmoid_torque, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
     """Integrate the equations: (theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
     y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], *[0.0] * 6]
     states = []
@@ -140,7 +143,7 @@ def integrate_reference(law=sigmoid, effects=None, drive=DRIVE, start=START, tor
         for begin, end, u in spans:
             # max_step: an adaptive step must not leap over a gap
             solution = solve_ivp(
-                right_side,
+                derivatives,
                 (k * hold + begin, k * hold + end),
                 y,
                 method="DOP853",
@@ -206,7 +209,7 @@ def simulate_plant_batch(plants, substeps, dtype=jnp.float64):
 
 
 LAWS = {
-    "sigmoid_backlash": (SigmoidBacklash(**SIGMOID), sigmoid),
+    "sigmoid_backlash": (SigmoidBacklash(**SIGMOID), sigmoid_torque),
     "linear_shaft": (LinearShaft(stiffness=3.0), lambda z: 3.0 * z),
     "dead_zone": (
         DeadZone(stiffness=3.0, half_gap=0.05),

@@ -43,7 +43,7 @@ def simulate_single_effects(substeps, dtype=jnp.float64):
     return dict(zip(VALUES, simulate_plant_batch(plants, substeps, dtype), strict=True))
 
 
-def errors(values, *substeps):
+def reference_errors(values, *substeps):
     """Distances of the drive from the reference, by so many substeps."""
     expected = integrate_reference(effects=values)
     assert expected[:, 2:].min() > 0.1  # sliding forwards
@@ -92,7 +92,7 @@ def test_effects_add_up_in_any_order():
     # two have kinks where the transmitted torque turns: of second order in the mean
     kinked = ("transmission.backlash", "transmission.load_friction")
     values = {name: numbers for name, numbers in VALUES.items() if name not in kinked}
-    coarse, fine = errors(values, 256, 4096)
+    coarse, fine = reference_errors(values, 256, 4096)
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
     shuffled = sorted(make_effects(values), key=lambda effect: (effect.place == "actuator", effect.place))
@@ -103,7 +103,7 @@ def test_effects_add_up_in_any_order():
 def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
     values = {name: VALUES[f"transmission.{name.split('.')[1]}"] for name in VALUES if name.startswith("transmission.")}
     # damping sets in with a jump at the edges of the gap: of first order there
-    coarse, fine = errors(values, 1024, 16384)
+    coarse, fine = reference_errors(values, 1024, 16384)
     assert fine < 1e-4 and fine < coarse / 8.0
 
 

@@ -11,7 +11,7 @@ RATIO = 5.0
 SIDES = st.sampled_from(["motor", "load"])
 
 
-def read(encoders, side, position, unit_noise=0.0, dtype=jnp.float64):
+def read_encoder(encoders, side, position, unit_noise=0.0, dtype=jnp.float64):
     arguments = as_arrays((encoders, float(position), float(unit_noise), RATIO), dtype)
     reading = arguments[0].measure(side, *arguments[1:])
     assert reading.dtype == dtype
@@ -21,7 +21,7 @@ def read(encoders, side, position, unit_noise=0.0, dtype=jnp.float64):
 @settings(deadline=None)
 @given(SIDES, st.floats(-1e3, 1e3), st.floats(1e-6, 1e-1))
 def test_a_reading_is_a_whole_count_at_most_half_a_count_off(side, position, count):
-    reading = read(Encoders(**{f"{side}_resolution": count}), side, position)
+    reading = read_encoder(Encoders(**{f"{side}_resolution": count}), side, position)
     assert abs(reading - position) <= 0.5 * count * (1.0 + 1e-9) + 1e-12
     counts = reading / count
     assert counts == pytest.approx(round(float(counts)), abs=1e-6)
@@ -30,7 +30,7 @@ def test_a_reading_is_a_whole_count_at_most_half_a_count_off(side, position, cou
 @settings(deadline=None)
 @given(SIDES, st.floats(-1e3, 1e3), st.floats(-4.0, 4.0))
 def test_an_ideal_encoder_reads_the_position(side, position, unit_noise):
-    assert read(Encoders(), side, position, unit_noise) == position
+    assert read_encoder(Encoders(), side, position, unit_noise) == position
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_an_ideal_encoder_reads_the_position(side, position, unit_noise):
 )
 def test_noise_of_each_side(side, load_noise, rms):
     encoders = Encoders(noise=1e-2, load_noise=load_noise)
-    assert read(encoders, side, 1.0, -2.0) == pytest.approx(1.0 - 2.0 * rms, rel=1e-14)
+    assert read_encoder(encoders, side, 1.0, -2.0) == pytest.approx(1.0 - 2.0 * rms, rel=1e-14)
 
 
 def test_noise_dithers_the_counts():
@@ -52,5 +52,5 @@ def test_noise_dithers_the_counts():
 
 def test_the_other_side_is_not_quantised_and_float32_stays_float32():
     encoders = Encoders(load_resolution=0.5)
-    assert read(encoders, "motor", 0.3, dtype=jnp.float32) == jnp.float32(0.3)
-    assert read(encoders, "load", 0.3, dtype=jnp.float32) == 0.5
+    assert read_encoder(encoders, "motor", 0.3, dtype=jnp.float32) == jnp.float32(0.3)
+    assert read_encoder(encoders, "load", 0.3, dtype=jnp.float32) == 0.5

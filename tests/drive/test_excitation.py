@@ -16,12 +16,12 @@ PERIODS = pytest.mark.parametrize("period", [1e-3, 7e-4, 1.0 / 3000.0])
 
 
 @jax.jit
-def _sample(excitation, times):
+def _sample_compiled(excitation, times):
     return jax.vmap(excitation)(times)
 
 
 def sample(excitation, times, dtype=jnp.float64):
-    values = _sample(as_arrays(excitation, dtype), jnp.asarray(times, dtype))
+    values = _sample_compiled(as_arrays(excitation, dtype), jnp.asarray(times, dtype))
     assert values.dtype == dtype and values.shape == np.shape(times)
     return np.asarray(values)
 

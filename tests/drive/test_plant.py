@@ -38,7 +38,7 @@ def test_the_papers_drive_at_the_default_step():
     np.testing.assert_allclose(simulate_plant(drive, 100, REST, torques, 0.1)[:, :2], expected[:, :2], atol=1e-6)
 
 
-def potential(law, z):
+def potential_energy(law, z):
     if law == "sigmoid_backlash":
         return SIGMOID["stiffness"] * (
             0.5 * z**2 - 8.0 * SIGMOID["dead_zone"] / SIGMOID["slope"] * np.log(np.cosh(0.5 * SIGMOID["slope"] * z))
@@ -58,7 +58,7 @@ def test_energy_drifts_less_than_a_millionth_in_20_s(law, twist, eccentric):
     motor, load, motor_velocity, load_velocity = states.T
     kinetic = 0.5 * FREE["motor_inertia"] * motor_velocity**2 + 0.5 * FREE["load_inertia"] * load_velocity**2
     z = motor - FREE["gear_ratio"] * load + error["amplitude"] * np.sin(error["harmonic"] * load + error.get("phase", 0.0))
-    energy = kinetic + potential(law, z) - potential(law, np.linspace(-0.3, 0.3, 10_001)).min()
+    energy = kinetic + potential_energy(law, z) - potential_energy(law, np.linspace(-0.3, 0.3, 10_001)).min()
     assert np.ptp(kinetic) > 0.5 * energy[0]  # it does swing
     assert np.abs(energy / energy[0] - 1.0).max() < 1e-6
 
@@ -136,7 +136,7 @@ def test_effects_and_drive_parameters_are_differentiable():
     def end(stiffness, drag):
         drive = make_plant(make_effect("load.quadratic_drag", drag=0.05), law=LinearShaft(3.0))
         drive = eqx.tree_at(lambda p: (p.transmission.stiffness, p.effects[0].drag), drive, (stiffness, drag))
-        return _end(drive)
+        return _end_position(drive)
 
     values = (jnp.asarray(3.0), jnp.asarray(0.05))
     for i, step in enumerate((1e-4, 1e-5)):
@@ -154,7 +154,7 @@ def test_a_batch_of_drives_moves_as_each_alone():
     drive = make_plant(make_effect("motor.coulomb_friction", torque=0.0))
 
     def end(level):
-        return _end(eqx.tree_at(lambda p: p.effects[0].torque, drive, level))
+        return _end_position(eqx.tree_at(lambda p: p.effects[0].torque, drive, level))
 
     together = jax.vmap(end)(frictions)
     np.testing.assert_allclose(together, [end(level) for level in frictions], rtol=1e-13)
@@ -162,7 +162,7 @@ def test_a_batch_of_drives_moves_as_each_alone():
 
 
 @jax.jit
-def _end(drive):
+def _end_position(drive):
     """Motor position after all `TORQUES`, in steps of an eighth of a hold."""
     step = HOLD / 8.0
 

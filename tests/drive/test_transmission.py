@@ -22,7 +22,7 @@ def transmitted_torque(law, z):
     return law.torque(law.deflection(z))
 
 
-def floats(values):
+def to_floats(values):
     return {key: float(value) for key, value in values.items()}
 
 
@@ -44,7 +44,7 @@ def test_torque_is_the_regression_with_the_true_parameters(law, z):
     assert len(regressors) == len(theta)
     predicted = sum(r * t for r, t in zip(regressors, theta, strict=True))
     assert predicted == pytest.approx(float(transmitted_torque(law, z)), rel=1e-12, abs=1e-12 * float(law.stiffness))
-    assert floats(law.from_theta(theta)) == pytest.approx(floats(truth), rel=1e-12)
+    assert to_floats(law.from_theta(theta)) == pytest.approx(to_floats(truth), rel=1e-12)
 
 
 @settings(deadline=None, max_examples=50)

@@ -87,6 +87,6 @@ def draw_samples(count, sides, period=1e-3, seed=0):
     return np.stack([torque, motor, load][: 1 + sides], axis=1)
 
 
-def bits(values):
+def to_integers(values):
     """Numbers as integers, so that zeros of both signs differ."""
     return np.ascontiguousarray(values).view(f"i{values.dtype.itemsize}")

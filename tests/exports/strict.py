@@ -12,20 +12,20 @@ from jaxbl.fused.jaxprs import callee, cond_branches, equation_parameter, scan_p
 _CODES = {"float32": "f", "float64": "d", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
 
 
-def _over_zero(a, b):
+def _divide(a, b):
     with np.errstate(all="ignore"):
         return type(a)(np.divide(a, b))
 
 
-def _root(x):
+def _square_root(x):
     return math.sqrt(x) if x >= 0.0 else math.nan
 
 
-def _cast(value, old, new):
+def _cast_bits(value, old, new):
     return struct.unpack(f"<{_CODES[new]}", struct.pack(f"<{_CODES[old]}", value))[0]
 
 
-def _nearest(x):
+def _round_to_nearest(x):
     return math.copysign(float(round(x)), x)
 
 
@@ -66,8 +66,8 @@ class Strict:
                 "    return run",
             ]
         )
-        scope = {"sqrt": np.sqrt if self.single else _root, "over_zero": _over_zero, "cast": _cast, "math": math}
-        scope |= {"f32": np.float32, "np": np, "nearest": _nearest} | self._constants
+        scope = {"sqrt": np.sqrt if self.single else _square_root, "over_zero": _divide, "cast": _cast_bits, "math": math}
+        scope |= {"f32": np.float32, "np": np, "nearest": _round_to_nearest} | self._constants
         exec(compile(text, "strict", "exec"), scope)
         return scope["make"]
 

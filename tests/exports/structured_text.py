@@ -153,12 +153,12 @@ def _divide(a, b):
     return a / b if isinstance(a, np.floating) else type(a)(math.trunc(int(a) / int(b)))
 
 
-def _negative(a):
+def _negate(a):
     assert isinstance(a, (np.floating, np.signedinteger))
     return -a
 
 
-def _root(a):
+def _square_root(a):
     assert isinstance(a, np.floating) and a >= 0.0, a
     return np.sqrt(a)
 
@@ -187,12 +187,12 @@ _WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _
 _MEANING = {
     "of": _require_type,
     **TYPES,
-    "negative": _negative,
+    "negative": _negate,
     "negated": lambda a: ~_require_type(np.bool_, a),
     "binary": {word: _require_alike(work) for word, work in (_WORK | _ORDER).items()}
     | {word: _require_alike(work, np.bool_) for word, work in _LOGIC.items()},
     "called": {
-        "SQRT": _root,
+        "SQRT": _square_root,
         "ABS": lambda a: abs(_require_alike(lambda a, _: a)(a, a)),
         "MIN": _require_alike(np.minimum),
         "MAX": _require_alike(np.maximum),

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, draw_samples, run_program
+from native import COMPILERS, STRICT, UNCONTRACTED, Native, draw_samples, run_program, to_integers
 from small_study import small_study
 from strict import Strict
 
@@ -47,7 +47,7 @@ def exported_code(tmp_path_factory):
     return export_once
 
 
-def outputs(native, inputs):
+def run_native(native, inputs):
     native.start(inputs[0, 1:])
     return native.run(inputs)
 
@@ -57,13 +57,13 @@ def outputs(native, inputs):
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_all_compilers_and_levels_give_the_same_bits(exported_code, compiler, level, precision):
     inputs, (folder, plain) = draw_samples(3000, 2), exported_code(precision)
-    first = outputs(plain, inputs)
-    result = outputs(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
+    first = run_native(plain, inputs)
+    result = run_native(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
     assert np.isfinite(result).all()
-    assert (bits(result) == bits(first)).all()
+    assert (to_integers(result) == to_integers(first)).all()
 
 
-def strictly(data, precision, inputs):
+def run_strict(data, precision, inputs):
     dtype = np.dtype(np.float32 if precision == "float" else np.float64)
     block = Strict(build_observer_chain(read_config(data), "drive", dtype))
     state, rows = block.start(inputs[0, 1:].astype(dtype)), []
@@ -80,15 +80,15 @@ def test_every_kind_is_the_traced_step_bit_for_bit(exported_code, kind, precisio
     inputs = draw_samples(400, 2)
     _, native = exported_code(precision, kind)
     assert native.size == native.summary["state_bytes"]
-    actual, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
-    assert (bits(actual) == bits(expected)).all()
+    actual, expected = run_native(native, inputs), run_strict(study(kind), precision, inputs)
+    assert (to_integers(actual) == to_integers(expected)).all()
 
 
 @pytest.mark.program("gcc")
 def test_many_steps_are_the_traced_step_bit_for_bit(exported_code, repeats):
     inputs = draw_samples(repeats(20_000, 1_000_000), 2)
     _, native = exported_code("double")
-    assert (bits(outputs(native, inputs)) == bits(strictly(study(), "double", inputs))).all()
+    assert (to_integers(run_native(native, inputs)) == to_integers(run_strict(study(), "double", inputs))).all()
 
 
 @pytest.mark.program("gcc")
@@ -106,17 +106,19 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
     sides = ("motor",) if law is None else ("motor", "load")
     inputs = draw_samples(4000, len(sides))
     native = export_native(tmp_path, data)
-    actual = outputs(native, inputs)
+    actual = run_native(native, inputs)
     with jax.enable_x64(True):
         experiment = as_arrays(read_config(data).build(), jnp.float64)
         measured = {side: jnp.asarray(inputs[:, 1 + i]) for i, side in enumerate(sides)}
 
-        def keep(state, signals):
+        def select_estimates(state, signals):
             return {f"{s}_torque_estimate": signals.side(s).torque_estimate for s in sides} | {
                 f"{s}_velocity_estimate": signals.side(s).velocity_estimate for s in sides
             }
 
-        expected = jax.jit(lambda u, y: replay(experiment, u, y, record=keep)[1])(jnp.asarray(inputs[:, 0]), measured)
+        expected = jax.jit(lambda u, y: replay(experiment, u, y, record=select_estimates)[1])(
+            jnp.asarray(inputs[:, 0]), measured
+        )
     names = [output["name"] for output in native.summary["outputs"]]
     for name, values in expected.items():
         # a switching term takes the other side where rounding decides
@@ -135,7 +137,7 @@ def test_the_example_filter_reads_and_writes_csv(tmp_path):
     native = Native(tmp_path)
     result = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
     assert lines[0].split(",")[1:] == [output["name"] for output in native.summary["outputs"]]
-    np.testing.assert_allclose(result[:, 1:], outputs(native, inputs), rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(result[:, 1:], run_native(native, inputs), rtol=1e-12, atol=1e-300)
 
 
 def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path):

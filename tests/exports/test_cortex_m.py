@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from native import STRICT, UNCONTRACTED, Native, draw_samples, run_program
-from test_c import outputs, study
+from test_c import run_native, study
 
 import jaxbl
 
@@ -57,7 +57,7 @@ def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     view = np.array([int(word, 16) for word in words], np.uint32).view(np.float32).reshape(-1, 2)
     native = Native(tmp_path)
     names = [output["name"] for output in native.summary["outputs"]]
-    expected = outputs(native, inputs)[:, [names.index("motor_torque_estimate"), names.index("load_velocity_estimate")]]
+    expected = run_native(native, inputs)[:, [names.index("motor_torque_estimate"), names.index("load_velocity_estimate")]]
     assert (view.view(np.uint32) == np.ascontiguousarray(expected).view(np.uint32)).all()
 
 

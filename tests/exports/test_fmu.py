@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_values import ENCODERS, VALUES
-from native import STRICT, bits, run_program
+from native import STRICT, run_program, to_integers
 from small_study import rigid_study, small_study
 from strict import Strict
 
@@ -80,7 +80,7 @@ def windows_too(_for_this_machine, monkeypatch):
 @pytest.fixture
 def sources_alone(monkeypatch):
     """For tests that need no binary."""
-    only(monkeypatch)
+    offer_programs(monkeypatch)
 
 
 def export_unit(data, folder, fmi=3, **options):
@@ -96,12 +96,12 @@ def unit_of(tmp_path_factory):
 
 
 @functools.cache
-def simulate(name):
+def simulate_study(name):
     """The trace of a study."""
     return jaxbl.run(STUDIES[name]).trace
 
 
-def free_run(path, summary, trace, start=None, **options):
+def run_by_fmpy(path, summary, trace, start=None, **options):
     """Simulate by FMPy under the trace's input."""
     period = summary["sample_period"]
     inputs = np.zeros(len(trace), [("time", float), ("u", float)])
@@ -207,7 +207,7 @@ class Instance:
     ("name", "fmi"), [("rigid", 2), ("rigid", 3), ("shaft", 3), ("moved gap", 2), ("moved gap", 3), ("all effects", 3)]
 )
 def test_the_free_run_is_that_of_the_simulation(unit_of, name, fmi):
-    assert_agreement(free_run(*unit_of(name, fmi), simulate(name)), simulate(name))
+    assert_agreement(run_by_fmpy(*unit_of(name, fmi), simulate_study(name)), simulate_study(name))
 
 
 @pytest.mark.parametrize(("name", "fmi"), [("rigid", 2), ("gap", 3), ("all effects", 3)])
@@ -253,7 +253,7 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
         rows.append(out)
     with Instance(path) as instance:
         trial = instance.begin().run(torques.astype(float))
-    assert (bits(trial) == bits(np.array(rows, dtype).astype(float))).all()
+    assert (to_integers(trial) == to_integers(np.array(rows, dtype).astype(float))).all()
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +290,7 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     *rows, refusal = stdout.splitlines()
     assert refusal == instance.said[-1]
     actual = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
-    assert (actual.view(np.int64) == bits(expected)).all()
+    assert (actual.view(np.int64) == to_integers(expected)).all()
 
 
 @COMPILED
@@ -298,8 +298,8 @@ def test_in_single_precision_it_is_near_the_simulation(tmp_path):
     path, summary = export_unit(small_study({"run.precision": "float32"}, **STUDIES["moved gap"]), tmp_path)
     assert summary["precision"] == "float"
     # 1e-7 of rounding; accelerations are differences over a sample, which make it a thousand times as large
-    trace = simulate("moved gap")
-    assert_agreement(free_run(path, summary, trace), trace, 2e-4)
+    trace = simulate_study("moved gap")
+    assert_agreement(run_by_fmpy(path, summary, trace), trace, 2e-4)
 
 
 @COMPILED
@@ -307,8 +307,8 @@ def test_in_single_precision_it_is_near_the_simulation(tmp_path):
 def test_parameters_are_those_of_the_study(unit_of, fmi):
     """Set before the run they give the run of the changed study, set between steps they act from there on."""
     path, summary = unit_of("gap with effects", fmi)
-    trace = simulate("changed gap")
-    assert_agreement(free_run(path, summary, trace, GAP_CHANGES), trace)
+    trace = simulate_study("changed gap")
+    assert_agreement(run_by_fmpy(path, summary, trace, GAP_CHANGES), trace)
     with Instance(path) as instance:
         instance.begin()
         before = instance.run([1.0] * 5)
@@ -497,7 +497,7 @@ def test_what_is_refused_has_a_line_in_the_log(unit_of, fmi):
 
 
 def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
-    only(monkeypatch)
+    offer_programs(monkeypatch)
     export = jaxbl.export(study(), tmp_path, "fmu", name="axis")
     assert export.lines == [
         "axis.fmu: FMI 3.0, co-simulation, steps of 0.001 s, 12 parameters; the sources alone: no C compiler (cc) was found."
@@ -509,7 +509,7 @@ def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
     assert validate_fmu(str(tmp_path / "axis.fmu")) == []
 
 
-def only(monkeypatch, *programs):
+def offer_programs(monkeypatch, *programs):
     """No other programs are found."""
     monkeypatch.setattr(
         "jaxbl.exports.fmu.shutil.which", {program: shutil.which(program) or program for program in programs}.get
@@ -525,7 +525,7 @@ def only(monkeypatch, *programs):
     ],
 )
 def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, machine, fmi, reason):
-    only(monkeypatch, "cc")
+    offer_programs(monkeypatch, "cc")
     for name, value in zip(("system", "machine"), machine, strict=True):
         monkeypatch.setattr(f"jaxbl.exports.fmu.platform.{name}", lambda value=value: value)
     assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {reason}.")
@@ -534,7 +534,7 @@ def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, mac
 @pytest.mark.program("x86_64-w64-mingw32-gcc")
 @pytest.mark.usefixtures("windows_too")
 def test_with_a_compiler_for_windows_alone_it_says_which_binary_is_missing(tmp_path, monkeypatch):
-    only(monkeypatch, "x86_64-w64-mingw32-gcc")
+    offer_programs(monkeypatch, "x86_64-w64-mingw32-gcc")
     export = jaxbl.export(study(), tmp_path, "fmu")
     assert export.lines[0].endswith("; a binary for x86_64-windows, and the sources.")
     assert export.lines[1:] == ["One more binary is missing: no C compiler (cc) was found."]
@@ -654,13 +654,13 @@ def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_pa
     """FMPy by CMake, which reads which files these are."""
     build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install 'jaxbl[fmu]')")
     with monkeypatch.context() as without:
-        only(without)
+        offer_programs(without)
         path, summary = export_unit(STUDIES["moved gap"], tmp_path, fmi)
     folder = fmpy.extract(path, tmp_path / "there")
     (tmp_path / "build").mkdir()
     build.build_platform_binary(folder, tmp_path / "build")
-    trace = simulate("moved gap")
-    assert_agreement(free_run(folder, summary, trace), trace)
+    trace = simulate_study("moved gap")
+    assert_agreement(run_by_fmpy(folder, summary, trace), trace)
 
 
 def test_the_same_study_gives_the_same_bytes_and_another_one_another_token(tmp_path):

@@ -21,7 +21,7 @@ TUNE = {"num": 4, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 6.0}, "lamb
 TOLERANCES = {"run.position_tolerance": 0.05, "run.velocity_tolerance": 5.0}
 
 
-def command(*words):
+def run_command(*words):
     main(lambda: app([*map(str, words)], standalone_mode=False))
 
 
@@ -35,7 +35,7 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     study = tmp_path / "axis.toml"
     study.write_text(tomli_w.dumps(data))
     before = read_config(study).to_dict()["observer"]
-    command("tune", study, "--out", tmp_path / "tuned", "--quiet")
+    run_command("tune", study, "--out", tmp_path / "tuned", "--quiet")
 
     tuned = tmp_path / "tuned_axis.toml"
     gains_alone = {key: value for key, value in data.items() if key not in ("observer", "tune")}
@@ -47,7 +47,7 @@ def test_tuned_gains_come_back_from_the_compiled_code_as_in_identify(tmp_path):
     log = tmp_path / "log.csv"
     run(config, seed=3).trace[["t", "u", "theta_e", "theta_s"]].to_csv(log, index=False)
     code = tmp_path / "code"
-    command("export", tuned, "--target", "c", "--precision", "double", "--name", "axis", "--out", code, "--quiet")
+    run_command("export", tuned, "--target", "c", "--precision", "double", "--name", "axis", "--out", code, "--quiet")
     run_program("gcc", *STRICT, *UNCONTRACTED, "-O2", "axis.c", "axis_filter.c", "-lm", "-o", "axis_filter", cwd=code)
     run_program("./axis_filter", log, "filtered.csv", cwd=code)
     frame = pd.read_csv(code / "filtered.csv")

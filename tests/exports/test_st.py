@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from native import bits, draw_samples
+from native import draw_samples, to_integers
 from structured_text import FunctionBlock
-from test_c import strictly, study
+from test_c import run_strict, study
 
 import jaxbl
 from jaxbl.observer import OBSERVERS
@@ -20,8 +20,8 @@ def test_every_kind_is_the_traced_step_bit_for_bit(tmp_path, kind, precision):
     assert block.name.text == b"drive"
     inputs = draw_samples(150, 2)
     rows = [list(block(input=u, motor_position=y, load_position=z).values()) for u, y, z in inputs]
-    expected = strictly(study(kind), precision, inputs)
-    assert (bits(np.array(rows, expected.dtype)) == bits(expected)).all()
+    expected = run_strict(study(kind), precision, inputs)
+    assert (to_integers(np.array(rows, expected.dtype)) == to_integers(expected)).all()
     again = block(input=inputs[0, 0], motor_position=inputs[0, 1], load_position=inputs[0, 2], restart=True)
     assert list(again.values()) == rows[0]
 

@@ -43,7 +43,7 @@ UNKNOWN = {
 }
 
 
-def only(*changes):
+def parametrize_changes(*changes):
     """Some of the changes, where a module may be imported in another place; a plant meets all three."""
     return pytest.mark.parametrize("refuse_feature", changes, ids=lambda change: change.__name__, indirect=True)
 
@@ -72,7 +72,7 @@ def looped_run():
     return jaxbl.run(STUDY, every=7)
 
 
-@only(rename_parameters, hide_modules)
+@parametrize_changes(rename_parameters, hide_modules)
 def test_a_sweep_is_scanned(scanned_sweep, refuse_feature, caplog):
     pattern = refuse_feature()
     result = jaxbl.sweep(SWEPT)
@@ -86,7 +86,7 @@ def test_a_sweep_is_scanned(scanned_sweep, refuse_feature, caplog):
     assert not caplog.messages
 
 
-@only(refuse_assembly, hide_modules)
+@parametrize_changes(refuse_assembly, hide_modules)
 def test_a_run_is_scanned(looped_run, refuse_feature, caplog):
     pattern = refuse_feature()
     trials = [jaxbl.run(STUDY, every=7) for _ in range(2)]

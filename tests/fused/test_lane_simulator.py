@@ -30,7 +30,7 @@ HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "mot
 OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
 
 
-def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=701, precision="float64"):
+def make_experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=701, precision="float64"):
     kind = DISCRETISATIONS[observer]
     motor = kind(10.0, 90.0, velocity_error=0.5)
     return as_arrays(
@@ -50,7 +50,7 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
     )
 
 
-def spread(experiment, paths, lanes):
+def spread_lane_values(experiment, paths, lanes):
     """Numbers of so many lanes about those of the experiment."""
     return {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
 
@@ -58,10 +58,10 @@ def spread(experiment, paths, lanes):
 def scan_lanes(experiment, values, reducer, seed):
     """Figures of the scan."""
 
-    def lane(values):
+    def scan_lane(values):
         return scan(set_leaves(experiment, values), jnp.asarray(seed), (reducer,))[0]
 
-    return jax.jit(jax.vmap(lane))(values)
+    return jax.jit(jax.vmap(scan_lane))(values)
 
 
 class Parts(LaneSimulator):
@@ -72,10 +72,10 @@ class Parts(LaneSimulator):
 
 
 @functools.cache
-def parts(half, precision):
+def make_parts(half, precision):
     """Parts of a short run with half of the effects, and with all metrics or one."""
     names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
-    full_experiment = experiment(names, law, steps=200, precision=precision)
+    full_experiment = make_experiment(names, law, steps=200, precision=precision)
     return Parts(
         full_experiment,
         (metrics_reducer(asked),),
@@ -95,9 +95,9 @@ def parts(half, precision):
 )
 def test_figures_are_those_of_the_scan(names, law, options):
     """Threads get different numbers of lanes."""
-    full_experiment = experiment(names, law, **options)
+    full_experiment = make_experiment(names, law, **options)
     effects = [path for path in leaf_paths(full_experiment) if path.startswith("effects.")]
-    values = spread(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
+    values = spread_lane_values(full_experiment, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
     fused = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3)
     expected = scan_lanes(full_experiment, values, ALL_METRICS, 3)
     assert set(fused) == set(expected)
@@ -107,8 +107,8 @@ def test_figures_are_those_of_the_scan(names, law, options):
 
 def test_figures_of_one_inertia_are_those_of_the_scan_and_of_the_kernel_of_accelerators():
     """The kernel, interpreted: two programs of the grid, the last lanes filled up, blocks of samples with a rest."""
-    full_experiment = experiment(["motor.coulomb_friction", "load.gravity"], rigid=True, substeps=3)
-    values = spread(
+    full_experiment = make_experiment(["motor.coulomb_friction", "load.gravity"], rigid=True, substeps=3)
+    values = spread_lane_values(
         full_experiment, ["effects.motor.coulomb_friction.torque", "observer.motor.alpha", "encoders.noise"], 150
     )
     fused = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 150, 2)(values, 3)
@@ -122,8 +122,10 @@ def test_figures_of_one_inertia_are_those_of_the_scan_and_of_the_kernel_of_accel
 
 
 def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
-    full_experiment = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
-    values = spread(full_experiment, [path for path in leaf_paths(full_experiment) if path.startswith("effects.")], 37)
+    full_experiment = make_experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
+    values = spread_lane_values(
+        full_experiment, [path for path in leaf_paths(full_experiment) if path.startswith("effects.")], 37
+    )
     asked = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
     stride, selection = (HostSimulator(full_experiment, (reducer,), tuple(values), 37, 2)(values, 3) for reducer in asked)
     assert len(selection) < len(stride)
@@ -133,8 +135,8 @@ def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
 
 def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
-    full_experiment = experiment([], DeadZone(60.0, 0.05))
-    values = spread(full_experiment, ["observer.motor.alpha", "observer.motor.lambda"], 7)
+    full_experiment = make_experiment([], DeadZone(60.0, 0.05))
+    values = spread_lane_values(full_experiment, ["observer.motor.alpha", "observer.motor.lambda"], 7)
     simulator = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 7, 1)
     varied = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
     assert simulator.carry_count < varied.carry_count
@@ -186,7 +188,7 @@ def test_the_kernel_of_accelerators_in_single_precision():
 def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
     with jax.enable_x64(precision == "float64"):
-        result = parts(half, precision)
+        result = make_parts(half, precision)
         kernel = Kernel(result._step, result._hooks, len(result._paths), 2 * LANES, 200, 64)
         # from JAX 0.11 on it has to be told which GPU
         device = AbstractDevice("NVIDIA H100", None, "gpu")
@@ -200,11 +202,11 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
 )
 def test_a_processor_has_no_kernel_of_accelerators():
     with pytest.raises(Unsupported, match="compilation for this device"):
-        DeviceSimulator(experiment([], LinearShaft(60.0)), (ALL_METRICS,), ("transmission.stiffness",), 5)
+        DeviceSimulator(make_experiment([], LinearShaft(60.0)), (ALL_METRICS,), ("transmission.stiffness",), 5)
 
 
 def test_what_is_joined_for_a_gpu_computes_the_same():
-    result, joined = parts(True, "float64"), []
+    result, joined = make_parts(True, "float64"), []
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
         joined.append(a)
@@ -232,14 +234,14 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     simulator = HostSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)
     loop, calls = simulator._loop, []
 
-    def failing(*arguments, **options):
+    def fail_third_call(*arguments, **options):
         calls.append(1)
         if len(calls) == 3:
             raise MemoryError("no more")
         loop(*arguments, **options)
 
-    failing.signature = loop.signature
-    monkeypatch.setattr(simulator, "_loop", failing)
+    fail_third_call.signature = loop.signature
+    monkeypatch.setattr(simulator, "_loop", fail_third_call)
     with pytest.raises(MemoryError, match="no more"):
         simulator(work.values(), SEED)
     monkeypatch.undo()
@@ -256,7 +258,7 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
     stiffness = np.concatenate([np.full(100, 60.0), np.geomspace(1e5, 1e7, 200)])
     orders = np.arange(lanes), np.random.default_rng(0).permutation(lanes)
     with jax.enable_x64(precision == "float64"):
-        full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        full_experiment = make_experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness}
         staying = ALL_METRICS._replace(done=None)
         expected = HostSimulator(full_experiment, (staying,), tuple(values), lanes, 1)(values, 3)
@@ -293,7 +295,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     stiffness = np.concatenate([np.full(64, 60.0), *late, np.full(64, 1e6)])
     tolerance = np.where(np.arange(lanes) % 4 == 0, 1e3, 1e-12)
     with jax.enable_x64(precision == "float64"):
-        full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        full_experiment = make_experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness, "run.velocity_tolerance": tolerance}
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
         asked = metrics_reducer(("converged", "convergence_time"))
@@ -331,7 +333,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
 
 def test_all_lanes_may_leave(monkeypatch):
     monkeypatch.setattr(module, "_CALL_WORK", 1)
-    full_experiment = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
+    full_experiment = make_experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
     simulator = HostSimulator(full_experiment, (ALL_METRICS,), ("transmission.stiffness",), 5, 1)
     result = simulator({"transmission.stiffness": np.full(5, 1e8)}, 3)
     assert not result["finite"].any()
@@ -366,7 +368,7 @@ def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
 
 
 def test_an_unknown_operation_is_refused_by_name():
-    full_experiment = experiment([], DeadZone(60.0, 0.05), steps=100)
+    full_experiment = make_experiment([], DeadZone(60.0, 0.05), steps=100)
     odd = Reducer(
         lambda e: jnp.zeros_like(e.run.sample_period),
         lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),

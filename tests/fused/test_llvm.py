@@ -29,7 +29,7 @@ def sum_loop():
     )
 
 
-def arrays():
+def loop_buffers():
     return {
         "value 0": np.array([1.0, 2.0]),
         "carry 0": np.zeros(2),
@@ -41,7 +41,7 @@ def arrays():
 
 
 def test_a_loop_says_what_it_takes(sum_loop):
-    assert [arg.name for arg in sum_loop.signature] == list(arrays())
+    assert [arg.name for arg in sum_loop.signature] == list(loop_buffers())
     assert [arg.extent for arg in sum_loop.signature] == [
         "lanes",
         "lanes",
@@ -50,7 +50,7 @@ def test_a_loop_says_what_it_takes(sum_loop):
         "samples",
         "samples and lanes",
     ]
-    inputs = arrays()
+    inputs = loop_buffers()
     sum_loop(list(inputs.values()), 5, 0, 2)
     np.testing.assert_array_equal(inputs["carry 0"], [110.0, 120.0])
     np.testing.assert_array_equal(inputs["sample output 0"].reshape(5, 2)[2], [33.0, 36.0])
@@ -64,27 +64,27 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("name", arrays())
+@pytest.mark.parametrize("name", loop_buffers())
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_does_not_fit_is_refused(sum_loop, name, wrong):
-    inputs = arrays()
+    inputs = loop_buffers()
     inputs[name] = WRONG[wrong](inputs[name])
     with pytest.raises(ValueError, match=rf"^{name} of a loop needs \d+ contiguous numbers of type"):
         sum_loop(list(inputs.values()), 5, 0, 2)
 
 
 def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(sum_loop):
-    loop_arrays = LoopArrays(sum_loop.signature, list(arrays().values()), 5, 2)
+    loop_arrays = LoopArrays(sum_loop.signature, list(loop_buffers().values()), 5, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
         sum_loop(loop_arrays, 6, 0, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
         sum_loop(loop_arrays, 5, 0, 4)
     with pytest.raises(ValueError, match="needs 6 arrays, not 5"):
-        sum_loop(list(arrays().values())[:-1], 5, 0, 2)
+        sum_loop(list(loop_buffers().values())[:-1], 5, 0, 2)
 
 
 def test_rows_of_one_array_stand_for_several(sum_loop):
-    inputs = arrays()
+    inputs = loop_buffers()
     pair = np.array([inputs["value 0"], inputs["carry 0"]])
     remainder = list(inputs.values())[2:]
     sum_loop([ArrayRows(pair), *remainder], 5, 0, 2)

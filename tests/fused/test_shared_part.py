@@ -14,7 +14,7 @@ from jaxbl.simulate import Experiment, Run
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 
-def experiment(excitation, dtype):
+def make_experiment(excitation, dtype):
     full_experiment = Experiment(
         drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
         transmission=LinearShaft(60.0),
@@ -49,7 +49,7 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
 
     monkeypatch.setattr(module, "SharedPartLoop", Noted)
     with jax.enable_x64(precision == "float64"):
-        length = HostSimulator(experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._block_length
+        length = HostSimulator(make_experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._block_length
         ((looped, scanned, shared),) = result
         assert (looped._loop is not None) >= states
         # the plant's four states are not carried by each lane

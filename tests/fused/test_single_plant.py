@@ -20,7 +20,7 @@ STEPS = 250
 OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
 
 
-def experiment(names, rigid=False, substeps=1, extra=()):
+def make_experiment(names, rigid=False, substeps=1, extra=()):
     drive = Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
     effects = (*(make_effect(name, **VALUES[name]) for name in names), *extra)
     law = LinearShaft(60.0) if "transmission.backlash" in names else SigmoidBacklash(1.0, 0.02, 20.0)
@@ -31,9 +31,11 @@ def experiment(names, rigid=False, substeps=1, extra=()):
 
 
 MODELS = {
-    "most": lambda: experiment([name for name in VALUES if name not in OTHERS], substeps=5),
-    "others": lambda: experiment(OTHERS),
-    "rigid": lambda: experiment(["motor.presliding_friction", "motor.cogging", "motor.inertia", "actuator.lag"], rigid=True),
+    "most": lambda: make_experiment([name for name in VALUES if name not in OTHERS], substeps=5),
+    "others": lambda: make_experiment(OTHERS),
+    "rigid": lambda: make_experiment(
+        ["motor.presliding_friction", "motor.cogging", "motor.inertia", "actuator.lag"], rigid=True
+    ),
 }
 
 
@@ -68,7 +70,7 @@ def test_the_path_is_that_of_the_scan(name, observed):
         assert computed == pytest.approx(np.asarray(reference), rel=1e-9, abs=1e-10)
 
 
-def directions(model, start):
+def list_directions(model, start):
     """Each state, the input, each number of the plant."""
     result = [Direction(state=row) for row in np.eye(len(jax.tree.leaves(start))).tolist()]
     result.append(Direction(torque=1.0))
@@ -83,12 +85,12 @@ def test_slopes_are_those_of_differences(name):
     start, torque, _ = draw_inputs(model)
     time = 1e-3 * np.arange(STEPS)
     states = simulate_plant(model, start, torque)
-    tangents = directions(model, start)
+    tangents = list_directions(model, start)
     assert module._derivatives_loop(module._PlantStructure.of(model, start)) is not None
     changes, new = step_derivatives(model, states, torque, time, tangents)
     assert changes.shape == (len(tangents), len(jax.tree.leaves(start)), STEPS)
 
-    def complete(tangent):
+    def expand_direction(tangent):
         """A direction as changes of all numbers."""
         zeros, shape = jax.tree.map(lambda _: 0.0, model), jax.tree.structure(start)
         return set_leaves(zeros, tangent.numbers), shape.unflatten(tangent.state or [0.0] * shape.num_leaves), tangent.torque
@@ -99,7 +101,7 @@ def test_slopes_are_those_of_differences(name):
         changed, *arguments = jax.tree.map(lambda x, c: x + steps * c, (model, states, torque), tangent)
         return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(changed.plant, changed.run, *x))(*arguments, time)))
 
-    numbers, tree = jax.tree.leaves((model, states, torque)), [complete(tangent) for tangent in tangents]
+    numbers, tree = jax.tree.leaves((model, states, torque)), [expand_direction(tangent) for tangent in tangents]
     # of the size of the number itself
     sizes = [np.max(np.abs(numbers[jax.tree.leaves(tangent).index(1.0)])) + 1e-3 for tangent in tree]
     steps, tree = 3e-5 * np.array(sizes), jax.tree.map(lambda *x: np.array(x, float), *tree)
@@ -121,7 +123,7 @@ class _Tabled(SideEffect):
 
 
 def test_what_a_loop_cannot_do_is_left_to_the_scan():
-    model = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
+    model = make_experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
     start, torque, _ = draw_inputs(model)
     plant = module._PlantStructure.of(model, start)
     assert module._trajectory_loop(plant, ()) is None
@@ -140,7 +142,7 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
 
 def test_tables_that_no_step_reads_are_no_obstacle():
     """A recorded excitation is part of the experiment, and the input is given."""
-    model = experiment(["motor.viscous_friction"])
+    model = make_experiment(["motor.viscous_friction"])
     start, torque, _ = draw_inputs(model)
     recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
     other = eqx.tree_at(lambda e: e.excitation, model, recorded)
@@ -148,7 +150,7 @@ def test_tables_that_no_step_reads_are_no_obstacle():
     assert module._derivatives_loop(module._PlantStructure.of(other, start)) is not None
     expected, plant = simulate_plant(model, start, torque), simulate_plant(other, start, torque)
     assert np.array_equal(plant.position["motor"], expected.position["motor"])
-    tangents = [directions(e, start)[:6] for e in (model, other)]
+    tangents = [list_directions(e, start)[:6] for e in (model, other)]
     pair = [
         step_derivatives(e, expected, torque, 1e-3 * np.arange(STEPS), tangent)[0]
         for e, tangent in zip((model, other), tangents, strict=True)
@@ -157,18 +159,18 @@ def test_tables_that_no_step_reads_are_no_obstacle():
 
 
 def test_columns_of_other_lengths_are_refused():
-    model = experiment([])
+    model = make_experiment([])
     start, torque, _ = draw_inputs(model)
     states = simulate_plant(model, start, torque)
     with pytest.raises(ValueError, match="of a loop needs"):
-        step_derivatives(model, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(model, start))
+        step_derivatives(model, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), list_directions(model, start))
     gain = dict.fromkeys(model.sides, np.array([0.3, 20.0]))
     with pytest.raises(ValueError, match="of a loop needs"):
         simulate_plant(model, start, torque, 0.0, dict.fromkeys(model.sides, torque[:-5]), gain)
 
 
 def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
-    model = experiment(["motor.viscous_friction"], rigid=True)
+    model = make_experiment(["motor.viscous_friction"], rigid=True)
     start, torque, _ = draw_inputs(model)
     runs = []
     for inertia in (0.02, 0.04):

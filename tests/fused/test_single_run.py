@@ -23,7 +23,7 @@ ODD = Reducer(
 )
 
 
-def experiment(excitation, steps, precision):
+def make_experiment(excitation, steps, precision):
     return as_arrays(
         Experiment(
             drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
@@ -41,7 +41,7 @@ def experiment(excitation, steps, precision):
     )
 
 
-def row(state, signals):
+def record_row(state, signals):
     # in another order than the alphabet's; one of them needs no state
     return {"u": signals.input, "torque": signals.torque, "moving": signals.load.true.velocity > 0.0, "t": signals.time}
 
@@ -49,8 +49,10 @@ def row(state, signals):
 @pytest.fixture(scope="module")
 def scan_run():
     """An experiment, and figures and record of it by the scan."""
-    full_experiment = experiment(Prbs(5.0, 0.05), 523, "float64")
-    return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD), row, 1))(jnp.asarray(3))
+    full_experiment = make_experiment(Prbs(5.0, 0.05), 523, "float64")
+    return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD), record_row, 1))(
+        jnp.asarray(3)
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,7 @@ def scan_run():
 )
 def test_figures_and_record_are_those_of_the_scan(scan_run, stride, reducers):
     full, figures, record = scan_run
-    result, selected = record_run(full, 3, reducers, row, stride)
+    result, selected = record_run(full, 3, reducers, record_row, stride)
     assert list(selected) == ["u", "torque", "moving", "t"]
     assert set(result) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
     for name, column in selected.items():
@@ -77,9 +79,11 @@ def test_figures_and_record_are_those_of_the_scan(scan_run, stride, reducers):
 
 def test_a_run_in_single_precision():
     with jax.enable_x64(False):
-        full_experiment = experiment(Multisine(5.0, 0.8), 500, "float32")
-        result, selected = record_run(full_experiment, 3, (ALL_METRICS,), row)
-        figures, record = jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS,), row))(jnp.asarray(3, jnp.uint32))
+        full_experiment = make_experiment(Multisine(5.0, 0.8), 500, "float32")
+        result, selected = record_run(full_experiment, 3, (ALL_METRICS,), record_row)
+        figures, record = jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS,), record_row))(
+            jnp.asarray(3, jnp.uint32)
+        )
     assert {column.dtype.name for column in selected.values()} == {"float32", "bool"}
     np.testing.assert_allclose(selected["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))
     np.testing.assert_allclose(result["motor.velocity_rmse"], figures["motor.velocity_rmse"], rtol=1e-3)

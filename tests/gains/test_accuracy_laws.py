@@ -20,7 +20,7 @@ PERIODS = [1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2]
 NOISES = [0.0, *np.geomspace(1e-7, 1e-1, 13)]
 
 
-def law(x=PERIOD, value=VELOCITY, theory=1.0, **keys):
+def law_figure(x=PERIOD, value=VELOCITY, theory=1.0, **keys):
     return {"kind": "line", "x": x, "value": value, "theory": theory} | keys
 
 
@@ -105,7 +105,7 @@ def test_of_two_laws_the_wider_counts():
 
 def test_laws_of_each_series_and_panel_with_seeds_as_replicates():
     axes = [listed_axis(PERIOD, *PERIODS), listed_axis(WORDS, "explicit", "implicit"), listed_axis(LAMBDA, 0.5, 1.0)]
-    data = study(law(series=WORDS, facet=LAMBDA), axes=axes, sweep={"seeds": 3})
+    data = study(law_figure(series=WORDS, facet=LAMBDA), axes=axes, sweep={"seeds": 3})
 
     def error(frame):
         power = frame[LAMBDA] + 0.5 * (frame[WORDS] == "implicit")
@@ -121,7 +121,7 @@ def test_laws_of_each_series_and_panel_with_seeds_as_replicates():
 
 def test_law_of_noise_ends_at_the_floor_of_the_period_and_at_the_signal():
     fitted_law = fit_only_law(
-        study(law(NOISE, theory=0.5, where={PERIOD: 1e-3})),
+        study(law_figure(NOISE, theory=0.5, where={PERIOD: 1e-3})),
         motor__velocity_rmse=lambda f: np.hypot(10.0 * f[PERIOD], np.minimum(20.0 * f[NOISE] ** 0.5, 1.0)),
     )
     assert fitted_law.slope == pytest.approx(0.5, abs=0.02)
@@ -132,20 +132,20 @@ def test_law_of_noise_ends_at_the_floor_of_the_period_and_at_the_signal():
 
 def test_law_of_the_period_ends_at_the_floor_of_noise():
     fitted_law = fit_only_law(
-        study(law(where={NOISE: 1e-7})),
+        study(law_figure(where={NOISE: 1e-7})),
         motor__velocity_rmse=lambda f: np.hypot(f[PERIOD], 0.1 * f[NOISE] ** 0.5),
     )
     assert fitted_law.slope == pytest.approx(1.0, abs=0.03)
     assert fitted_law.stops["below"].startswith("noise floor: the error is 1.45 times that without noise")
     assert fitted_law.stops["above"] == "end of the sweep"
     # the same without noise
-    assert fit_only_law(study(law(where={NOISE: "least"})), motor__velocity_rmse=lambda f: f[PERIOD]).in_range.all()
+    assert fit_only_law(study(law_figure(where={NOISE: "least"})), motor__velocity_rmse=lambda f: f[PERIOD]).in_range.all()
 
 
 def test_white_noise_that_the_period_still_averages_is_named():
     fitted_law = fit_only_law(
         study(
-            law(NOISE, POSITION, where={PERIOD: "least"}),
+            law_figure(NOISE, POSITION, where={PERIOD: "least"}),
             axes=[listed_axis(PERIOD, 1e-5, 4e-5), listed_axis(NOISE, *NOISES)],
         ),
         motor__position_rmse=lambda f: np.hypot(0.1 * f[NOISE], 1.0 * f[NOISE] ** 0.75 * f[PERIOD] ** 0.5),
@@ -157,7 +157,7 @@ def test_white_noise_that_the_period_still_averages_is_named():
 
 def test_float_resolution_ends_a_law_and_leaves_none_where_all_is_zero():
     rounding = 1e-3 * np.finfo(np.float32).eps
-    data = study(law(where={NOISE: 0.0}))
+    data = study(law_figure(where={NOISE: 0.0}))
     data["run"]["precision"] = "float32"
     fitted_law = fit_only_law(
         data,
@@ -166,14 +166,16 @@ def test_float_resolution_ends_a_law_and_leaves_none_where_all_is_zero():
     )
     assert fitted_law.slope == pytest.approx(1.0, abs=0.02)
     assert fitted_law.stops["below"].startswith("float resolution: the error is ")
-    fitted_law = fit_only_law(study(law(value=POSITION, where={NOISE: 0.0})), motor__position_rmse=lambda f: 0.0 * f[PERIOD])
+    fitted_law = fit_only_law(
+        study(law_figure(value=POSITION, where={NOISE: 0.0})), motor__position_rmse=lambda f: 0.0 * f[PERIOD]
+    )
     assert fitted_law.fit is None
     assert fitted_law.to_dict()["slope"] is None
     assert fitted_law.stops == dict.fromkeys(("below", "above"), "float resolution: the error is exactly zero")
 
 
 def test_a_diverged_seed_takes_its_point_out():
-    data = study(law(where={NOISE: 0.0}), sweep={"seeds": 2})
+    data = study(law_figure(where={NOISE: 0.0}), sweep={"seeds": 2})
     fitted_law = fit_only_law(
         data,
         motor__velocity_rmse=lambda f: f[PERIOD],
@@ -185,27 +187,27 @@ def test_a_diverged_seed_takes_its_point_out():
 
 def test_an_end_without_a_known_cause_says_so():
     fitted_law = fit_only_law(
-        study(law(where={NOISE: 0.0})), motor__velocity_rmse=lambda f: 1e-3 * np.maximum(f[PERIOD], 1e-4)
+        study(law_figure(where={NOISE: 0.0})), motor__velocity_rmse=lambda f: 1e-3 * np.maximum(f[PERIOD], 1e-4)
     )
     assert fitted_law.stops == {"below": "other: local slope 0.00", "above": "end of the sweep"}
 
 
 BAD = {
     "no axis": (
-        law(where={"encoders.nois": 0.0}),
+        law_figure(where={"encoders.nois": 0.0}),
         f"where: 'encoders.nois' is not an axis of this study; did you mean '{NOISE}'?",
     ),
-    "no value": (law(where={NOISE: 2e-7}), f"where: '{NOISE}' has no value 2e-07; the nearest is 1e-07"),
+    "no value": (law_figure(where={NOISE: 2e-7}), f"where: '{NOISE}' has no value 2e-07; the nearest is 1e-07"),
     "no word": (
-        law(where={NOISE: "smallest"}),
+        law_figure(where={NOISE: "smallest"}),
         f"where: '{NOISE}' has no value 'smallest'; use a number, 'least' or 'largest'",
     ),
     "other axis": (
-        law(),
+        law_figure(),
         f"theory: a fit needs single lines, and '{NOISE}' varies along them; fix it by where, series or facet",
     ),
     "no number": (
-        law(value="motor.converged", where={NOISE: 0.0}),
+        law_figure(value="motor.converged", where={NOISE: 0.0}),
         "theory: 'motor.converged' is true or false and has no slope; leave theory out",
     ),
 }
@@ -221,13 +223,15 @@ def test_figures_that_cannot_be_fitted(case):
 
 def test_words_and_sampled_axes_in_where():
     axes = [listed_axis(PERIOD, *PERIODS), listed_axis(WORDS, "explicit", "implicit")]
-    data = study(law(where={WORDS: "implicit"}), axes=axes)
+    data = study(law_figure(where={WORDS: "implicit"}), axes=axes)
     fitted_law = fit_only_law(data, motor__velocity_rmse=lambda f: f[PERIOD] ** np.where(f[WORDS] == "implicit", 2.0, 1.0))
     assert fitted_law.slope == pytest.approx(2.0)
     with pytest.raises(InputError, match="has no value 'implict'; did you mean 'implicit'"):
-        accuracy_laws(make_result(study(law(where={WORDS: "implict"}), axes=axes)))
+        accuracy_laws(make_result(study(law_figure(where={WORDS: "implict"}), axes=axes)))
     data = study(
-        law(where={LAMBDA: 1.0}), axes=[axes[0], spaced_axis(LAMBDA, 1.0, 2.0)], sweep={"design": "sobol", "points": 4}
+        law_figure(where={LAMBDA: 1.0}),
+        axes=[axes[0], spaced_axis(LAMBDA, 1.0, 2.0)],
+        sweep={"design": "sobol", "points": 4},
     )
     with pytest.raises(InputError, match="is sampled quasi-randomly and repeats no value"):
         accuracy_laws(make_result(data))
@@ -252,7 +256,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_keys_of_a_figure(case):
     keys, message = WRONG[case]
-    figure = {key: value for key, value in law().items() if key != "theory"} | keys
+    figure = {key: value for key, value in law_figure().items() if key != "theory"} | keys
     with pytest.raises(InputError) as error:
         read_config(study(figure))
     assert str(error.value) == f"config: {message}"
@@ -268,10 +272,10 @@ def swept_laws():
         listed_axis(NOISE, 0.0, 3e-5, 1e-4, 3e-4, 1e-3),
     ]
     figures = [
-        law(value=POSITION, theory=2.0, series=WORDS, where={NOISE: 0.0}),
-        law(value=VELOCITY, theory=1.0, series=WORDS, where={NOISE: 0.0}),
-        law(NOISE, POSITION, 1.0, series=WORDS, where={PERIOD: "least"}),
-        law(NOISE, VELOCITY, 0.5, series=WORDS, where={PERIOD: "least"}),
+        law_figure(value=POSITION, theory=2.0, series=WORDS, where={NOISE: 0.0}),
+        law_figure(value=VELOCITY, theory=1.0, series=WORDS, where={NOISE: 0.0}),
+        law_figure(NOISE, POSITION, 1.0, series=WORDS, where={PERIOD: "least"}),
+        law_figure(NOISE, VELOCITY, 0.5, series=WORDS, where={PERIOD: "least"}),
     ]
     data = rigid_study(
         {"run.duration": 4.0, "observer.motor.lambda": 8.0, "observer.motor.velocity_error": 0.0},

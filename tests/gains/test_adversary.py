@@ -32,7 +32,7 @@ def _few_lanes():
 
 
 @functools.cache
-def search(system):
+def prove_and_search(system):
     """A proof from the largest noise, and the result of a search for errors above it."""
     proof = prove(system, system.noise, 0.0)
     return proof, search_violations(system, system.noise, 0.0, proof, proof.bounds[-1], 1)
@@ -66,7 +66,7 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
             *(np.tile(x, len(e)) for x in (system.noise * noise, mean, moment, system.push * nominal)),
         )  # fmt: skip
         largest = max(largest, error.max())
-    proof, result = search(system)
+    proof, result = prove_and_search(system)
     assert result.worst >= largest
     assert result.violations == 0
     assert proof.bounds[-1] <= RATIOS[system] * result.worst
@@ -74,7 +74,7 @@ def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_a_bound_that_is_too_small_is_found_out(system):
-    proof, result = search(system)
+    proof, result = prove_and_search(system)
     low_proof = proof._replace(bounds=proof.bounds / (1.01 * proof.bounds[-1] / result.worst))
     refuted = search_violations(system, system.noise, 0.0, low_proof, low_proof.bounds[-1], 1)
     assert refuted.violations > 0
@@ -94,7 +94,7 @@ def test_runs_from_the_start_are_held_against_the_bound_of_each_sample():
 
 def test_the_same_seed_finds_the_same():
     system = SYSTEMS[1]
-    proof, _ = search(system)
+    proof, _ = prove_and_search(system)
     first, other = (search_violations(system, system.noise, 0.0, proof, 1.0, 10_000, seed=3) for _ in range(2))
     assert first.worst == other.worst and first.runs == other.runs >= 10_000
     np.testing.assert_array_equal(first.sequence.noise, other.sequence.noise)

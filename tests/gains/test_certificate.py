@@ -177,11 +177,11 @@ def test_bad_numbers_are_told(changes, message):
 def test_a_bound_that_runs_exceed_is_refused(monkeypatch):
     prove = certificate.prove
 
-    def wrong(*arguments):
+    def prove_too_little(*arguments):
         proof = prove(*arguments)
         return proof._replace(bounds=0.9 * proof.bounds)
 
-    monkeypatch.setattr(certificate, "prove", wrong)
+    monkeypatch.setattr(certificate, "prove", prove_too_little)
     certificate_data = certify(*GAINS, **BOUNDS)
     assert not certificate_data["certified"]
     assert certificate_data["search"]["violations"] > 0

@@ -28,7 +28,7 @@ SYSTEMS = [
 ]
 
 
-def drawn_pushes(rng, n, parts=64):
+def draw_pushes(rng, n, parts=64):
     """Mean and moment of accelerations that change at any time within a period."""
     kinds = rng.integers(0, 3, n)
     w = rng.uniform(-1.0, 1.0, (n, parts))
@@ -55,7 +55,7 @@ def test_image_holds_whatever_the_adversary_does(system):
     e = lower[k] + share * (upper[k] - lower[k])
     g = (k - rows.half_count + np.where(rng.random(n) < 0.3, rng.integers(0, 2, n), rng.random(n))) * rows.dg
     noise = system.noise * np.where(rng.random(n) < 0.5, np.sign(rng.normal(size=n)), rng.uniform(-1.0, 1.0, n))
-    mean, moment = drawn_pushes(rng, n)
+    mean, moment = draw_pushes(rng, n)
     e, g, error = step_errors(system, e, g, noise, mean, moment, system.push * np.sign(rng.normal(size=n)))
     assert error.max() <= bound * (1.0 + 1e-12)
     # ends of rows belong to both

@@ -40,7 +40,7 @@ def build_search(
     return limits
 
 
-def bowl(x, a):
+def bowl_error(x, a):
     """Least at 10 and 10."""
     return np.cosh(np.log(x / 10.0)) + np.cosh(np.log(a / 10.0))
 
@@ -62,7 +62,7 @@ def test_of_an_optimum_inside_it_is_said_which_parts_of_the_error_balance():
 
 
 def test_the_parts_of_another_error_are_not_known():
-    search = build_search(bowl, chatter=lambda x, a: 0.5 * bowl(x, a))
+    search = build_search(bowl_error, chatter=lambda x, a: 0.5 * bowl_error(x, a))
     search.table = search.table.model_copy(update={"objective": "torque"})
     ways = find_limits(search, "motor")["towards"]["alpha"]
     assert [(way["limit"], way["by"]) for way in ways.values()] == [("error", None)] * 2
@@ -80,7 +80,7 @@ CONSTRAINTS = {
 @pytest.mark.parametrize("name", CONSTRAINTS)
 def test_a_constraint_that_forbids_less_error_binds(name):
     constraint, (gain, way) = CONSTRAINTS[name]
-    limits = find_limits(build_search(bowl, **constraint), "motor")
+    limits = find_limits(build_search(bowl_error, **constraint), "motor")
     assert limits["binding"] == [name]
     assert [key for key, entry in limits["constraints"].items() if entry["binds"]] == [name]
     towards = limits["towards"][gain][way]
@@ -94,7 +94,7 @@ def test_a_constraint_that_forbids_less_error_binds(name):
 
 
 def test_a_constraint_whose_gains_are_no_better_does_not_bind():
-    limits = find_limits(build_search(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
+    limits = find_limits(build_search(bowl_error, exact=lambda x, a: 1.1 * x / 9.0), "motor")
     assert limits["binding"] == []
     smaller = limits["towards"]["lambda"]["smaller"]
     # both are said
@@ -102,7 +102,7 @@ def test_a_constraint_whose_gains_are_no_better_does_not_bind():
 
 
 def test_a_time_of_zero_has_room_without_end():
-    limits = find_limits(build_search(bowl, longest_convergence=1.0), "motor")
+    limits = find_limits(build_search(bowl_error, longest_convergence=1.0), "motor")
     assert limits["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
 
 

@@ -31,16 +31,16 @@ def test_the_worst_path_is_that_of_its_equation_and_ends_at_its_ratio(lambda_, a
     assert -v[-1] == pytest.approx(float(peak_ratio(lambda_, alpha, 1.0)), rel=1e-12)
 
     # down from the largest error, where the square root is no trouble
-    def slope(t, state):
+    def derivatives(t, state):
         return [state[1], -alpha - 1.0 - 0.5 * lambda_ * state[1] / np.sqrt(state[0])]
 
-    def there(t, state):
+    def reaches_half(t, state):
         return state[0] - x[half]
 
-    there.terminal = True
+    reaches_half.terminal = True
     turn = int(np.argmax(x))
     half = turn + np.flatnonzero(x[turn:] < 0.5 * x[turn])[0]
-    solved = solve_ivp(slope, (0.0, 10.0), [x[turn], 0.0], rtol=1e-11, atol=1e-14, events=there, max_step=0.01)
+    solved = solve_ivp(derivatives, (0.0, 10.0), [x[turn], 0.0], rtol=1e-11, atol=1e-14, events=reaches_half, max_step=0.01)
     assert solved.y_events[0][0, 1] == pytest.approx(v[half], rel=1e-8)
 
 

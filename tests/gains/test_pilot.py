@@ -12,16 +12,16 @@ from jaxbl.sweeps.trial import run
 WORST = TuneTable(worst_over_uncertainty=True)
 
 
-def corners(study, table=WORST):
+def list_corners(study, table=WORST):
     return list_scenarios(read_config(study), table)
 
 
 def test_nominal_alone_unless_asked():
-    assert corners(small_study(), TuneTable())[1:] == (["nominal"], {})
+    assert list_corners(small_study(), TuneTable())[1:] == (["nominal"], {})
 
 
 def test_corners_of_both_sides_at_once():
-    pilot_data = corners(small_study({"uncertainty.relative": 0.1}))
+    pilot_data = list_corners(small_study({"uncertainty.relative": 0.1}))
     assert pilot_data.names[0] == "nominal"
     assert pilot_data.names[1] == "inertia -10 %, viscous -10 %"
     assert len(pilot_data.names) == 5
@@ -33,17 +33,17 @@ def test_corners_of_both_sides_at_once():
 
 
 def test_what_is_known_exactly_stays():
-    pilot_data = corners(
+    pilot_data = list_corners(
         small_study({"uncertainty.exact": ["drive.motor_inertia", "drive.load_inertia", "drive.load_viscous"]})
     )
     assert list(pilot_data.columns) == ["effects.motor.viscous_friction.viscous"]
     assert len(pilot_data.names) == 3
     everything = [f"drive.{side}_{number}" for side in ("motor", "load") for number in ("inertia", "viscous")]
-    assert corners(small_study({"uncertainty.exact": everything})).names == ["nominal"]
+    assert list_corners(small_study({"uncertainty.exact": everything})).names == ["nominal"]
 
 
 def test_one_inertia_without_friction():
-    pilot_data = corners(rigid_study({"drive.motor_viscous": 0.0}))
+    pilot_data = list_corners(rigid_study({"drive.motor_viscous": 0.0}))
     assert list(pilot_data.columns) == ["effects.motor.inertia.inertia"]
     assert pilot_data.names == ["nominal", "inertia -2 %", "inertia +2 %"]
 
@@ -52,7 +52,7 @@ def test_one_inertia_without_friction():
 def test_effects_that_the_study_has_are_varied_about_their_values(count):
     effects = [{"kind": "motor.coulomb_friction", "torque": 0.01}, *[{"kind": "motor.inertia", "inertia": 0.01}] * count]
     exact = ["effects.motor.inertia.inertia"] if count == 1 else ["effects.1.inertia"]
-    pilot_data = corners(small_study({"uncertainty.exact": exact}, effects=effects))
+    pilot_data = list_corners(small_study({"uncertainty.exact": exact}, effects=effects))
     # two of a kind go by position
     path = "effects.motor.inertia.inertia" if count == 1 else "effects.1.inertia"
     np.testing.assert_allclose(pilot_data.columns[path], 0.01 + 0.001 * np.array([0, -1, -1, 1, 1]))
@@ -63,7 +63,7 @@ def test_pilot_agrees_with_the_trace_of_a_run():
     study = small_study(
         {"observer.motor.velocity_error": 0.0, "observer.load.velocity_error": 0.3, "excitation.amplitude": 0.5}
     )
-    pilot_data = run_pilot(corners(study, TuneTable()), TuneTable())
+    pilot_data = run_pilot(list_corners(study, TuneTable()), TuneTable())
     trace, drive = run(study).trace, {"motor": (0.05, 0.15), "load": (7.0, 16.0)}
     for side, (inertia, viscous) in drive.items():
         driving = trace["u"] if side == "motor" else 0.0
@@ -81,6 +81,6 @@ def test_pilot_agrees_with_the_trace_of_a_run():
 
 def test_pilot_takes_the_worst_drive():
     study = small_study({"uncertainty.relative": 0.3, "excitation.amplitude": 0.5})
-    nominal, worst = (run_pilot(corners(study, table), table) for table in (TuneTable(), WORST))
+    nominal, worst = (run_pilot(list_corners(study, table), table) for table in (TuneTable(), WORST))
     for side in ("motor", "load"):
         assert worst[side]["f_plus"] > nominal[side]["f_plus"]

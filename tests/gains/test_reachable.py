@@ -22,7 +22,7 @@ def _double():
         yield
 
 
-def noises(states):
+def list_noises(states):
     spaced = NOISE * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
     return np.concatenate([
         np.repeat(spaced[:, None], len(states), axis=1),
@@ -38,11 +38,11 @@ def explore_kind(kind, gains, most=50_000):
     return (
         observer,
         rest_state,
-        explore(build_error_step(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest_state.further)]), most),
+        explore(build_error_step(observer), list_noises, np.array([[0.5, 1.0] + [0.0] * len(rest_state.further)]), most),
     )
 
 
-def errors_of(observer, rest_state, noise, push):
+def simulate_errors(observer, rest_state, noise, push):
     """Velocity errors at the samples of a double integrator: its own simulation, with true motion."""
 
     def step_errors(carry, sample_inputs):
@@ -60,7 +60,7 @@ def test_the_way_leads_to_the_error_that_is_found(kind, gains):
     observer, rest_state, result = explore_kind(kind, gains)
     assert np.abs(result.noise).max() <= NOISE
     assert set(result.sign) <= {-1.0, 1.0} and not result.push.any()
-    errors = errors_of(observer, rest_state, result.noise, result.sign)
+    errors = simulate_errors(observer, rest_state, result.noise, result.sign)
     assert abs(errors[-1]) == pytest.approx(result.worst, rel=1e-9)
     assert len(errors) <= result.state_count <= 50_000
 
@@ -71,7 +71,7 @@ def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains)
     push = np.array(list(itertools.product([-1.0, 1.0], repeat=4)))
     noise = NOISE * np.array([(1.0, *signs) for signs in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
     pairs = np.repeat(noise, len(push), axis=0), np.tile(np.column_stack([push, push[:, -1]]), (len(noise), 1))
-    assert result.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest_state, n, d))(*pairs)).max()
+    assert result.worst >= np.abs(jax.vmap(lambda n, d: simulate_errors(observer, rest_state, n, d))(*pairs)).max()
 
 
 @pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.999), ((0.15, 1.0), 0.995), ((0.1, 0.3), 0.998)])
@@ -91,7 +91,7 @@ def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
         sample_inputs = np.column_stack([states, noise])
         return sample_inputs @ moved, np.abs(sample_inputs @ seen_velocity)
 
-    result, worst, left = explore(step, noises, push[None]), NOISE * abs(seen_velocity[2]), seen_velocity[:2]
+    result, worst, left = explore(step, list_noises, push[None]), NOISE * abs(seen_velocity[2]), seen_velocity[:2]
     for _ in range(400):
         worst, left = worst + NOISE * abs(moved[2] @ left) + abs(push @ left), moved[:2] @ left
     assert share * worst <= result.worst <= worst * (1.0 + 1e-9)

@@ -95,17 +95,23 @@ def test_counterexamples_in_the_observers_own_states(name, judged_rules):
     f_plus, alpha, lambda_ = (counterexample[key] for key in ("f_plus", "alpha", "lambda"))
     assert STATED[name](lambda_, alpha, f_plus)
 
-    def slope(t, s):
+    def derivatives(t, s):
         rate = s[1] - lambda_ * np.sqrt(abs(s[0])) * np.sign(s[0])
         return [rate, f_plus * np.sign(rate) - alpha * np.sign(s[0])]
 
-    def passes(t, s):
+    def crosses_zero(t, s):
         return s[0]
 
-    passes.terminal, passes.direction = True, -1
+    crosses_zero.terminal, crosses_zero.direction = True, -1
     unit = np.sqrt(f_plus)
     solution = solve_ivp(
-        slope, (0.0, 40.0 / unit), [0.0, unit], events=passes, rtol=1e-8, atol=1e-10 * f_plus, max_step=0.01 / unit
+        derivatives,
+        (0.0, 40.0 / unit),
+        [0.0, unit],
+        events=crosses_zero,
+        rtol=1e-8,
+        atol=1e-10 * f_plus,
+        max_step=0.01 / unit,
     )
     if alpha < f_plus:
         assert counterexample["peak_ratio_simulated"] == np.inf

@@ -11,7 +11,7 @@ from jaxbl.sweeps import programs
 from jaxbl.sweeps.sweep import sweep
 
 
-def stage(folder, changes=None, **options):
+def run_stage(folder, changes=None, **options):
     """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
     study = read_config(thirty_run_study(**(changes or {})))
     with open_stages(study, "tune", folder, None, **options) as stages:
@@ -23,28 +23,28 @@ def stage(folder, changes=None, **options):
 
 
 def test_a_damaged_manifest_is_written_anew(tmp_path):
-    assert stage(tmp_path)[0] == 30
+    assert run_stage(tmp_path)[0] == 30
     path = tmp_path / "tune" / "manifest.json"
     before = path.read_bytes()
     path.write_bytes(before[: len(before) // 2])
     # what it said is found again; the stage's parts are there
-    lanes, manifest, _ = stage(tmp_path)
+    lanes, manifest, _ = run_stage(tmp_path)
     assert (lanes, manifest) == (0, {})
     assert path.read_bytes() == before
-    lanes, manifest, _ = stage(tmp_path)
+    lanes, manifest, _ = run_stage(tmp_path)
     assert lanes == 0 and manifest["pilot"] == 1.5
 
 
 def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
-    stage(tmp_path)
+    run_stage(tmp_path)
     path = tmp_path / "tune" / "manifest.json"
     path.write_text(path.read_text().replace("1.5", "1.6"))
     before = path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")
     with pytest.raises(InputError, match=r"(belongs to|holds) another study"):
-        stage(tmp_path, {"encoders": {"noise": 1e-3}})
+        run_stage(tmp_path, {"encoders": {"noise": 1e-3}})
     (tmp_path / "tune" / "table.parquet").unlink()
     with pytest.raises(InputError, match="holds another study"):
-        stage(tmp_path, {"encoders": {"noise": 1e-3}})
+        run_stage(tmp_path, {"encoders": {"noise": 1e-3}})
     assert (path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")) == before
     assert sorted(path.name for path in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
     # of a command that is not there nobody can say whose it is
@@ -56,12 +56,12 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
 
 
 def test_a_damaged_table_is_computed_anew(tmp_path):
-    stage(tmp_path)
+    run_stage(tmp_path)
     path = tmp_path / "tune" / "table.parquet"
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 1
     path.write_bytes(content)
-    assert list(stage(tmp_path)[2]["x"]) == [1.0, 2.0]
+    assert list(run_stage(tmp_path)[2]["x"]) == [1.0, 2.0]
 
 
 def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):

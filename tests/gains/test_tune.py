@@ -23,7 +23,7 @@ DISTURBED = [{"kind": "motor.constant_torque", "torque": 0.05}]
 """f_plus = 0.05 / 0.05 = 1 rad/s^2 at all times."""
 
 
-def one_side(changes=None, **tables):
+def rigid_tune_study(changes=None, **tables):
     """The rigid drive under a constant torque, its observer starting 0.1 rad/s off."""
     study = {"effects": DISTURBED, "tune": TABLE, "sweep": {"seeds": 2}} | tables
     base = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
@@ -33,7 +33,7 @@ def one_side(changes=None, **tables):
 
 @pytest.fixture(scope="module")
 def tuned_study():
-    return tune(one_side(tune=TABLE | {"compare": [{"name": "loud", "motor": {"lambda": 50.0, "alpha": 500.0}}]}))
+    return tune(rigid_tune_study(tune=TABLE | {"compare": [{"name": "loud", "motor": {"lambda": 50.0, "alpha": 500.0}}]}))
 
 
 def test_the_bound_is_the_largest_of_the_run_and_of_the_start(tuned_study):
@@ -52,7 +52,7 @@ def test_optimum_agrees_with_brute_force_over_a_fine_grid(tuned_study):
         listed_axis("observer.motor.lambda", *(math.sqrt(bound) * np.geomspace(0.5, 20.0, 11))),
     ]
     metrics = ["velocity_rmse", "converged", "margin_alpha", "margin_exact"]
-    study = one_side(axes=axes, sweep={"seeds": 2, "metrics": metrics})
+    study = rigid_tune_study(axes=axes, sweep={"seeds": 2, "metrics": metrics})
     study.pop("tune")
     frame = sweep(study).frame
     groups = frame.groupby(["observer.motor.alpha", "observer.motor.lambda"])
@@ -124,7 +124,7 @@ def test_comparison_is_on_noise_that_the_search_has_not_seen(tuned_study):
     assert rows["usual rule"]["lambda"] == pytest.approx(1.5 * math.sqrt(bound))
     assert (rows["config"]["lambda"], rows["config"]["alpha"]) == (4.0, 9.0)
     # the same as a sweep of these gains with these seeds
-    study = one_side({"observer.motor.lambda": 50.0, "observer.motor.alpha": 500.0, "sweep.first_seed": 2})
+    study = rigid_tune_study({"observer.motor.lambda": 50.0, "observer.motor.alpha": 500.0, "sweep.first_seed": 2})
     frame = sweep(study).frame
     assert list(frame["seed"]) == [2, 3]
     assert rows["loud"]["velocity_rmse"]["worst"] == pytest.approx(frame["motor.velocity_rmse"].max(), rel=1e-9)
@@ -188,7 +188,7 @@ def test_both_sides_at_once_over_uncertain_drives_and_a_restart(tmp_path, monkey
 
 
 def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    study = one_side()
+    study = rigid_tune_study()
     run_chunks, run = [], Engine.run
 
     def count_lanes(engine, chunk):
@@ -212,7 +212,7 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
 def test_a_range_that_ends_too_early_is_said():
     table = TABLE | {"alpha_ratio": {"start": 4.0, "stop": 20.0}, "refine": 0}
-    summary = tune(one_side(tune=table)).summary
+    summary = tune(rigid_tune_study(tune=table)).summary
     assert any(
         "the optimum lies at the end alpha / f⁺ = 4 of the range searched (tune.alpha_ratio)" in remark
         for remark in summary["remarks"]
@@ -225,7 +225,7 @@ def test_a_range_that_ends_too_early_is_said():
 
 def test_a_constraint_that_holds_the_optimum_back_is_said():
     table = TABLE | {"margin_exact": 5.0, "refine": 0}
-    summary = tune(one_side(tune=table)).summary
+    summary = tune(rigid_tune_study(tune=table)).summary
     assert summary["achieved"]["motor"]["margin_exact"] >= 5.0
     assert any("margin_exact = 5 forbids better gains" in remark for remark in summary["remarks"])
     limits = summary["limits"]["motor"]
@@ -261,21 +261,23 @@ def test_limits_are_those_of_the_candidates(tuned_study):
 
 def test_gains_that_do_not_converge_have_no_factor():
     slow = {"name": "slow", "motor": {"lambda": 0.001, "alpha": 1.5}}
-    summary = tune(one_side(tune=TABLE | {"compare": [slow], "refine": 0})).summary
+    summary = tune(rigid_tune_study(tune=TABLE | {"compare": [slow], "refine": 0})).summary
     assert summary["holdout"]["factors"]["motor"]["slow"] == {"why_none": "slow: converged in 0 % of the runs"}
     assert "motor: the gains 'slow' converge in only 0 % of the held-out runs: no factor is stated." in summary["remarks"]
 
 
 def test_same_gains_by_two_names_are_compared_once_and_shown_twice():
     summary = tune(
-        one_side(tune=TABLE | {"refine": 0, "compare": [{"name": "as it is", "motor": {"lambda": 4.0, "alpha": 9.0}}]})
+        rigid_tune_study(
+            tune=TABLE | {"refine": 0, "compare": [{"name": "as it is", "motor": {"lambda": 4.0, "alpha": 9.0}}]}
+        )
     )
     rows = {row["name"]: row for row in summary.summary["holdout"]["rows"]}
     assert {**rows["as it is"], "name": "config"} == rows["config"]
 
 
 def test_without_a_table_the_defaults_are_taken():
-    study = one_side()
+    study = rigid_tune_study()
     study.pop("tune")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxbl.gains.gain_search.GainSearch.run", lambda search: pytest.skip(f"{search.table.num}"))
@@ -298,7 +300,7 @@ NONE = {
 def test_no_feasible_gains_is_no_result_and_names_the_constraint(case):
     table, changes, message = NONE[case]
     with pytest.raises(NoResult, match=r"motor: none of the 25 gains with alpha / f⁺ in 1\.2 \.\.\. 20 ") as error:
-        tune(one_side(changes, tune=TABLE | table))
+        tune(rigid_tune_study(changes, tune=TABLE | table))
     assert message in str(error.value), error.value
     assert "\n" not in str(error.value)
 
@@ -306,51 +308,60 @@ def test_no_feasible_gains_is_no_result_and_names_the_constraint(case):
 def test_a_drive_that_diverges_is_no_result():
     effects = [{"kind": "motor.viscous_friction", "viscous": 1e4}, *DISTURBED]
     with pytest.raises(NoResult, match="motor: the drive itself diverges in the pilot run"):
-        tune(one_side(effects=effects))
+        tune(rigid_tune_study(effects=effects))
 
 
 PAIR = {"lambda": 1.0, "alpha": 1.0}
 BAD = {
     "at rest": (
-        one_side(effects=[], excitation={"kind": "sine", "amplitude": 0.0, "frequency": 1.0})
+        rigid_tune_study(effects=[], excitation={"kind": "sine", "amplitude": 0.0, "frequency": 1.0})
         | {"observer": {"motor": {"lambda": 1.0, "alpha": 1.0}}},
         "motor: f⁺ = 0: ",
     ),
     "all known": (
-        one_side({"drive.motor_viscous": 0.0}, effects=[]),
+        rigid_tune_study({"drive.motor_viscous": 0.0}, effects=[]),
         "motor: f⁺ = 0: ",
     ),
-    "margin_alpha": (one_side(tune={"margin_alpha": 1.0}), "tune.margin_alpha: should be greater than 1, not 1.0"),
-    "margin_exact": (one_side(tune={"margin_exact": 0.9}), "tune.margin_exact: should be greater than or equal to 1"),
-    "alpha range": (one_side(tune={"alpha_ratio": {"start": 1.0}}), "tune.alpha_ratio.start: should be greater than 1"),
+    "margin_alpha": (rigid_tune_study(tune={"margin_alpha": 1.0}), "tune.margin_alpha: should be greater than 1, not 1.0"),
+    "margin_exact": (
+        rigid_tune_study(tune={"margin_exact": 0.9}),
+        "tune.margin_exact: should be greater than or equal to 1",
+    ),
+    "alpha range": (
+        rigid_tune_study(tune={"alpha_ratio": {"start": 1.0}}),
+        "tune.alpha_ratio.start: should be greater than 1",
+    ),
     "empty range": (
-        one_side(tune={"lambda_ratio": {"start": 3.0, "stop": 3.0}}),
+        rigid_tune_study(tune={"lambda_ratio": {"start": 3.0, "stop": 3.0}}),
         "tune.lambda_ratio: start 3.0 should be less than stop 3.0",
     ),
     "range below the margin": (
-        one_side(tune={"margin_alpha": 3.0, "alpha_ratio": {"stop": 2.0}}),
+        rigid_tune_study(tune={"margin_alpha": 3.0, "alpha_ratio": {"stop": 2.0}}),
         "tune: alpha_ratio: stop 2.0 is below margin_alpha 3.0",
     ),
     "endless gain": (
-        one_side(tune={"compare": [{"name": "a", "motor": {"lambda": math.inf, "alpha": 1.0}}]}),
+        rigid_tune_study(tune={"compare": [{"name": "a", "motor": {"lambda": math.inf, "alpha": 1.0}}]}),
         "tune.compare[0].motor.lambda: should be a finite number, not inf",
     ),
     "name twice": (
-        one_side(tune={"compare": [{"name": "tuned", "motor": PAIR}]}),
+        rigid_tune_study(tune={"compare": [{"name": "tuned", "motor": PAIR}]}),
         "tune: compare[0].name: 'tuned' is taken",
     ),
     "load on one inertia": (
-        one_side(tune={"compare": [{"name": "a", "motor": PAIR, "load": PAIR}]}),
+        rigid_tune_study(tune={"compare": [{"name": "a", "motor": PAIR, "load": PAIR}]}),
         "tune.compare[0].load has no meaning on a rigid drive",
     ),
     "no load": (
         small_study(tune={"compare": [{"name": "a", "motor": PAIR}]}),
         "tune.compare[0].load is missing",
     ),
-    "kind of the holdout": (one_side(tune={"holdout": {"kind": "sinus"}}), "tune.holdout.kind: unknown kind 'sinus'; did"),
-    "key of the holdout": (one_side(tune={"holdout": {"kind": "sine", "a": 1}}), "tune.holdout: unknown key 'a'"),
+    "kind of the holdout": (
+        rigid_tune_study(tune={"holdout": {"kind": "sinus"}}),
+        "tune.holdout.kind: unknown kind 'sinus'; did",
+    ),
+    "key of the holdout": (rigid_tune_study(tune={"holdout": {"kind": "sine", "a": 1}}), "tune.holdout: unknown key 'a'"),
     "no inertia left": (
-        one_side({"uncertainty.relative": 1.5}, tune={"worst_over_uncertainty": True}),
+        rigid_tune_study({"uncertainty.relative": 1.5}, tune={"worst_over_uncertainty": True}),
         "uncertainty.relative: 1.5 leaves no inertia on the motor",
     ),
 }  # fmt: skip

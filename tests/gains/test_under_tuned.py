@@ -20,27 +20,27 @@ from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.sweeps.trial import run
 
 
-def peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=10_000, least_peak=0.0):
+def simulate_peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.0), most=10_000, least_peak=0.0):
     """Passages through x1 = 0 in the observer's own states, down to one below `least_peak`: times, and x2 with its sign."""
     time, state, simulated = 0.0, np.array(start), []
     for _ in range(most):
         sign = np.sign(state[0]) or np.sign(state[1])
 
-        def slope(t, s, sign=sign):
+        def derivatives(t, s, sign=sign):
             root = np.sqrt(max(sign * s[0], 0.0)) * sign
             return [s[1] - lambda_ * root, disturbance(t) - alpha * sign - damping * s[1]]
 
-        def passes(t, s, sign=sign):
+        def crosses_zero(t, s, sign=sign):
             return sign * s[0]
 
-        passes.terminal, passes.direction = True, -1
+        crosses_zero.terminal, crosses_zero.direction = True, -1
         size = abs(state[1]) / alpha
         solution = solve_ivp(
-            slope,
+            derivatives,
             (time, end),
             state,
             method="DOP853",
-            events=passes,
+            events=crosses_zero,
             rtol=1e-7,
             atol=1e-13,
             first_step=min(1e-4 * size, end - time),
@@ -62,7 +62,7 @@ SLOW = 1.5 * np.sin(TIMES)
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.0, 0.0), (0.0, 1.0), (0.01, 0.0), (0.005, 3.0)])
 def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
     law = peak_law(lambda_, 1.8, TIMES, SLOW, damping=damping, peak=0.02)
-    times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), least_peak=1.8e-3)
+    times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), least_peak=1.8e-3)
     expected = np.interp(times, TIMES, law)
     is_compared = expected > 2e-3
     assert is_compared.sum() > 30
@@ -97,7 +97,7 @@ def test_the_law_ends_after_a_finite_time():
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.3, 0.0), (0.05, 1.0), (2.5, 0.0)])
 def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
     simulated = simulate_error(lambda_, 1.8, TIMES, SLOW, damping=damping, velocity_error=0.5)
-    times, x2 = peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 3.0, damping, (0.0, 0.5), most=12)
+    times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 3.0, damping, (0.0, 0.5), most=12)
     assert simulated.largest == 0.5
     assert simulated.peaks[0] == 0.5
     count = min(len(times), len(simulated.times) - 1)
@@ -109,7 +109,7 @@ def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
 
 def test_simulated_error_from_a_position_error():
     simulated = simulate_error(0.3, 1.8, TIMES, SLOW, position_error=-0.2, velocity_error=0.1)
-    times, x2 = peaks(0.3, 1.8, lambda t: 1.5 * np.sin(t), 3.0, 0.0, (-0.2, 0.1), most=3)
+    times, x2 = simulate_peaks(0.3, 1.8, lambda t: 1.5 * np.sin(t), 3.0, 0.0, (-0.2, 0.1), most=3)
     np.testing.assert_allclose(simulated.peaks[:3], np.abs(x2), rtol=2e-4)
     np.testing.assert_allclose(simulated.times[:3], times, rtol=2e-4)
 
@@ -145,7 +145,7 @@ def test_limit_cycle_under_a_sine(alpha, lambda_, damping):
     assert predicted.threshold == pytest.approx(simulated.threshold, rel=0.12)
     assert 0.0 < simulated.threshold < simulated.stable
     # errors that begin near it come to it
-    _, x2 = peaks(lambda_, alpha, lambda t: -np.sin(t), 500.0, damping, (0.0, 0.95 * simulated.stable), most=150)
+    _, x2 = simulate_peaks(lambda_, alpha, lambda t: -np.sin(t), 500.0, damping, (0.0, 0.95 * simulated.stable), most=150)
     assert np.abs(np.abs(x2[:4]) / simulated.stable - 1.0).max() > 0.01
     np.testing.assert_allclose(np.abs(x2[-4:]), simulated.stable, rtol=1e-3)
 
@@ -162,13 +162,13 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
     # without approximation the limit is at most 5 % larger: beyond that errors of any phase go to zero
     phase = np.pi - np.arcsin(0.9)
     start = 0.0, sine_cycle(0.9 * limit, alpha, 1.0, frequency).stable
-    _, lasting = peaks(0.9 * limit, alpha, lambda t: np.sin(t + phase), 500.0, 0.0, start, most=60)
+    _, lasting = simulate_peaks(0.9 * limit, alpha, lambda t: np.sin(t + phase), 500.0, 0.0, start, most=60)
     assert len(lasting) == 60
     assert np.abs(lasting[-4:]).min() > 0.9 * start[1]
     # cycles have peaks of about pi / 2 alpha: far below that nothing upholds an error
     largest, small = 0.5 * np.pi * alpha, 0.05 * alpha
     for phase in np.arange(3) * 2.0 * np.pi / 3.0:
-        _, x2 = peaks(
+        _, x2 = simulate_peaks(
             1.08 * limit, alpha, lambda t, p=phase: np.sin(t + p), 500.0, 0.0, (0.0, largest), most=200, least_peak=small
         )
         assert np.abs(x2[-1]) < small

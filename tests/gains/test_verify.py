@@ -30,7 +30,7 @@ CAUSES = {"run too short", "period too long", "noise", "quantisation", "explicit
 WHOLE = {"several", "f_plus underestimated", "unexplained"}
 
 
-def exact(ratio):
+def exact_lambda(ratio):
     """Least lambda at f_plus = 1 from the integrals of docs/theory.md."""
     c1, c2 = 2.0 * (ratio - 1.0), 2.0 * (ratio + 1.0)
 
@@ -55,19 +55,19 @@ def demand_lambda(alpha, f_plus):
         np.sqrt(4.0 * f_plus * (alpha + f_plus) / (alpha - f_plus)),
         np.sqrt(alpha + f_plus),
         np.sqrt(4.0 * (alpha - np.sqrt(alpha**2 - f_plus**2))),
-        np.sqrt(f_plus) * exact(alpha / f_plus),
+        np.sqrt(f_plus) * exact_lambda(alpha / f_plus),
     )
     return dict(zip(names, values, strict=True))
 
 
-def entries(summary, level):
+def level_entry(summary, level):
     (level_data,) = [entry for entry in summary["levels"] if entry["level"] == level]
     return level_data
 
 
 def test_normalised_level_counted_again(verified_study):
     verdict, _ = verified_study
-    level_data, plane = entries(verdict.summary, "normalised"), verdict.error_map
+    level_data, plane = level_entry(verdict.summary, "normalised"), verdict.error_map
     np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
     np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
     assert plane.ratio.shape == (9, 7)
@@ -106,7 +106,7 @@ def judged_cells(verified_study):
 @pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
 def test_levels_of_the_drive_counted_again(level, cells, verified_study, judged_cells):
     verdict, _ = verified_study
-    level_data = entries(verdict.summary, level)
+    level_data = level_entry(verdict.summary, level)
     rows = judged_cells[level, "true"]
     keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
     assert level_data["side"] == "motor"
@@ -199,7 +199,7 @@ def test_causes_in_the_summary_count_runs(verified_study):
     verdict, _ = verified_study
     for level, keys in KEYS.items():
         part = verdict.counterexamples[verdict.counterexamples["level"] == level]
-        run_counts = entries(verdict.summary, level).get("causes", {})
+        run_counts = level_entry(verdict.summary, level).get("causes", {})
         assert set(run_counts) == set(part["bound"])
         for bound, causes in run_counts.items():
             runs = part[part["bound"] == bound].drop_duplicates(keys)
@@ -229,13 +229,13 @@ def test_verdict_on_disk(verified_study):
     assert [entry["cause"] for entry in level_data["counterexamples"]] == true["cause"].tolist()[:200]
 
 
-def contents(folder):
+def read_contents(folder):
     return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
 
 
 def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeypatch):
     verdict, folder = verified_study
-    results = {path: stored for path, stored in contents(folder).items() if path.parent.name == "points"}
+    results = {path: stored for path, stored in read_contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
@@ -244,16 +244,16 @@ def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeyp
     for level, frame in verdict.levels.items():
         pd.testing.assert_frame_equal(second.levels[level], frame)
     pd.testing.assert_frame_equal(second.counterexamples, verdict.counterexamples)
-    contents_after = contents(folder)
+    contents_after = read_contents(folder)
     assert all(contents_after[path] == stored for path, stored in results.items())
 
 
 def test_another_studys_folder_is_left_as_it_is(verified_study):
     _, folder = verified_study
-    before = contents(folder)
+    before = read_contents(folder)
     with pytest.raises(InputError, match="holds another study"):
         verify(rigid_study({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
-    assert contents(folder) == before
+    assert read_contents(folder) == before
 
 
 AT_REST = rigid_study(
@@ -392,4 +392,4 @@ def test_claimed_bound_that_misses_friction_at_rest(verified_at_rest):
     assert set(level_data["bound"]) == {"claimed"}
     assert set(level_data[ALPHA]) == {0.5}
     assert set(level_data["cause"]) == {"f_plus underestimated"}
-    assert entries(verdict.summary, "drive")["claimed_bound"]["too_small"] == 1.0
+    assert level_entry(verdict.summary, "drive")["claimed_bound"]["too_small"] == 1.0

@@ -8,7 +8,7 @@ import pytest
 from hidden_log import simulate_study
 from measured import EMPS, XL330, find_recording, read_stretch
 from small_study import rigid_study, small_study
-from trace_segment import segment_of
+from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.errors import InputError
@@ -141,7 +141,7 @@ def test_report_has_every_number_and_figure(identification, tmp_path):
     assert all(path in page for path in TRUTH)
 
 
-def open_ended(study):
+def drop_excitation_and_gains(study):
     """The study without excitation and observers."""
     return {key: value for key, value in study.items() if key not in ("excitation", "observer")}
 
@@ -160,7 +160,7 @@ def sensor_logs(tmp_path_factory):
 @pytest.fixture(scope="module")
 def full_identification(sensor_logs):
     """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
-    study = open_ended(NOMINAL)
+    study = drop_excitation_and_gains(NOMINAL)
     # the log is sampled twice as often
     study["run"] = {key: 2 * value if key in ("sample_period", "substeps") else value for key, value in study["run"].items()}
     study["log"] = {"transmitted": "sensor", "initial_state": "rest"}
@@ -304,7 +304,7 @@ def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart():
     # an exact model: by its own integrator
     start = experiment.plant.init(experiment.initial)
     positions = jit(plant_trajectory)(experiment, start, jnp.asarray(trace["u"])).position["motor"]
-    segment = segment_of(trace.assign(theta_e=positions))
+    segment = make_segment(trace.assign(theta_e=positions))
     free = make_free_parameters(experiment, default_paths(read_config(study), experiment), 1.0)
     settings = read_config(study).identify
     search = ParameterSearch(experiment, [segment], settings, rest=False, name="log").run(free)

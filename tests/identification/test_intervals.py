@@ -15,7 +15,7 @@ from jaxbl.identification.trajectory import cut, fits
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 
 
-def record(seed=0, size=0.2, drag=0.15):
+def simulate_mass(seed=0, size=0.2, drag=0.15):
     """A mass with viscous friction, exact discretisation, from a known start."""
     mass = 0.05
     t = PERIOD * np.arange(SAMPLES)
@@ -40,7 +40,7 @@ def fit_numbers(paths, windows):
 
 
 def test_where_the_fit_is_quadratic_both_intervals_agree():
-    windows = record(size=2.0)
+    windows = simulate_mass(size=2.0)
     experiment, free, result = fit_numbers(["drive.motor_inertia", "drive.motor_viscous"], windows)
     width = spread(result)
     profiles = profile(experiment, free, windows, result, width)
@@ -54,21 +54,21 @@ def test_where_the_fit_is_quadratic_both_intervals_agree():
 
 def test_where_it_is_not_the_profile_follows_the_likelihood():
     """Weak excitation: the friction is hardly seen. The reference is a root of the cost with all else fitted anew."""
-    windows = record(size=0.003, seed=3)
+    windows = simulate_mass(size=0.003, seed=3)
     paths = ["drive.motor_inertia", "drive.motor_viscous"]
     experiment, free, result = fit_numbers(paths, windows)
     width = spread(result)
     ends = profile(experiment, free, windows, result, width)["drive.motor_viscous"].interval
     scale = float(width.variance) * float(width.inflation[1]) ** 2
 
-    def excess(value):
+    def excess_cost(value):
         theta = np.array([[result.theta[0], np.log(value / 0.15)]])
-        (again,) = fits(experiment, free, windows, theta, 60, np.array([[False, True]]))
-        return 2.0 * (float(again.cost) - float(result.cost)) / scale - 3.841
+        (bound_fit,) = fits(experiment, free, windows, theta, 60, np.array([[False, True]]))
+        return 2.0 * (float(bound_fit.cost) - float(result.cost)) / scale - 3.841
 
     best = 0.15 * np.exp(float(result.theta[1]))
-    assert ends[1] == pytest.approx(brentq(excess, best, 20.0 * best, xtol=1e-6), rel=0.03)
-    low = brentq(excess, best * np.exp(-2.99), best, xtol=1e-6) if excess(best * np.exp(-2.99)) > 0.0 else 0.0
+    assert ends[1] == pytest.approx(brentq(excess_cost, best, 20.0 * best, xtol=1e-6), rel=0.03)
+    low = brentq(excess_cost, best * np.exp(-2.99), best, xtol=1e-6) if excess_cost(best * np.exp(-2.99)) > 0.0 else 0.0
     assert ends[0] == pytest.approx(low, rel=0.03)
     # far from symmetric: here the covariance's interval is another one
     theta, deviation = float(result.theta[1]), float(jnp.sqrt(width.covariance[1, 1]))

@@ -33,7 +33,7 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [write_log(folder / f"{seed}.csv", seed, zero) for seed, zero in ((0, 0.0), (1, 0.3), (2, -0.2))]
 
 
-def ahead(record: Record, paths: list[Path]) -> list[float]:
+def turned_angles(record: Record, paths: list[Path]) -> list[float]:
     """Angles by which the positions of each log of a record were turned, rad."""
     read = np.concatenate([pd.read_csv(part)["theta_e"] for part in paths])
     return [float(np.mean(part)) for part in np.split(record.positions["motor"] - read, len(paths))]
@@ -42,19 +42,19 @@ def ahead(record: Record, paths: list[Path]) -> list[float]:
 def test_logs_with_other_zeros_are_turned_to_that_of_the_first(paths: list[Path]):
     config, _ = read_model(MODEL)
     record = read_logs(config, paths[:2])
-    np.testing.assert_allclose(ahead(record, paths[:2]), [0.0, 0.3], atol=0.02)
+    np.testing.assert_allclose(turned_angles(record, paths[:2]), [0.0, 0.3], atol=0.02)
     (warning,) = record.warnings
     assert warning.startswith(
         "1.csv: theta_e counts from another zero than in 0.csv, by the torque that repeats 5 times a turn"
     )
     holdout = read_logs(config, paths[2], like=record)
-    np.testing.assert_allclose(ahead(holdout, paths[2:]), [-0.2], atol=0.02)
+    np.testing.assert_allclose(turned_angles(holdout, paths[2:]), [-0.2], atol=0.02)
 
 
 def test_an_offset_that_is_given_stands(paths: list[Path]):
     config, _ = read_model(MODEL | {"log": {"theta_e": {"column": "theta_e", "offset": 0.0}}})
     record = read_logs(config, paths[:2])
-    assert ahead(record, paths[:2]) == [0.0, 0.0] and not record.warnings
+    assert turned_angles(record, paths[:2]) == [0.0, 0.0] and not record.warnings
 
 
 def test_a_model_of_a_log_has_no_effects_of_encoders(paths: list[Path]):

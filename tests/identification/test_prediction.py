@@ -47,7 +47,7 @@ def simulate_disturbed_mass(force, seed=0):
     return torque, states, {"motor": states[:, 0] + 1e-4 * random.standard_normal(SAMPLES)}
 
 
-def experiment_and_free():
+def prepare_mass():
     experiment = prepare(read_config(rigid_study({"run.sample_period": PERIOD, "run.substeps": 1})))
     return experiment, make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
 
@@ -57,23 +57,23 @@ def fit_numbers(experiment, free, windows):
     return fit(experiment, free, windows, jnp.zeros(2))
 
 
-def windows_of(torque, readings, samples):
+def cut_windows(torque, readings, samples):
     smoothed = smooth(jnp.asarray(readings["motor"]), PERIOD)
     start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ())
     return cut(torque, readings, PERIOD, start, {"motor": 1e-4}, samples)
 
 
 def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
-    experiment, free = experiment_and_free()
+    experiment, free = prepare_mass()
     errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}
     force = 1e-4
     for seed in range(8):
         torque, _, readings = simulate_disturbed_mass(force, seed)
-        windows = windows_of(torque, readings, 500)
+        windows = cut_windows(torque, readings, 500)
         predicted, smoothness = predictor(experiment, windows)
         np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
-        for name, cut_windows in (("free", windows), ("predicted", predicted)):
-            result = fit_numbers(experiment, free, cut_windows)
+        for name, fitted_windows in (("free", windows), ("predicted", predicted)):
+            result = fit_numbers(experiment, free, fitted_windows)
             errors[name].append(result.theta)
             widths[name].append(np.sqrt(np.diag(spread(result).covariance)))
     size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}
@@ -83,9 +83,9 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
 
 
 def test_without_a_disturbance_the_predictor_runs_freely():
-    experiment, free = experiment_and_free()
+    experiment, free = prepare_mass()
     torque, _, readings = simulate_disturbed_mass(1e-14)
-    windows = windows_of(torque, readings, 500)
+    windows = cut_windows(torque, readings, 500)
     predicted, smoothness = predictor(experiment, windows)
     assert smoothness["motor"] < 1e-9
     assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)

@@ -29,7 +29,7 @@ T = jnp.linspace(0.0, 2.0, 4001)
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 
 
-def motion(amplitude, rate):
+def sine_motion(amplitude, rate):
     return (
         {"motor": amplitude[0] * jnp.sin(rate[0] * T), "load": amplitude[1] * jnp.sin(rate[1] * T)},
         {"motor": amplitude[0] * rate[0] * jnp.cos(rate[0] * T), "load": amplitude[1] * rate[1] * jnp.cos(rate[1] * T)},
@@ -50,7 +50,7 @@ def test_balance_is_the_equations_of_motion():
         {"kind": "actuator.gain_error", "relative": 0.1},
     ]
     experiment = prepare(read_config(small_study(transmission=LAW, effects=effects)))
-    position, velocity, acceleration = motion((1.0, 0.2), (5.0, 4.0))
+    position, velocity, acceleration = sine_motion((1.0, 0.2), (5.0, 4.0))
     u = jnp.cos(3.0 * T)
     result = balance(experiment, Kinematics(T, u, position, velocity, acceleration))
     ratio = experiment.drive.gear_ratio

@@ -15,7 +15,7 @@ Q = JERK * np.array(
 )
 
 
-def motion(seed, samples):
+def simulate_motion(seed, samples):
     """A motion under white jerk, and its readings."""
     random = np.random.default_rng(seed)
     steps = random.standard_normal((samples, 3)) @ np.linalg.cholesky(Q).T
@@ -25,7 +25,7 @@ def motion(seed, samples):
     return state, state[:, 0] + NOISE * random.standard_normal(samples)
 
 
-def batch(readings):
+def smooth_by_least_squares(readings):
     """The same by one least-squares problem over all states, without a filter."""
     samples = len(readings)
     size = np.array([1.0, 1.0 / PERIOD, 1.0 / PERIOD**2]) * NOISE
@@ -48,9 +48,9 @@ def batch(readings):
 
 
 def test_agrees_with_least_squares_over_all_states():
-    _, readings = motion(1, 120)
+    _, readings = simulate_motion(1, 120)
     result = smooth(readings, PERIOD, known=(NOISE, JERK))
-    state, covariance = batch(readings)
+    state, covariance = smooth_by_least_squares(readings)
     deviation = np.sqrt(np.einsum("tii->ti", covariance))
     # a hundredth of the backward filter's information counts twice at the first sample
     assert np.abs((result.state - state) / deviation).max() < 0.02
@@ -62,7 +62,7 @@ def test_agrees_with_least_squares_over_all_states():
 
 
 def test_finds_noise_and_jerk_and_knows_its_errors():
-    state, readings = motion(2, 6000)
+    state, readings = simulate_motion(2, 6000)
     result = smooth(readings, PERIOD)
     assert float(result.noise) == pytest.approx(NOISE, rel=0.05)
     assert float(result.jerk) == pytest.approx(JERK, rel=0.5)
@@ -89,7 +89,7 @@ def test_covariance_stays_positive_where_readings_are_fine(noise):
 
 
 def test_units_and_offsets_do_not_matter():
-    _, readings = motion(3, 400)
+    _, readings = simulate_motion(3, 400)
     result = smooth(readings, PERIOD)
     other = smooth(7.0 + 1e3 * readings, PERIOD)
     np.testing.assert_allclose(
@@ -111,7 +111,7 @@ def test_quantised_readings():
 def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monkeypatch):
     if not machine_code:
         monkeypatch.setattr(signal_scan, "_compile_loop", lambda *_: None)
-    readings = np.stack([(1.0 + seed) * motion(seed, 300)[1] for seed in range(columns)], axis=1)
+    readings = np.stack([(1.0 + seed) * simulate_motion(seed, 300)[1] for seed in range(columns)], axis=1)
     result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
     for channel, position in zip(result.T, readings.T, strict=True):
         alone = smooth(position, PERIOD, known=(NOISE, JERK)).acceleration

@@ -36,7 +36,7 @@ LANES, WINDOWS, SAMPLES = 100, 4, 300
 """Realisations of the noise, and the windows of each: all fits of two sides share their program."""
 
 
-def drive(substeps, period=PERIOD, **changes):
+def prepare_drive(substeps, period=PERIOD, **changes):
     law = {"law": "dead_zone", "stiffness": TRUE["transmission.stiffness"], "half_gap": TRUE["transmission.half_gap"]}
     settings = {"run.sample_period": period, "run.substeps": substeps, "run.duration": 50 * period}
     return prepare(read_config(small_study(settings, transmission=law, **changes)))
@@ -53,13 +53,13 @@ def simulate_motion(kind, samples, period=PERIOD):
     return torque, trace.states.T
 
 
-def windows_of(torque, readings, noise, samples, period=PERIOD):
+def cut_windows(torque, readings, noise, samples, period=PERIOD):
     motions = {side: smooth(values, period) for side, values in readings.items()}
     start = PlantState({s: x.position for s, x in motions.items()}, {s: x.velocity for s, x in motions.items()}, ())
     return cut(torque, readings, period, start, noise, samples)
 
 
-def noisy(states, noise, key):
+def add_noise(states, noise, key):
     keys = jax.random.split(key)
     return {
         side: states[:, 2 * i] + noise[side] * jax.random.normal(keys[i], (len(states),)) for i, side in enumerate(noise)
@@ -76,9 +76,9 @@ def fit_lanes(experiment, torque, states, noise, period=PERIOD):
     free = make_free_parameters(experiment, list(TRUE), 1.0)
     keys = jax.random.split(jax.random.key(7), LANES)
     states = jnp.asarray(states)
-    readings = {side: np.asarray(x) for side, x in jax.vmap(lambda key: noisy(states, noise, key))(keys).items()}
+    readings = {side: np.asarray(x) for side, x in jax.vmap(lambda key: add_noise(states, noise, key))(keys).items()}
     # initial states are guessed by the first
-    first = windows_of(torque, {side: x[0] for side, x in readings.items()}, noise, SAMPLES, period)
+    first = cut_windows(torque, {side: x[0] for side, x in readings.items()}, noise, SAMPLES, period)
     windows = jax.tree.map(lambda x: np.broadcast_to(x, (LANES, *np.shape(x))), first)
     measured = {side: x.reshape(LANES, WINDOWS, SAMPLES) for side, x in readings.items()}
     windows = dataclasses.replace(windows, measured=measured)
@@ -89,7 +89,7 @@ def fit_lanes(experiment, torque, states, noise, period=PERIOD):
 @functools.cache
 def fit_motion(kind):
     """Return model, numbers, windows and fits; the truth has a hard gap and another integrator."""
-    experiment = drive(3)
+    experiment = prepare_drive(3)
     return experiment, *fit_lanes(experiment, *simulate_motion(kind, WINDOWS * SAMPLES), {"motor": 3e-4, "load": 6e-5})
 
 
@@ -142,7 +142,7 @@ def test_the_gap_at_1_khz():
     """Noise of 1e-4 rad, 1.2 s, a hard gap: half gap (4 j_0) within 0.5 % every time."""
     period = 1e-3
     motion = simulate_motion("multisine", WINDOWS * SAMPLES, period)
-    *_, fits = fit_lanes(drive(3, period), *motion, {"motor": 1e-4, "load": 2e-5}, period)
+    *_, fits = fit_lanes(prepare_drive(3, period), *motion, {"motor": 1e-4, "load": 2e-5}, period)
     errors = np.expm1(fits.theta)
     assert np.abs(errors[:, 5]).max() < 0.005, errors[:, 5]
 
@@ -233,6 +233,8 @@ def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
 def test_a_number_stays_within_what_a_study_may_say():
     """A fit may ask for more damping than the effect has."""
     damped = {"kind": "load.flexibility", "inertia": 0.01, "frequency": 5.0, "damping_ratio": 0.5}
-    (damping_ratio,) = make_free_parameters(drive(6, effects=[damped]), ["effects.load.flexibility.damping_ratio"], 1.0)
+    (damping_ratio,) = make_free_parameters(
+        prepare_drive(6, effects=[damped]), ["effects.load.flexibility.damping_ratio"], 1.0
+    )
     assert damping_ratio.value(0.1) == pytest.approx(0.5 * np.exp(0.1))
     assert float(damping_ratio.value(1.0)) == float(damping_ratio.value(jnp.asarray(1.0))) == 0.95

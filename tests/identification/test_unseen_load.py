@@ -33,7 +33,7 @@ TRUTH = {
 }
 
 
-def motor_only(folder, log):
+def write_motor_log(folder, log):
     path = folder / "motor.csv"
     replace(log, theta_s=None).write(path)
     return path
@@ -41,7 +41,7 @@ def motor_only(folder, log):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    return motor_only(tmp_path_factory.mktemp("log"), simulate_geared_drive()[0])
+    return write_motor_log(tmp_path_factory.mktemp("log"), simulate_geared_drive()[0])
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     shaft = {"law": "linear_shaft", "stiffness": 60.0}
     torque = 5.0 * np.sin(2.0 * np.pi * 1.0 * t)
     (trace,) = simulate([Run(Machine(GEARED, shaft, FRICTIONS), 2e-3, torque, motor_noise=1e-5, seed=2)])
-    path = motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None))
+    path = write_motor_log(tmp_path, Log(trace.t, trace.u, trace.theta_e, None))
     law = {"law": "sigmoid_backlash", "stiffness": 50.0, "dead_zone": 0.005, "slope": 200.0}
     study = STUDY | {"transmission": law, "uncertainty": {"exact": ["drive.gear_ratio", "transmission.slope"]}}
     (tmp_path / "axis.toml").write_text(tomli_w.dumps(study))
@@ -109,7 +109,7 @@ def test_a_load_that_may_never_be_met_has_no_numbers(tmp_path):
     (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=3e-3, seed=2)])
     assert np.ptp(trace.states[2]) == 0.0
     study = STUDY | {"drive": light, "effects": [FRICTIONS[0], FRICTIONS[1] | {"torque": 0.3}]}
-    summary = identify(motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
+    summary = identify(write_motor_log(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
     assert "by a motor that, within a gap, never meets the load" in summary["backlash"]["why"]
     assert {parameter["interval"][1] for parameter in summary["parameters"].values()} == {None}
 

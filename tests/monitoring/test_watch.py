@@ -60,13 +60,13 @@ def steady_watch(logs):
     return jaxbl.watch(logs / "same.csv", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, **WINDOW)
 
 
-def looks(count):
+def end_after_looks(count):
     """Ends a stream after so many looks at it, more than it takes to read its file."""
     left = iter(range(count))
     return lambda: next(left, None) is None
 
 
-def command(*words):
+def run_command(*words):
     """The exit code of a command."""
     with pytest.raises(SystemExit) as end:
         main(lambda: app([*map(str, words)]))
@@ -172,7 +172,7 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
 def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs, growing_watch):
     log, _ = growing_watch
     task = read_watch_task(logs / "grown.csv", logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
-    live = run_watch(task, ended=looks(12))
+    live = run_watch(task, ended=end_after_looks(12))
     assert live.summary["samples"] == log.summary["samples"]
     assert live.summary["left_out"] == {}
     pd.testing.assert_frame_equal(live.values, log.values, rtol=1e-6, atol=1e-9)
@@ -185,7 +185,7 @@ def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, steady
         port = free.getsockname()[1]
     sent, sender = threading.Event(), []
 
-    def send():
+    def send_rows():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             out.sendto(b"hello", ("127.0.0.1", port))
             for i in range(0, len(rows), 100):
@@ -195,14 +195,16 @@ def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, steady
         time.sleep(0.5)
         sent.set()
 
-    def ended():
+    def start_sender():
         # called first when the address is open
         if not sender:
-            sender.append(threading.Thread(target=send))
+            sender.append(threading.Thread(target=send_rows))
             sender[0].start()
         return sent.is_set()
 
-    live = jaxbl.watch(f"udp://127.0.0.1:{port}", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, ended=ended, **WINDOW)
+    live = jaxbl.watch(
+        f"udp://127.0.0.1:{port}", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, ended=start_sender, **WINDOW
+    )
     sender[0].join()
     assert live.summary["left_out"] == {"malformed datagrams or lines": 101}
     pd.testing.assert_frame_equal(live.values, steady_watch.values, rtol=1e-6, atol=1e-9)
@@ -231,14 +233,14 @@ def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
     log = tmp_path / "log.csv"
     still.to_csv(log, index=False)
     task = read_watch_task(log, logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
-    result = run_watch(task, ended=looks(8))
+    result = run_watch(task, ended=end_after_looks(8))
     assert (result.summary["values"], result.summary["determined"], result.summary["alarm"]) == (12, 0, None)
     assert jaxbl.write_report(result, tmp_path)[0].startswith("Nothing was determined (12 values)")
 
 
 def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path, capsys):
     words = ("watch", logs / "grown.csv", "--model", logs / "axis.toml", "--alarm-gap", LIMIT, *OPTIONS)
-    assert command(*words, "--out", tmp_path / "out") == 3
+    assert run_command(*words, "--out", tmp_path / "out") == 3
     output = capsys.readouterr().out.splitlines()
     lines = [line for line in output if line.lstrip()[:1].isdigit()]
     assert len(lines) == 24
@@ -256,17 +258,17 @@ def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path,
     assert values["t"][values["alarm"]].iloc[0] == summary["alarm"]["t"]
     assert (tmp_path / "out" / "figures" / "watch.png").stat().st_size > 10_000
     # the same log again, and another one
-    assert command(*words, "--out", tmp_path / "out", "--quiet") == 3
+    assert run_command(*words, "--out", tmp_path / "out", "--quiet") == 3
     assert capsys.readouterr().out == ""
     other = ("watch", logs / "same.csv", "--model", logs / "axis.toml", *OPTIONS, "--out", tmp_path / "out")
-    assert command(*other) == 2
+    assert run_command(*other) == 2
     assert "holds results of another log" in capsys.readouterr().err
-    assert command(*other, "--overwrite") == 0
+    assert run_command(*other, "--overwrite") == 0
 
 
 def test_json_is_a_line_for_each_row_of_values_and_one_for_the_end(logs, tmp_path, capsys):
     words = ("watch", logs / "grown.csv", "--model", logs / "axis.toml", "--alarm-gap", LIMIT, *OPTIONS)
-    assert command(*words, "--out", tmp_path / "out", "--json") == 3
+    assert run_command(*words, "--out", tmp_path / "out", "--json") == 3
     *values, end = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     assert len(values) == 24
     assert values[-1]["alarm"]
@@ -298,17 +300,17 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
     assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten
-    assert command(*words) == 2
+    assert run_command(*words) == 2
     assert "holds values of another stream" in capsys.readouterr().err
 
 
-def without(data, *tables):
+def drop_tables(data, *tables):
     return {key: value for key, value in data.items() if key not in tables}
 
 
 BAD = {
     "no gap to watch": (rigid_study(), {}, "drive.kind rigid has no gap to watch"),
-    "no gains": (without(axis(), "observer"), {}, r"\[observer.motor\] has no gains; jaxbl tune"),
+    "no gains": (drop_tables(axis(), "observer"), {}, r"\[observer.motor\] has no gains; jaxbl tune"),
     "window too short": (axis(), {"window": 0.1}, "window is 0.1 s; .* at least 0.5 s"),
     "window longer than the log": (axis(), {"window": 100.0}, "has 9.999 s, window is 100 s"),
     "no window": (axis(), {"window": 0.0}, "window is 0; it should be positive"),
@@ -363,7 +365,7 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
         port = out.getsockname()[1]
     heard, calls = [], []
 
-    def ended():
+    def send_and_count():
         if not calls:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
                 out.sendto(b"1,2,3", ("127.0.0.1", port))
@@ -371,7 +373,7 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
         return len(calls) > 8
 
     task = read_watch_task(f"udp://127.0.0.1:{port}", logs / "axis.toml", **WINDOW)
-    run_watch(task, on_remark=heard.append, ended=ended)
+    run_watch(task, on_remark=heard.append, ended=send_and_count)
     assert any("nothing that can be read has come for" in remark for remark in heard)
     assert any(
         "1 malformed datagrams or lines; the last: 3 cells in '1,2,3'; there should be 4" in remark for remark in heard

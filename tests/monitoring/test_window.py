@@ -23,18 +23,18 @@ def prepare_window(data):
     return prepare(read_config(data))
 
 
-def late(values):
+def filter_late(values):
     """The low-pass as SciPy has it, one sample later."""
     share = -np.expm1(-PERIOD / CONSTANT)
     return np.concatenate([[0.0], lfilter([share], [1.0, share - 1.0], values)[:-1]])
 
 
-def hinge(twist, stiffness, half_gap, zero):
+def hinge_torque(twist, stiffness, half_gap, zero):
     z = twist - zero
     return stiffness * (z - np.clip(z, -half_gap, half_gap))
 
 
-def motion(count):
+def simulate_motion(count):
     """Twist and positions: the twist goes through the gap some times a second, the sides turn more slowly."""
     time = np.arange(count) * PERIOD
     twist = 0.17 * np.sin(2 * np.pi * 0.9 * time) + 0.05 * np.sin(2 * np.pi * 2.3 * time + 0.4)
@@ -42,20 +42,20 @@ def motion(count):
     return time, twist, RATIO * load + twist, load
 
 
-def rows_of(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
+def observer_rows(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
     """Rows of observers without an error, for a drive with known numbers; its model knows half of the friction."""
-    time, twist, motor, load = motion(count)
+    time, twist, motor, load = simulate_motion(count)
     speeds = {"motor": np.gradient(motor, time, edge_order=2), "load": np.gradient(load, time, edge_order=2)}
     draws = np.random.default_rng(seed)
     rows = {"twist": twist, "motor.position": motor, "load.position": load}
     for side, friction, nominal, gain in (("motor", MOTOR, 0.15, 1.0), ("load", LOAD, 16.0, -1.0 / RATIO)):
         extra = friction["coulomb"] * np.sign(speeds[side]) + (friction["viscous"] - nominal) * speeds[side]
-        torque = hinge(twist, STIFFNESS, half_gap, ZERO) + gain * extra + (PUSH if side == "motor" else 0.0)
-        rows[f"{side}.torque"] = late(torque) + noise * draws.standard_normal(count)
+        torque = hinge_torque(twist, STIFFNESS, half_gap, ZERO) + gain * extra + (PUSH if side == "motor" else 0.0)
+        rows[f"{side}.torque"] = filter_late(torque) + noise * draws.standard_normal(count)
     return rows
 
 
-def window_of(rows, data=None, seconds=10.0):
+def fill_window(rows, data=None, seconds=10.0):
     window = Window(prepare_window(data or axis()), seconds)
     window.add(rows, restarts=True)
     return window
@@ -64,7 +64,7 @@ def window_of(rows, data=None, seconds=10.0):
 @pytest.mark.parametrize("half_gap", [0.5 * HALF_GAP, HALF_GAP, 1.5 * HALF_GAP])
 def test_the_numbers_that_rows_were_made_of(half_gap):
     """Also where the model's half gap is another one, with an offset of the twist, friction and a constant torque."""
-    estimate = window_of(rows_of(half_gap=half_gap)).estimate()
+    estimate = fill_window(observer_rows(half_gap=half_gap)).estimate()
     for side, friction in (("motor", MOTOR), ("load", LOAD)):
         numbers = estimate[side].numbers
         assert numbers["half_gap"].value == pytest.approx(half_gap, rel=1e-4)
@@ -77,19 +77,19 @@ def test_the_numbers_that_rows_were_made_of(half_gap):
 
 def test_the_same_as_a_fit_by_scipy():
     """Least squares of the low-passed torque of a gap, without friction, over stiffness, gap, zero and a constant."""
-    rows = rows_of(noise=0.5)
-    time, twist, motor, _ = motion(10_000)
-    window = window_of(rows)
+    rows = observer_rows(noise=0.5)
+    time, twist, motor, _ = simulate_motion(10_000)
+    window = fill_window(rows)
     numbers = window.estimate()["motor"].numbers
     speed = np.gradient(motor, time, edge_order=2)
     # rows that count: the filter has settled, the motor does not turn, and the velocity has its readings
-    selected = np.abs(late(np.sign(speed))) > 0.9
+    selected = np.abs(filter_late(np.sign(speed))) > 0.9
     selected[:100] = selected[-20:] = False
 
     def residual(x):
         stiffness, half_gap, zero, coulomb, viscous, push = x
-        torque = hinge(twist, stiffness, half_gap, zero) + coulomb * np.sign(speed) + (viscous - 0.15) * speed + push
-        return (late(torque) - rows["motor.torque"])[selected]
+        torque = hinge_torque(twist, stiffness, half_gap, zero) + coulomb * np.sign(speed) + (viscous - 0.15) * speed + push
+        return (filter_late(torque) - rows["motor.torque"])[selected]
 
     fit = least_squares(residual, [55.0, 0.07, 0.0, 0.1, 0.1, 0.0], x_scale=[60, 0.1, 0.01, 0.1, 0.1, 0.1], xtol=1e-14)
     for name, value in zip(("stiffness", "half_gap", "_", "coulomb", "viscous"), fit.x, strict=False):
@@ -99,7 +99,7 @@ def test_the_same_as_a_fit_by_scipy():
 
 
 def test_standard_errors_are_the_scatter():
-    values = [window_of(rows_of(noise=0.5, seed=seed)).estimate()["motor"].numbers for seed in range(60)]
+    values = [fill_window(observer_rows(noise=0.5, seed=seed)).estimate()["motor"].numbers for seed in range(60)]
     for name in ("half_gap", "stiffness", "coulomb", "viscous"):
         scatter = np.std([numbers[name].value for numbers in values], ddof=1)
         stated_error = np.sqrt(np.mean([numbers[name].error ** 2 for numbers in values]))
@@ -108,25 +108,25 @@ def test_standard_errors_are_the_scatter():
 
 
 def test_what_determines_nothing_gives_nothing():
-    rows = rows_of()
-    assert window_of({name: values[:9000] for name, values in rows.items()}).estimate() == {}  # not full
+    rows = observer_rows()
+    assert fill_window({name: values[:9000] for name, values in rows.items()}).estimate() == {}  # not full
     still = {name: np.full_like(values, values[1]) for name, values in rows.items()}
-    assert window_of(still).estimate() == {}
+    assert fill_window(still).estimate() == {}
     # one flank alone: the gap and the zero of the twist can't be told apart
     flank = rows | {"twist": 0.15 + 0.2 * np.abs(rows["twist"])}
-    flank["motor.torque"] = late(hinge(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
-    estimate = window_of(flank).estimate().get("motor")
+    flank["motor.torque"] = filter_late(hinge_torque(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
+    estimate = fill_window(flank).estimate().get("motor")
     assert estimate is None or estimate.numbers["half_gap"].error > HALF_GAP
     infinite = rows | {"motor.torque": np.full(10_000, np.inf)}
-    assert "motor" not in window_of(infinite).estimate()
+    assert "motor" not in fill_window(infinite).estimate()
 
 
 def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
-    rows = rows_of(20_000)
+    rows = observer_rows(20_000)
     spoilt = {name: values.copy() for name, values in rows.items()}
     for side in ("motor", "load"):
         spoilt[f"{side}.torque"][12_000:12_090] += 100.0
-    assert abs(window_of(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
+    assert abs(fill_window(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
     window = Window(prepare_window(axis()), 10.0)
     window.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
     window.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
@@ -138,7 +138,7 @@ def test_the_chain_in_pieces_is_the_replay_of_the_whole(data):
     """Pieces have any length, also that of a block and one more."""
     experiment = prepare_window(data)
     count = 5000
-    time, _, motor, load = motion(count)
+    time, _, motor, load = simulate_motion(count)
     noise = np.random.default_rng(1).standard_normal((2, count))
     inputs = {"motor": motor + 1e-4 * noise[0], "load": load + 2e-5 * noise[1]}
     torque = np.sin(5.0 * time)

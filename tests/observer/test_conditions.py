@@ -59,23 +59,23 @@ def ratio_by_quadrature(lambda_, alpha, f_plus):
 def ratio_by_simulation(lambda_, alpha, f_plus):
     """Follow (34) from (0, 1) with the disturbance that pushes outwards, in the observer's own states, to the next peak."""
 
-    def speed(x, velocity):
+    def position_rate(x, velocity):
         return velocity - lambda_ * np.sqrt(max(x, 0.0))
 
-    def right(disturbance):
-        return lambda t, s: [speed(*s), disturbance - alpha]
+    def derivatives(disturbance):
+        return lambda t, s: [position_rate(*s), disturbance - alpha]
 
-    def turns(t, s):
-        return speed(*s)
+    def stops(t, s):
+        return position_rate(*s)
 
-    def returns(t, s):
+    def crosses_zero(t, s):
         return s[0]
 
-    turns.terminal = returns.terminal = True
-    turns.direction = returns.direction = -1
+    stops.terminal = crosses_zero.terminal = True
+    stops.direction = crosses_zero.direction = -1
     settings = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-14}
-    outward = solve_ivp(right(f_plus), (0.0, 100.0), [0.0, 1.0], events=turns, **settings)
-    inward = solve_ivp(right(-f_plus), (0.0, 100.0), outward.y[:, -1], events=returns, **settings)
+    outward = solve_ivp(derivatives(f_plus), (0.0, 100.0), [0.0, 1.0], events=stops, **settings)
+    inward = solve_ivp(derivatives(-f_plus), (0.0, 100.0), outward.y[:, -1], events=crosses_zero, **settings)
     return -inward.y[1, -1]
 
 
@@ -103,12 +103,12 @@ LANES = 300
 
 def compile_function(function):
     """For up to so many cases, of whatever shape: one program of each precision."""
-    wide = jax.jit(function)
+    compiled = jax.jit(function)
 
     def call(*arguments):
         arguments = np.broadcast_arrays(*arguments)
         shape, size = arguments[0].shape, arguments[0].size
-        return np.asarray(wide(*(np.resize(x, LANES) for x in arguments)))[:size].reshape(shape)
+        return np.asarray(compiled(*(np.resize(x, LANES) for x in arguments)))[:size].reshape(shape)
 
     return call
 
@@ -177,7 +177,7 @@ def test_order_of_the_conditions(margin, f_plus):
         assert (least["moreno_osorio"] < least["seeber_horn"]) == (1.0 + margin > crossing)
 
 
-def extremes(lambda_, alpha, f_plus):
+def extreme_matrices(lambda_, alpha, f_plus):
     """Matrices of zeta' = A zeta / (2 sqrt|x1|), zeta = (sqrt|x1| sign x1, x2), under d = -f and +f where x1 > 0."""
     return [np.array([[-lambda_, 1.0], [-2.0 * (alpha - d), 0.0]]) for d in (-f_plus, f_plus)]
 
@@ -190,7 +190,7 @@ def test_quadratic_lyapunov_functions_end_where_shorten_and_narendra_say(ratio, 
     alpha = ratio * f_plus
     least = float(LEAST["moreno_osorio"](alpha, f_plus))
     for lambda_, shared in ((least * (1.0 + off), True), (least / (1.0 + off), False)):
-        first, second = extremes(lambda_, alpha, f_plus)
+        first, second = extreme_matrices(lambda_, alpha, f_plus)
         assert max(np.linalg.eigvals(first).real.max(), np.linalg.eigvals(second).real.max()) < 0.0
         assert np.linalg.matrix_rank(first - second) == 1
         eigenvalues = np.linalg.eigvals(first @ second)
@@ -209,7 +209,7 @@ def test_moreno_osorio_allows_only_what_a_lyapunov_function_shows(ratio, f_plus,
     q = np.diag([((1.0 + 1e-3 * off) * f_plus) ** 2, 1e-6 * off**2 * f_plus])
     p = solve_continuous_are(a, b, q, -np.eye(1))
     assert np.linalg.eigvalsh(p).min() > 0.0
-    for matrix in extremes(lambda_, alpha, f_plus):
+    for matrix in extreme_matrices(lambda_, alpha, f_plus):
         assert np.linalg.eigvalsh(matrix.T @ p + p @ matrix).max() < 0.0
 
 
@@ -321,7 +321,7 @@ def apply_by_row(family, cases):
     return disturbance
 
 
-def random_switching(seed):
+def switch_at_random(seed):
     phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 40)
     rate = np.random.default_rng(seed + 1).uniform(0.5, 30.0, 40)
     return lambda t, x, speed: np.sign(np.sin(rate * t + phase))
@@ -333,7 +333,7 @@ def test_convergence_time_stays_below_the_bound_where_32_holds():
         lambda t, x, speed: np.sign(speed),
         lambda t, x, speed: np.sign(x),
         lambda t, x, speed: np.ones_like(x),
-        random_switching(3),
+        switch_at_random(3),
     ]
     random = np.random.default_rng(7)
     f_plus = np.ones(40)
@@ -361,7 +361,7 @@ def test_bound_is_infinite_where_32_fails():
 WORST, SLOWEST = compile_function(conditions.convergence_time_worst), compile_function(conditions.slowest_ray)
 
 
-def convergent_gains(seed, nearest=1.02, farthest=40.0):
+def draw_convergent_gains(seed, nearest=1.02, farthest=40.0):
     """Gains from just above the exact condition to far above, with bounds of several sizes."""
     random = np.random.default_rng(seed)
     f_plus = np.exp(random.uniform(-1.0, 1.0, LANES))
@@ -376,7 +376,7 @@ def root_ray(lambda_, alpha, f_plus):
     return 0.5 * (np.sqrt(np.where(inside >= 0.0, inside, np.nan)) - lambda_)
 
 
-def switching(ray):
+def switch_at_ray(ray):
     """The disturbance that pushes outwards until |x1|' = ray sqrt|x1|, and homewards from there on."""
 
     def disturbance(t, x, speed):
@@ -389,34 +389,34 @@ def switching(ray):
 HALF = jax.jit(lambda *arguments, ray, homeward: half_cycle(*arguments, ray=ray, homeward=homeward))
 
 
-def whole_time(cycle):
+def total_time(cycle):
     """Time of half cycles without end, from the first one at unit speed; nan where they do not converge."""
     ratio = np.asarray(cycle.ratio)
     return np.where(ratio < 1.0, np.asarray(cycle.time) / np.where(ratio < 1.0, 1.0 - ratio, 1.0), np.nan)
 
 
 def test_worst_time_is_that_of_simulated_half_cycles_and_of_no_other_ray():
-    gains = convergent_gains(0)
+    gains = draw_convergent_gains(0)
     zeros, unit = np.zeros(LANES), np.ones(LANES)
     worst, ray, root = np.asarray(WORST(*gains, zeros, unit)), np.asarray(SLOWEST(*gains)), root_ray(*gains)
     at_root = np.isclose(ray, root, rtol=1e-6, atol=0.0)
     assert 50 < at_root.sum() < 250
     assert np.all(ray <= 0.0)
-    held = HALF(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
-    np.testing.assert_allclose(whole_time(held), worst, rtol=1e-4)
+    slowest_cycle = HALF(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
+    np.testing.assert_allclose(total_time(slowest_cycle), worst, rtol=1e-4)
     # every other ray: as shares of the root's, or of all directions where there is none
-    times = [whole_time(HALF(*gains, ray=zeros, homeward=unit))]
+    times = [total_time(HALF(*gains, ray=zeros, homeward=unit))]
     for share in np.linspace(0.0, 1.0, 100, endpoint=False):
         rays = np.where(np.isnan(root), -np.sqrt(gains[1]) * share / (1.0 - share), share * root)
-        times.append(whole_time(HALF(*gains, ray=rays, homeward=-unit)))
+        times.append(total_time(HALF(*gains, ray=rays, homeward=-unit)))
     longest = np.nanmax(times, axis=0)
     assert np.all(longest <= worst * (1.0 + 1e-4))
     assert np.all(longest >= worst * (1.0 - 1e-3))
 
 
 def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_long():
-    """By the implicit scheme of small steps, from starts anywhere; what it leaves out is below the rest."""
-    gains, start = convergent_gains(5, nearest=1.3), starts(5)
+    """The implicit scheme of small steps follows each case from many starts; its error is the allowance."""
+    gains, start = draw_convergent_gains(5, nearest=1.3), draw_starts(5)
     columns = (*gains, *start, SLOWEST(*gains), WORST(*gains, *start))
     # each case has its worst time as unit
     lambda_, alpha, f_plus, position, velocity, ray, unit = (np.asarray(c)[::12] for c in columns)
@@ -428,10 +428,10 @@ def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_lon
     root = root_ray(lambda_, alpha, f_plus)
     at_root = np.isclose(ray, root, rtol=1e-6)
     # where the slowest holds on along the root's ray, starts beyond it go home at once or return to it
-    slowest = [switching(np.where(at_root, beyond, ray)) for beyond in (1.1 * root, -lambda_ - root)]
+    slowest = [switch_at_ray(np.where(at_root, beyond, ray)) for beyond in (1.1 * root, -lambda_ - root)]
     first_side = np.where(position == 0.0, np.sign(velocity), np.sign(position))
 
-    def held(until):
+    def push_until(until):
         def disturbance(t, x, speed):
             at_first = np.sign(x) == first_side
             return np.where(at_first, first_side if t < until else -first_side, slowest[1](t, x, speed))
@@ -440,8 +440,8 @@ def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_lon
 
     family = [
         *slowest,
-        *(held(until) for until in (0.03, 0.1, 0.3)),
-        *(switching(-share * np.sqrt(alpha)) for share in (0.0, 0.1, 0.3, 1.0, 3.0)),
+        *(push_until(until) for until in (0.03, 0.1, 0.3)),
+        *(switch_at_ray(-share * np.sqrt(alpha)) for share in (0.0, 0.1, 0.3, 1.0, 3.0)),
         lambda t, x, speed: np.sign(x),
         lambda t, x, speed: np.ones_like(x),
         lambda t, x, speed: -np.ones_like(x),
@@ -453,15 +453,15 @@ def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_lon
     arguments = [np.tile(column, len(family)) for column in (lambda_, alpha, f_plus, position, velocity)]
     times = convergence_times(*arguments, apply_by_row(family, cases), 1.1, 5e-5, tolerance=1e-4).reshape(len(family), cases)
     # a step too long in one arc lasts as much longer in the next as it is slower
-    off = 1e-3 + 1e-4 * (alpha + f_plus) / (alpha - f_plus)
-    assert np.all(times <= 1.0 + off)
+    allowance = 1e-3 + 1e-4 * (alpha + f_plus) / (alpha - f_plus)
+    assert np.all(times <= 1.0 + allowance)
     # over many half cycles the scheme's own damping adds up
     few = np.asarray(RATIO(lambda_, alpha, f_plus)) < 0.5
     assert few.sum() > 15
-    assert np.all(np.abs(times[:2].max(axis=0) - 1.0)[few] <= 3.0 * off[few])
+    assert np.all(np.abs(times[:2].max(axis=0) - 1.0)[few] <= 3.0 * allowance[few])
 
 
-def starts(seed):
+def draw_starts(seed):
     """Errors at t = 0, some of them in position or velocity alone."""
     position, velocity = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, LANES))
     position[:50], velocity[50:100] = 0.0, 0.0
@@ -470,8 +470,8 @@ def starts(seed):
 
 @pytest.mark.parametrize("scale", [1e-3, 0.3, 50.0])
 def test_worst_time_is_homogeneous_and_odd(scale):
-    lambda_, alpha, f_plus = convergent_gains(4)
-    position, velocity = starts(4)
+    lambda_, alpha, f_plus = draw_convergent_gains(4)
+    position, velocity = draw_starts(4)
     time = WORST(lambda_, alpha, f_plus, position, velocity)
     np.testing.assert_allclose(WORST(lambda_, alpha, f_plus, -position, -velocity), time, rtol=1e-12)
     # lengths go with the square of times
@@ -482,8 +482,8 @@ def test_worst_time_is_homogeneous_and_odd(scale):
 
 
 def test_worst_time_lies_below_the_bound():
-    lambda_, alpha, f_plus = convergent_gains(6, farthest=300.0)
-    start = starts(6)
+    lambda_, alpha, f_plus = draw_convergent_gains(6, farthest=300.0)
+    start = draw_starts(6)
     bound, worst = (np.asarray(f(lambda_, alpha, f_plus, *start)) for f in (BOUND, WORST))
     assert np.all(np.isfinite(worst))
     assert 50 < np.isfinite(bound).sum() < 250
@@ -491,7 +491,7 @@ def test_worst_time_lies_below_the_bound():
 
 
 def test_worst_time_is_infinite_where_peaks_do_not_fall():
-    lambda_, alpha, f_plus = convergent_gains(2, nearest=1.0 + 1e-6, farthest=1.0 + 1e-5)
+    lambda_, alpha, f_plus = draw_convergent_gains(2, nearest=1.0 + 1e-6, farthest=1.0 + 1e-5)
     start = np.zeros(LANES), np.ones(LANES)
     assert np.all(np.isfinite(WORST(lambda_, alpha, f_plus, *start)))
     assert np.all(np.asarray(WORST(lambda_ * (1.0 - 1e-4), alpha, f_plus, *start)) == np.inf)
@@ -503,7 +503,7 @@ def test_worst_time_is_infinite_where_peaks_do_not_fall():
 
 def test_derivatives_of_the_worst_time():
     position, velocity = np.random.default_rng(1).uniform(-1.0, 1.0, (2, LANES))
-    arguments = [*convergent_gains(0), position, velocity]
+    arguments = [*draw_convergent_gains(0), position, velocity]
     derivatives = jax.jit(jax.grad(lambda *x: jnp.sum(conditions.convergence_time_worst(*x)), (0, 1, 2, 3, 4)))(*arguments)
     for k, gradient in enumerate(derivatives):
         step = 1e-6 * np.abs(arguments[k])
@@ -514,7 +514,7 @@ def test_derivatives_of_the_worst_time():
 
 
 def test_worst_time_in_float32():
-    gains = convergent_gains(8, nearest=1.2)
+    gains = draw_convergent_gains(8, nearest=1.2)
     start = np.zeros(LANES), np.ones(LANES)
     times = WORST(*(jnp.asarray(x, jnp.float32) for x in (*gains, *start)))
     assert times.dtype == jnp.float32

@@ -16,7 +16,7 @@ from jaxbl.observer.differentiator import solve_correction
 ORDERS = sorted(DIFFERENTIATORS)
 
 
-def free(velocity):
+def no_acceleration(velocity):
     return 0.0 * velocity
 
 
@@ -69,7 +69,7 @@ def test_root_of_the_correction(order, dtype, few):
 def estimate_of_zero(observer, position, h):
     """The estimate of a position measured to be zero, after one step from another position at rest."""
     zero = jnp.zeros(())
-    return observer.step(observer.start(position, zero, free, h), zero, free, h)[1].position
+    return observer.step(observer.start(position, zero, no_acceleration, h), zero, no_acceleration, h)[1].position
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -186,7 +186,7 @@ def test_any_start_leads_into_the_sliding_set(order):
 
     def step(state, top):
         # the error is observed: true states zero, but for what the highest derivative does over the period
-        new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
+        new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), no_acceleration, jnp.asarray(h)))(state)
         position, velocity, *further = (
             x - p * top for x, p in zip([new.position, new.velocity, *new.further], push, strict=True)
         )

@@ -14,11 +14,11 @@ from jaxbl.observer.base import predict_next
 H, FRICTION = 1e-3, 3.0
 
 
-def nominal(velocity):
+def nominal_acceleration(velocity):
     return 0.7 - FRICTION * velocity
 
 
-def observe(observer, measured, acceleration=nominal, period=H):
+def observe(observer, measured, acceleration=nominal_acceleration, period=H):
     """Estimates along measured positions, from the first one at rest."""
 
     dtype, count = measured.dtype, len(measured)
@@ -36,16 +36,18 @@ def run_observer(observer, measured, acceleration, period):
     return jax.lax.scan(lambda state, y: observer.step(state, y, acceleration, period), start, measured)[1]
 
 
-def model(period=H):
+def prediction_matrix(period=H):
     """The prediction of position, velocity and disturbance as a matrix, and what the nominal input adds."""
-    still = np.array([*map(float, predict_next(0.0, 0.0, nominal, period)), 0.0])
-    columns = [np.array([*map(float, predict_next(x, v, nominal, period, disturbance=d)), d]) for x, v, d in np.eye(3)]
+    still = np.array([*map(float, predict_next(0.0, 0.0, nominal_acceleration, period)), 0.0])
+    columns = [
+        np.array([*map(float, predict_next(x, v, nominal_acceleration, period, disturbance=d)), d]) for x, v, d in np.eye(3)
+    ]
     return np.stack(columns, axis=1) - np.outer(still, [1.0, 1.0, 1.0]), still
 
 
-def estimator(shares, measured, states):
+def simulate_estimator(shares, measured, states):
     """The estimates of x_hat = x_predicted + L (y - x_predicted), by scipy's simulation of the linear system."""
-    a, still = (part[:states] for part in model())
+    a, still = (part[:states] for part in prediction_matrix())
     a, gain, read = a[:, :states], np.array(shares)[:states, None], np.eye(1, states)
     correct = np.eye(states) - gain @ read
     # inputs are the measurement and one, the state is the predicted one
@@ -54,15 +56,15 @@ def estimator(shares, measured, states):
     return dlsim(system, inputs, x0=np.array([measured[0], 0.0, 0.0])[:states])[1]
 
 
-def signal(count=2000):
+def noisy_signal(count=2000):
     t = H * np.arange(count)
     return np.sin(5.0 * t) + 0.1 * t + 1e-4 * np.random.default_rng(3).normal(size=count)
 
 
 @pytest.mark.parametrize("observer", [ExtendedState(150.0), Kalman(1e-4, 30.0), Kalman(1e-4, 30.0, 0.5)])
 def test_observers_with_a_disturbance_are_the_linear_system_of_their_shares(observer):
-    estimates = observe(observer, signal())
-    expected = estimator(observer.correction(nominal, jnp.asarray(H)), signal(), 3)
+    estimates = observe(observer, noisy_signal())
+    expected = simulate_estimator(observer.correction(nominal_acceleration, jnp.asarray(H)), noisy_signal(), 3)
     for estimated, other in zip(estimates, expected.T, strict=True):
         np.testing.assert_allclose(estimated, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
@@ -79,7 +81,7 @@ def test_luenberger_is_the_linear_system_of_its_shares(damping):
     a = np.array([[1.0, H], [0.0, 1.0]])
     correct = np.eye(2) - np.outer(shares[:2], [1.0, 0.0])
     system = (a @ correct, a @ shares[:2, None], correct, shares[:2, None], 1.0)
-    y = signal()
+    y = noisy_signal()
     expected = dlsim(system, y, x0=np.array([y[0], 0.0]))[1]
     estimates = observe(observer, y, free)
     for estimated, other in zip(estimates, expected.T, strict=False):
@@ -89,7 +91,7 @@ def test_luenberger_is_the_linear_system_of_its_shares(damping):
 @pytest.mark.parametrize("damping", [0.4, 0.999999, 1.0, 1.000001, 2.5])
 def test_luenberger_has_the_poles_that_were_asked_for(damping):
     bandwidth = 200.0
-    shares = Luenberger(bandwidth, damping).correction(nominal, jnp.asarray(H))
+    shares = Luenberger(bandwidth, damping).correction(nominal_acceleration, jnp.asarray(H))
     a = np.array([[1.0, H], [0.0, 1.0]])
     poles = np.linalg.eigvals((np.eye(2) - np.outer(np.array(shares[:2]), [1.0, 0.0])) @ a)
     asked = np.exp(H * bandwidth * np.roots([1.0, 2.0 * damping, 1.0]))
@@ -100,7 +102,7 @@ def test_luenberger_has_the_poles_that_were_asked_for(damping):
 
 
 def test_extended_state_has_three_poles_at_one_place():
-    shares = np.array(ExtendedState(300.0).correction(nominal, jnp.asarray(H)), float)
+    shares = np.array(ExtendedState(300.0).correction(nominal_acceleration, jnp.asarray(H)), float)
     a = np.array([[1.0, H, 0.5 * H * H], [0.0, 1.0, H], [0.0, 0.0, 1.0]])
     poles = np.poly((np.eye(3) - np.outer(shares, [1.0, 0.0, 0.0])) @ a)
     np.testing.assert_allclose(poles, np.poly([np.exp(-300.0 * H)] * 3), rtol=1e-9)
@@ -111,7 +113,7 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
     rng = np.random.default_rng(0)
 
     @jax.jit
-    def correction(observer, friction, h):
+    def shares_of(observer, friction, h):
         return observer.correction(lambda velocity: dtype(0.3) - friction * velocity, h)
 
     for _ in range(20):
@@ -119,7 +121,7 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
         width = 10.0 ** rng.uniform(-3.0, 0.3) / h
         slow, fast = noise * h**0.5 * width**3, noise * h**0.5 * width**2 * rng.integers(2)
 
-        shares = correction(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
+        shares = shares_of(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
         still = np.array([*predict_next(0.0, 0.0, lambda v, f=friction: -f * v, h), 0.0])
         assert not still.any()
         a = np.stack(
@@ -137,7 +139,7 @@ def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
 
 def test_dirty_derivative_is_the_filters_of_scipy():
     """Velocity and disturbance of a drive without friction, by scipy's filters of the same difference equations."""
-    tau, y = 4e-3, signal()
+    tau, y = 4e-3, noisy_signal()
 
     def free(velocity):
         return 0.0 * velocity

@@ -43,10 +43,10 @@ def run_identifier(identifier, law, low_pass, z, torques, block):
         state, _ = jax.lax.scan(add_sample, state, samples)
     else:
         state, _ = jax.lax.scan(add_block, state, jax.tree.map(lambda x: x.reshape(-1, block), samples))
-    return matrix_of(state), identifier.estimate(state, law), identifier.excitation(state)
+    return information_matrix(state), identifier.estimate(state, law), identifier.excitation(state)
 
 
-def matrix_of(state):
+def information_matrix(state):
     """The information matrix from its upper triangle."""
     n = len(state.regressors)
     upper = jnp.stack([total.value(state.weight) for total in state.information])
@@ -54,7 +54,7 @@ def matrix_of(state):
     return jnp.zeros((n, n), upper.dtype).at[rows, columns].set(upper).at[columns, rows].set(upper)
 
 
-def record(law, size=4000, noise=0.05, seed=0):
+def simulate_record(law, size=4000, noise=0.05, seed=0):
     """Twists that work the law, and a noisy torque of each side."""
     random = np.random.default_rng(seed)
     z = 0.3 * np.sin(3.0 * H * np.arange(size)) + 0.05 * random.normal(size=size)
@@ -88,7 +88,7 @@ def parameters_of(law, theta):
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_least_squares_of_both_sides(law, regressor_filter):
     """With forgetting, a delayed start, and the low-pass of one sample's delay on phi where it is matched."""
-    z, torques = record(law)
+    z, torques = simulate_record(law)
     forgetting, start, time_constant = 0.999, 501, 0.01
     identifier = Identifier(start * H, forgetting, regressor_filter)
     _, estimates, _ = identify(identifier, law, z, torques, time_constant)
@@ -137,7 +137,7 @@ def test_sums_are_the_solution_of_the_papers_differential_form():
 
 def test_a_million_samples_in_float32():
     """Positive and accurate to float32's own rounding, which plain sums are not."""
-    z, torques = record(SIGMOID, 1_000_000)
+    z, torques = simulate_record(SIGMOID, 1_000_000)
     z, torques = z.astype(np.float32), {side: torque.astype(np.float32) for side, torque in torques.items()}
     identifier = Identifier(0.0, 1.0, "none")
     information, estimates, excitation = identify(identifier, SIGMOID, z, torques, dtype=jnp.float32, block=500)
@@ -165,7 +165,7 @@ def test_start_and_forgetting_in_the_plain_sums():
 
 
 def test_settling_changes_no_figure():
-    z, torques = record(SIGMOID)
+    z, torques = simulate_record(SIGMOID)
     identifier = Identifier(0.5, 0.99)
     reference = identify(identifier, SIGMOID, z, torques, 0.01)
     for block in (1, 400):
@@ -175,7 +175,7 @@ def test_settling_changes_no_figure():
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_nan_without_excitation(law):
-    z, torques = record(law)
+    z, torques = simulate_record(law)
     _, estimates, excitation = identify(Identifier(), law, 0.0 * z, dict.fromkeys(torques, 0.0 * z))
     assert all(np.isnan(value) for side in estimates.values() for value in side.values())
     assert excitation == 0.0
@@ -194,7 +194,7 @@ def test_one_twist_does_not_determine_two_unknowns(dtype):
 
 
 def test_excitation_is_the_least_eigenvalue_of_the_normalised_matrix():
-    z, torques = record(SIGMOID)
+    z, torques = simulate_record(SIGMOID)
     information, _, excitation = identify(Identifier(regressor_filter="none"), SIGMOID, z, torques)
     information = np.asarray(information)
     scale = 1.0 / np.sqrt(np.diag(information))

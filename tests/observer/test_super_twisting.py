@@ -12,7 +12,7 @@ from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observe
 from jaxbl.simulate import Sample, initial_state, scan, step
 
 
-def zero(velocity):
+def no_acceleration(velocity):
     return 0.0 * velocity
 
 
@@ -33,7 +33,7 @@ def test_implicit_step_solves_its_generalised_equation(dtype, magnitude, sign, l
     observer = ImplicitSuperTwisting(jnp.asarray(lambda_), jnp.asarray(alpha))
     # a measurement of zero, so that the estimate is -e without rounding
     state = ObserverState(jnp.asarray(-b), jnp.asarray(dtype(0.0)))
-    new, estimate = observer.step(state, jnp.asarray(dtype(0.0)), zero, jnp.asarray(h))
+    new, estimate = observer.step(state, jnp.asarray(dtype(0.0)), no_acceleration, jnp.asarray(h))
     assert estimate.control.dtype == dtype
     e, s = -float(estimate.position), float(estimate.control) / float(alpha)
     few = 20 * np.finfo(dtype).eps
@@ -56,7 +56,7 @@ def observe_block(observer, state, measured, acceleration, h):
     return jax.lax.scan(lambda state, y: observer.step(state, y, acceleration, h), state, measured)
 
 
-def observe(observer, measured, h, acceleration=zero, state=(0.0, 0.0)):
+def observe(observer, measured, h, acceleration=no_acceleration, state=(0.0, 0.0)):
     """Estimates along measured positions."""
     dtype, count = measured.dtype, len(measured)
     observer, state, h = jax.tree.map(lambda x: jnp.asarray(x, dtype), (observer, ObserverState(*state), h))
@@ -98,11 +98,11 @@ def test_explicit_is_forward_euler_of_the_paper():
     np.testing.assert_allclose(np.stack(estimates, 1), expected, rtol=1e-9, atol=1e-12)
 
 
-def order(sizes, errors):
+def fit_order(sizes, errors):
     return np.polyfit(np.log(sizes), np.log(errors), 1)[0]
 
 
-def errors_of(observer, h, noise=0.0, duration=6.0):
+def largest_errors(observer, h, noise=0.0, duration=6.0):
     """Largest errors of position and velocity over the last third of a run on sin t, whose acceleration is unknown."""
     t = h * np.arange(round(duration / h))
     measured = jnp.asarray(np.sin(t) + noise * np.random.default_rng(1).uniform(-1.0, 1.0, t.size))
@@ -115,12 +115,13 @@ def test_errors_fall_with_the_period_as_theory_says():
     """Levant (2003): |x_1| ~ h^2 and |x_2| ~ h without noise; the implicit estimate has no position error at all."""
     periods = [4e-3, 2e-3, 1e-3, 5e-4]
     explicit, implicit = (
-        np.array([errors_of(cls(3.0, 2.2), h) for h in periods]) for cls in (ExplicitSuperTwisting, ImplicitSuperTwisting)
+        np.array([largest_errors(cls(3.0, 2.2), h) for h in periods])
+        for cls in (ExplicitSuperTwisting, ImplicitSuperTwisting)
     )
-    assert abs(order(periods, explicit[:, 0]) - 2.0) < 0.15
-    assert abs(order(periods, explicit[:, 1]) - 1.0) < 0.15
+    assert abs(fit_order(periods, explicit[:, 0]) - 2.0) < 0.15
+    assert abs(fit_order(periods, explicit[:, 1]) - 1.0) < 0.15
     assert np.all(implicit[:, 0] < 1e-15)
-    assert abs(order(periods, implicit[:, 1]) - 1.0) < 0.05
+    assert abs(fit_order(periods, implicit[:, 1]) - 1.0) < 0.05
     assert np.all(implicit[:, 1] < 0.5 * explicit[:, 1])
 
 
@@ -128,9 +129,9 @@ def test_errors_fall_with_the_period_as_theory_says():
 def test_errors_grow_with_the_noise_as_theory_says(cls):
     """Levant (2003): |x_1| ~ noise and |x_2| ~ its root."""
     noises = [1e-5, 1e-4, 1e-3]
-    errors = np.array([errors_of(cls(3.0, 2.2), 1e-4, noise) for noise in noises])
-    assert abs(order(noises, errors[:, 0]) - 1.0) < 0.15
-    assert abs(order(noises, errors[:, 1]) - 0.5) < 0.15
+    errors = np.array([largest_errors(cls(3.0, 2.2), 1e-4, noise) for noise in noises])
+    assert abs(fit_order(noises, errors[:, 0]) - 1.0) < 0.15
+    assert abs(fit_order(noises, errors[:, 1]) - 0.5) < 0.15
 
 
 @pytest.mark.parametrize("discretisation", ["explicit", "implicit"])

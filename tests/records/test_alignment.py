@@ -10,11 +10,11 @@ from jaxbl.report.inspect import summary
 
 @pytest.fixture
 def read_frame(tmp_path):
-    def reading(frame, log=None, nominal=NOMINAL):
+    def write_and_read(frame, log=None, nominal=NOMINAL):
         frame.to_parquet(tmp_path / "log.parquet")
         return read_record(tmp_path / "log.parquet", log, gear_ratio=20.0, nominal=nominal)
 
-    return reading
+    return write_and_read
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1])

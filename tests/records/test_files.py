@@ -370,7 +370,7 @@ def read_blocks(path):
     return {"t": words[:, 0], "u": words[:, 1]}
 
 
-def lazy_blocks(path):
+def read_blocks_lazily(path):
     columns = Columns(
         {name: Column(lambda i=i: np.fromfile(path).reshape(-1, 2)[:, i], len(T)) for i, name in enumerate("tu")}
     )
@@ -391,7 +391,7 @@ def install_readers(monkeypatch):
     return install
 
 
-@pytest.mark.parametrize("read", [read_blocks, lazy_blocks, lambda path: pd.DataFrame(read_blocks(path))])
+@pytest.mark.parametrize("read", [read_blocks, read_blocks_lazily, lambda path: pd.DataFrame(read_blocks(path))])
 def test_readers_of_installed_packages_read_the_files_of_their_ending(read, install_readers, tmp_path):
     np.stack([T, U], axis=1).tofile(tmp_path / "log.REC")
     assert not files.is_log(tmp_path / "log.REC")
@@ -400,7 +400,7 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
     columns = read_log_file(tmp_path / "log.REC", ("t", "u"))
     for name, values in {"t": T, "u": U}.items():
         np.testing.assert_array_equal(columns.load_numbers(name), values)
-    assert columns.notes == (["Read block by block."] if read is lazy_blocks else [])
+    assert columns.notes == (["Read block by block."] if read is read_blocks_lazily else [])
 
 
 @pytest.mark.parametrize(

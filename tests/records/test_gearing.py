@@ -31,13 +31,13 @@ def wide_twist_log():
     return frame
 
 
-def looked_at(tmp_path, frame, gear_ratio, log=None):
+def inspect_frame(tmp_path, frame, gear_ratio, log=None):
     frame.to_parquet(tmp_path / "log.parquet")
     return inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio)
 
 
 def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide_twist_log):
-    inspection = looked_at(tmp_path, wide_twist_log, 5.0)
+    inspection = inspect_frame(tmp_path, wide_twist_log, 5.0)
     gearing = inspection.record.statistics.gearing
     assert gearing.is_loose and gearing.skew is None
     assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
@@ -52,16 +52,16 @@ def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wi
     # the gap passes for friction in a rigid drive
     for quantity in ("inertia", "viscous friction", "Coulomb friction"):
         assert answers[quantity].answer == "weak" and "loosely" in answers[quantity].reason
-    assert looked_at(tmp_path, wide_twist_log, None).record.notes == ()
+    assert inspect_frame(tmp_path, wide_twist_log, None).record.notes == ()
 
 
 def test_what_cannot_be_is_refused_even_then(tmp_path, wide_twist_log):
     with pytest.raises(InputError, match=r"theta_e - 50 theta_s ranges over 1.9\d rad, .*: gear_ratio, or a unit") as error:
-        looked_at(tmp_path, wide_twist_log, 50.0)
+        inspect_frame(tmp_path, wide_twist_log, 50.0)
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="gear_ratio, or a unit in"):
-        looked_at(tmp_path, wide_twist_log, 5.0, {"theta_s": {"column": "theta_s", "unit": "turn"}})
-    notes = looked_at(tmp_path, wide_twist_log, -5.0).record.notes
+        inspect_frame(tmp_path, wide_twist_log, 5.0, {"theta_s": {"column": "theta_s", "unit": "turn"}})
+    notes = inspect_frame(tmp_path, wide_twist_log, -5.0).record.notes
     assert any("perhaps the sign of one of them is wrong" in note for note in notes)
 
 
@@ -69,12 +69,12 @@ def test_what_cannot_be_is_refused_even_then(tmp_path, wide_twist_log):
 @pytest.mark.parametrize("factor", [0.1, 10.0, -1.0])
 def test_a_wrong_ratio_is_refused(tmp_path, gap, factor):
     with pytest.raises(InputError, match=r"theta_e moves -?(20|19\.9)"):
-        looked_at(tmp_path, simulate_log(gap=gap, noise=1e-3), factor * GEAR_RATIO)
+        inspect_frame(tmp_path, simulate_log(gap=gap, noise=1e-3), factor * GEAR_RATIO)
 
 
 def test_a_gap_of_a_good_part_of_the_motion_leaves_the_ratio(tmp_path):
     for gap in (5.0, 20.0, 40.0):
-        inspection = looked_at(tmp_path, simulate_log(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
+        inspection = inspect_frame(tmp_path, simulate_log(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
         assert not any("moves" in note or "against" in note for note in inspection.record.notes), inspection.record.notes
 
 

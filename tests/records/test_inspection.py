@@ -90,23 +90,23 @@ def test_one_direction_one_speed_and_one_frequency(tmp_path):
     t = 1e-3 * np.arange(6000)
     forwards = 10.0 * t + 0.5 * np.sin(3.0 * t) + 0.2 * np.sin(11.0 * t)
 
-    def log(position):
+    def make_log(position):
         velocity = np.gradient(position, t)
         u = 0.01 * np.gradient(velocity, t) + 0.05 * velocity + 0.1 * np.sign(velocity)
         return pd.DataFrame({"t": t, "u": u, "theta_e": position, "theta_s": position / GEAR_RATIO})
 
-    judgements = judge_log(tmp_path, log(forwards))
+    judgements = judge_log(tmp_path, make_log(forwards))
     assert judgements["constant torque"] == ("weak", "motion in one direction only: hard to separate from Coulomb friction")
     assert judgements["Coulomb friction"][0] == "weak"
     assert judgements["lost motion"] == ("no", "0 reversals: both flanks of the gap must come into contact")
     triangle = 4.0 * np.abs((t / 2.0) % 1.0 - 0.5) + 1e-5 * np.random.default_rng(0).standard_normal(6000)
-    judgements = judge_log(tmp_path, log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
+    judgements = judge_log(tmp_path, make_log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
     for quantity in ("viscous friction", "Coulomb friction"):
         assert (
             judgements[quantity][0] == "weak"
             and "too close to separate viscous from Coulomb friction" in judgements[quantity][1]
         )
-    judgements = judge_log(tmp_path, log(np.sin(6.0 * t)))
+    judgements = judge_log(tmp_path, make_log(np.sin(6.0 * t)))
     assert judgements["inertia"][0] == "weak" and "hard to separate from a spring or gravity" in judgements["inertia"][1]
 
 
@@ -118,7 +118,7 @@ def test_noise_identifies_nothing(tmp_path):
     assert {answer for answer, _ in judgements.values()} == {"no"}
 
 
-def odd_signal(random, count):
+def draw_odd_signal(random, count):
     """Anything that may stand in a column."""
     time = np.arange(count) / count
     return random.choice([
@@ -140,7 +140,7 @@ def test_any_log_is_inspected_or_refused_in_one_line(tmp_path_factory, seed, cou
     stamps = [period * np.arange(count), period * np.cumsum(random.uniform(0.5, 1.5, count)),
               period * np.cumsum(random.integers(0, 3, count)), period * 4.0 * np.floor(np.arange(count) / 4.0),
               period * np.cumsum(random.exponential(1.0, count) ** 3)][random.integers(5)]  # fmt: skip
-    frame = pd.DataFrame({"t": stamps} | {name: odd_signal(random, count) for name in ("u", "theta_e", "theta_s")})
+    frame = pd.DataFrame({"t": stamps} | {name: draw_odd_signal(random, count) for name in ("u", "theta_e", "theta_s")})
     path = tmp_path_factory.mktemp("odd") / "log.parquet"
     frame.to_parquet(path)
     inspection, refusal = None, ""

@@ -155,7 +155,7 @@ TABLES = {
 }
 
 
-def columns(count=2000):
+def make_columns(count=2000):
     time = np.arange(count) * PERIOD
     motor, load = 40.0 * np.sin(3.0 * time), 8.0 * np.sin(3.0 * time + 0.05)
     return pd.DataFrame(
@@ -174,7 +174,7 @@ def columns(count=2000):
 @pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
 def test_rows_are_what_the_reader_makes_of_the_whole_log(table, tmp_path):
     log, table = tmp_path / "log.csv", LogTable.model_validate(table)
-    columns().to_csv(log, index=False)
+    make_columns().to_csv(log, index=False)
     record = read_record(log, table)
     check_stream_table(table, "log")
     stream = Stream(FollowedFile(log), table, PERIOD)

@@ -16,7 +16,7 @@ def fit_frame(frame, expected=GEAR_RATIO):
     return fit_gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
 
 
-def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
+def simulate_load(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
     """To and fro, or around and around, under a load that pulls to one side and changes it at some times."""
     random = np.random.default_rng(seed)
     t = 0.02 * np.arange(6000)
@@ -51,7 +51,7 @@ def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality, repeat
 @pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"around": True}])
 def test_intervals_by_the_side_of_the_load_cover_the_gap(options, repeats):
     count = repeats(10, 30)
-    fits = [fit_frame(load_driven(seed, **options), 1.0) for seed in range(count)]
+    fits = [fit_frame(simulate_load(seed, **options), 1.0) for seed in range(count)]
     assert all(f.flank == "load" and f.flank_changes == len(options.get("changes", (61.0,))) for f in fits)
     covered = sum(f.lost_motion_interval[0] <= 0.02 <= f.lost_motion_interval[1] for f in fits)
     assert covered >= 0.9 * count
@@ -65,14 +65,14 @@ def test_intervals_by_the_side_of_the_load_cover_the_gap(options, repeats):
 def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around, repeats):
     for seed in range(repeats(4, 10)):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
-            fit = fit_frame(load_driven(seed, around=around, **options), 1.0)
+            fit = fit_frame(simulate_load(seed, around=around, **options), 1.0)
             assert fit.flank == "motion", (seed, options)
             assert not fit.exceeds_noise(1e-4) or fit.lost_motion < 0.005
 
 
 def test_places_where_the_load_hardly_pulls_do_not_count():
     """A quarter of the range where only half of the gap is crossed."""
-    frame = load_driven(3)
+    frame = simulate_load(3)
     late = frame["t"] > 61.0
     frame["theta_e"] -= np.where(late & (frame["theta_s"] < 0.5), 0.01, 0.0)
     fit = fit_frame(frame, 1.0)
@@ -81,7 +81,7 @@ def test_places_where_the_load_hardly_pulls_do_not_count():
 
 
 def test_it_is_told_with_its_interval(tmp_path):
-    load_driven(0).to_parquet(tmp_path / "log.parquet")
+    simulate_load(0).to_parquet(tmp_path / "log.parquet")
     inspection = inspect(tmp_path / "log.parquet", {"absent": ["u"]}, gear_ratio=1.0)
     reason = next(j.reason for j in inspection.identifiability if j.quantity == "lost motion")
     assert reason.startswith("theta_e shifts by 0.0") and reason.endswith("as the load torque changes its sign")

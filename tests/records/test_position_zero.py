@@ -6,7 +6,9 @@ import pytest
 from jaxbl.records import TurningLog, find_zero_shift
 
 
-def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0) -> TurningLog:
+def simulate_turning_log(
+    seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0
+) -> TurningLog:
     """A motor that turns to and fro; cogging of 5 and 10 a turn, read from a zero of its own."""
     random, period = np.random.default_rng(seed), 1e-3
     time = np.arange(8000) * period
@@ -24,14 +26,14 @@ def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns
 
 @pytest.mark.parametrize("gear", [False, True])
 def test_the_difference_of_the_zeros_is_found(gear: bool):
-    shift = find_zero_shift(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
+    shift = find_zero_shift(simulate_turning_log(1, 0.0, gear=gear), simulate_turning_log(2, 0.4, gear=gear))
     assert shift is not None and shift.waves == (5, 10)
     assert abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
 
 
 def test_the_smallest_of_equal_places_is_taken():
     # 5 and 10 a turn repeat every 72 degrees
-    shift = find_zero_shift(log(1, 0.0), log(2, 3.0))
+    shift = find_zero_shift(simulate_turning_log(1, 0.0), simulate_turning_log(2, 3.0))
     assert shift is not None
     assert abs(shift.value - (3.0 - 2.0 * 2.0 * np.pi / 5.0)) < 4.0 * shift.error
 
@@ -39,10 +41,10 @@ def test_the_smallest_of_equal_places_is_taken():
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        (log(1, 0.3), log(2, 0.3)),
-        (log(1, 0.0, cogging=0.0), log(2, 0.4, cogging=0.0)),
-        (log(1, 0.0), log(2, 0.4, cogging=0.0)),
-        (log(1, 0.0, turns=0.3), log(2, 0.4, turns=0.3)),
+        (simulate_turning_log(1, 0.3), simulate_turning_log(2, 0.3)),
+        (simulate_turning_log(1, 0.0, cogging=0.0), simulate_turning_log(2, 0.4, cogging=0.0)),
+        (simulate_turning_log(1, 0.0), simulate_turning_log(2, 0.4, cogging=0.0)),
+        (simulate_turning_log(1, 0.0, turns=0.3), simulate_turning_log(2, 0.4, turns=0.3)),
     ],
     ids=["one zero", "no cogging", "cogging in one alone", "less than a turn"],
 )

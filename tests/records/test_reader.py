@@ -148,12 +148,12 @@ def test_rounded_stamps_are_an_even_grid(tmp_path):
         np.testing.assert_array_equal(record.torque, frame["u"])
 
 
-def uneven(seed=1, count=4000):
+def uneven_times(seed=1, count=4000):
     return np.cumsum(1e-3 * np.random.default_rng(seed).uniform(0.7, 1.4, count))
 
 
 def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
-    times = uneven()
+    times = uneven_times()
     record = read_record(write_frame(tmp_path, simulate_log(times)), gear_ratio=GEAR_RATIO)
     truth = simulate_log(times[0] + record.time)
     assert record.sample_period == record.statistics.sampling.median_period == pytest.approx(np.median(np.diff(times)))
@@ -165,7 +165,7 @@ def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
 
 
 def test_resampling_keeps_the_impulse_of_a_held_torque(tmp_path):
-    times = uneven()
+    times = uneven_times()
     frame = simulate_log(times)
     for period in (None, 5e-4, 3.7e-3):
         record = read_record(write_frame(tmp_path, frame), {"resample": period} if period else None)
@@ -193,7 +193,7 @@ def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, 
 
 
 def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
-    frame = simulate_log(uneven())
+    frame = simulate_log(uneven_times())
     kept_rows = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
     repeated = pd.concat([kept_rows.iloc[:500], kept_rows.iloc[[499, 499]], kept_rows.iloc[500:]])
     record = read_record(write_frame(tmp_path, repeated), gear_ratio=GEAR_RATIO)
@@ -298,7 +298,7 @@ def test_resolution_noise_saturation_and_jumps(tmp_path):
 
 
 def test_uneven_stamps_are_no_noise_and_no_jumps(tmp_path):
-    record = read_record(write_frame(tmp_path, simulate_log(uneven(), noise=2e-3)))
+    record = read_record(write_frame(tmp_path, simulate_log(uneven_times(), noise=2e-3)))
     motor = record.statistics.channels["theta_e"]
     # splines between the readings smooth a little
     assert motor.noise == pytest.approx(2e-3, rel=0.3)
@@ -325,7 +325,7 @@ def replace_columns(**columns):
     return lambda frame: frame.assign(**{name: change(frame) for name, change in columns.items()})
 
 
-def with_cell(column, row, value):
+def replace_cell(column, row, value):
     def change(frame):
         frame = frame.astype({column: object})
         frame.loc[row, column] = value
@@ -349,10 +349,10 @@ BAD = {
         r"no column 'theta_s', but 'Theta_S'; \[log\] theta_s = \"Theta_S\" would read it",
     ),
     "no time": (lambda f: f.rename(columns={"t": "time"}), {}, r"no column 't'; .*; \[log\] t.column can name another"),
-    "text": (with_cell("u", 17, "on"), {}, "column 'u', data row 18 is 'on'; it should be a finite number"),
-    "nan": (with_cell("theta_s", 4, np.nan), {}, "column 'theta_s', data row 5 is empty or not a number"),
-    "text in time": (with_cell("t", 0, "start"), {}, "column 't', data row 1 is 'start'"),
-    "back in time": (with_cell("t", 100, 0.05), {}, "column 't', data row 101: time goes back from 0.099 s to 0.05 s"),
+    "text": (replace_cell("u", 17, "on"), {}, "column 'u', data row 18 is 'on'; it should be a finite number"),
+    "nan": (replace_cell("theta_s", 4, np.nan), {}, "column 'theta_s', data row 5 is empty or not a number"),
+    "text in time": (replace_cell("t", 0, "start"), {}, "column 't', data row 1 is 'start'"),
+    "back in time": (replace_cell("t", 100, 0.05), {}, "column 't', data row 101: time goes back from 0.099 s to 0.05 s"),
     "no time passes": (
         replace_columns(t=lambda f: 0.0 * f["t"] + 3.0),
         {},

@@ -62,7 +62,7 @@ def test_groups_are_those_of_pandas():
     pd.testing.assert_series_equal(groups.medians(column), expected.median(), check_names=False)
 
 
-def stored(folder, data, **columns):
+def store_result(folder, data, **columns):
     """A made-up study in parts."""
     result = make_result(data, **columns)
     engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"))
@@ -109,7 +109,7 @@ def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(Figure, "savefig", write_values)
     rng = np.random.default_rng(0)
     figures = FIGURES if kind == "grid" else FIGURES[:3]
-    result = stored(
+    result = store_result(
         tmp_path / "study",
         rigid_study(figures=figures, **STUDIES[kind]),
         motor__velocity_rmse=lambda frame: np.sqrt(frame[ALPHA]) * np.exp(rng.normal(size=len(frame))),

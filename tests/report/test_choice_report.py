@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 KINDS = ["super_twisting", "luenberger", "kalman"]
 
 
-def chosen(*axes):
+def choose_observer(*axes):
     effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
     table = {"observers": KINDS, "trials": 8, "refine": 0, "axes": list(axes)}
     changes = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5}
@@ -28,12 +28,14 @@ def chosen(*axes):
 
 @pytest.fixture(scope="module")
 def point_choice():
-    return chosen()
+    return choose_observer()
 
 
 @pytest.fixture(scope="module")
 def mapped_choice():
-    return chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4), listed_axis("encoders.motor_resolution", 0.0, 1e-4))
+    return choose_observer(
+        listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4), listed_axis("encoders.motor_resolution", 0.0, 1e-4)
+    )
 
 
 @pytest.fixture(scope="module", params=["point_choice", "mapped_choice"])
@@ -107,7 +109,7 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
 
 
 def test_one_axis_is_drawn_as_lines(mapped_choice):
-    line = chosen(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
+    line = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
     (drawn,) = draw_choice(line)
     (ax,) = drawn.figure.axes
     assert [point.get_label() for point in ax.lines] == KINDS

@@ -116,16 +116,18 @@ def test_the_observers_residual_is_given_where_they_converge():
     nothing = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
     silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
 
-    def lines_of(**observed):
+    def observer_lines(**observed):
         where = {side: SUMMARY["where"][side] | {"observed": residual} for side, residual in observed.items()}
         return [line for line in diagnosis_lines(change_summary(where=where)) if "observers" in line]
 
-    assert lines_of(motor=nothing, load=calls) == [
+    assert observer_lines(motor=nothing, load=calls) == [
         "By the observers' equivalent control: motor side, no more than its noise (0.02 N m rms); load side, 2.1 N m rms "
         "(its noise 0.2), correlation 0.99 with the smoother's."
     ]
-    assert lines_of(motor=silent, load=calls)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
-    assert lines_of(motor=silent) == []
+    assert observer_lines(motor=silent, load=calls)[0].startswith(
+        "By the observers' equivalent control: load side, 2.1 N m rms"
+    )
+    assert observer_lines(motor=silent) == []
 
 
 def test_other_verdicts_say_what_is_left():
@@ -139,7 +141,7 @@ def test_other_verdicts_say_what_is_left():
 
 
 def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
-    def lines(share=0.83, **test):
+    def part_lines(share=0.83, **test):
         gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | test}
         where = {"load": {"sentence": "load side, there"}}
         return diagnosis_lines(change_summary(verdict="unknown_effect", where_after=where, gap=gap, explained_share=share))
@@ -148,18 +150,18 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
         "Partly explained: the model lacks load.coulomb_friction; with it, {} of the missing torque is explained on data "
     )
     remainder = "not used for the fit. The rest is none of the known effects: load side, there."
-    first, _, _, second, *_ = lines(failed=["theta_e"])
+    first, _, _, second, *_ = part_lines(failed=["theta_e"])
     assert first == partly.format("83 %") + remainder
     assert second == (
         "More is left than noise, the uncertainty of the numbers and torques too small to be named account for (1 % test): "
         "theta_e 0.0011 rad (at most 0.0012)."
     )
-    assert lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + remainder
-    assert lines(share=-0.2, remainder=True)[0] == partly.format("none") + remainder
-    first, _, _, second, *_ = lines(far={"drive.motor_inertia": -25.0})
+    assert part_lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + remainder
+    assert part_lines(share=-0.2, remainder=True)[0] == partly.format("none") + remainder
+    first, _, _, second, *_ = part_lines(far={"drive.motor_inertia": -25.0})
     assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
-    unsure = lines(powerless=True, little=True)
+    unsure = part_lines(powerless=True, little=True)
     too_little = "the data not used for the fit are too noisy, or too few, to show it."
     assert unsure[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {too_little}"
     assert unsure[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
@@ -170,7 +172,7 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
     alone = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
     assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in alone
-    assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
+    assert part_lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
 def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
@@ -224,12 +226,12 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     time = 2e-3 * np.arange(2000)
     noise = 0.02 * np.random.default_rng(0).standard_normal(2000)
 
-    def residual(torque, rows):
+    def make_residual(torque, rows):
         return Residual("motor", time[rows], torque[rows], np.full(len(time[rows]), 0.02), np.ones(1), 100.0)
 
     before = 0.3 * np.sign(np.sin(5.0 * time)) + noise
     parts = [(slice(0, 1500), False), (slice(1500, 2000), True)]
-    pairs = {"motor": [(residual(before, rows), residual(noise, rows), held) for rows, held in parts]}
+    pairs = {"motor": [(make_residual(before, rows), make_residual(noise, rows), held) for rows, held in parts]}
     record = _Named(unit_of=lambda path, unit: unit, path=tmp_path / "axis.csv")
     gap = {"holdout": {"separate": False}}
     part = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})

@@ -29,11 +29,11 @@ SHORT = {"run.duration": 1.0, "run.sample_period": 2e-3, "run.substeps": 4, "ide
 DEAD_ZONE = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 
 
-def geared(changes=None, **tables):
+def geared_study(changes=None, **tables):
     return small_study(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
 
 
-def drawn_of(result):
+def draw_by_name(result):
     return {drawing.name: drawing for drawing in draw_identification(result)}
 
 
@@ -43,7 +43,7 @@ def _trace(study: str):
     return run(json.loads(study)).trace
 
 
-def torques_of(config, trace, sides):
+def regression_torques(config, trace, sides):
     columns = (
         {side: jnp.asarray(trace[f"{side}.{name}"]) for side in sides} for name in ("position", "velocity", "acceleration")
     )
@@ -68,7 +68,7 @@ def make_identification(data, folder, *, gap=False, unit="rad", transmitted=Fals
         trace[f"{side}.velocity_deviation"] = trace[f"{side}.acceleration_deviation"] = 1e-3
         trace[f"{side}.acceleration"] = np.gradient(trace[f"{side}.velocity"], record.sample_period)
         trace[f"{side}.residual"] = 1e-4 * np.random.default_rng(0).standard_normal(len(trace))
-    for name, values in torques_of(config, trace, sides).items():
+    for name, values in regression_torques(config, trace, sides).items():
         trace["torque" if name == "transmission" else f"{name}.effects"] = np.asarray(values)
     if transmitted:
         trace["transmitted"] = truth["torque"]
@@ -105,13 +105,16 @@ def make_identification(data, folder, *, gap=False, unit="rad", transmitted=Fals
 
 
 CASES = {
-    "dead zone": (geared(), {}, GEARED),
-    "sigmoid": (geared(transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 80.0}), {},
-                GEARED),
-    "shaft": (geared(transmission={"law": "linear_shaft", "stiffness": 60.0}), {}, GEARED),
-    "gap": (geared(), {"gap": True, "held": ["drive.load_inertia"]}, GEARED),
-    "measured": (geared({"run.duration": 10.0}), {"transmitted": True}, GEARED),
-    "effects": (geared(effects=[{"kind": "transmission.backlash", "half_gap": 0.01},
+    "dead zone": (geared_study(), {}, GEARED),
+    "sigmoid": (
+        geared_study(transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 80.0}),
+        {},
+        GEARED,
+    ),
+    "shaft": (geared_study(transmission={"law": "linear_shaft", "stiffness": 60.0}), {}, GEARED),
+    "gap": (geared_study(), {"gap": True, "held": ["drive.load_inertia"]}, GEARED),
+    "measured": (geared_study({"run.duration": 10.0}), {"transmitted": True}, GEARED),
+    "effects": (geared_study(effects=[{"kind": "transmission.backlash", "half_gap": 0.01},
                                 {"kind": "transmission.damping", "damping": 0.1},
                                 {"kind": "transmission.eccentricity", "amplitude": 0.01},
                                 {"kind": "motor.inertia", "inertia": 0.01},
@@ -141,18 +144,18 @@ def test_all_figures_are_drawn_with_units(case, tmp_path):
             "by the load side",
             "measured",
         ]
-        assert "measured" in labels(figures["torque"])
+        assert "measured" in legend_labels(figures["torque"])
     if case == "shaft":
-        assert not any("gap" in text for text in labels(figures["limit_cycle"]))
+        assert not any("gap" in text for text in legend_labels(figures["limit_cycle"]))
     if case == "effects":
-        assert any("half width 0.09" in text for text in labels(figures["hysteresis"]))
+        assert any("half width 0.09" in text for text in legend_labels(figures["hysteresis"]))
     if case == "gap":
         assert [text.get_text() for text in figures["intervals"].axes[0].texts][
             -1
         ] == "held at nominal: not seen in this log"
 
 
-def labels(figure: Figure) -> list[str]:
+def legend_labels(figure: Figure) -> list[str]:
     """Labels of all that is in the legends of the first axes."""
     return figure.axes[0].get_legend_handles_labels()[1]
 
@@ -188,23 +191,23 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
 def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
     friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
-    result = make_identification(geared({"run.duration": 2.0}, effects=friction), tmp_path)
-    axes = drawn_of(result)["torque"].figure.axes
+    result = make_identification(geared_study({"run.duration": 2.0}, effects=friction), tmp_path)
+    axes = draw_by_name(result)["torque"].figure.axes
     rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert len(rms) == 2
     without = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
-    axes = drawn_of(without)["torque"].figure.axes
+    axes = draw_by_name(without)["torque"].figure.axes
     more = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert min(rms) < 0.6 * min(more)
 
 
 def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     """Small motion, then large motion in the third quarter."""
-    result = make_identification(geared({"run.duration": 10.0}), tmp_path)
+    result = make_identification(geared_study({"run.duration": 10.0}), tmp_path)
     trace = result.trace.copy()
     size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
     trace["motor.velocity"] *= size
-    above, below = drawn_of(dataclasses.replace(result, trace=trace))["velocities"].figure.axes[::2]
+    above, below = draw_by_name(dataclasses.replace(result, trace=trace))["velocities"].figure.axes[::2]
     low, high = above.get_xlim()
     assert 5.9 < low < high < 8.1
     assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
@@ -212,7 +215,7 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
 
 @pytest.mark.usefixtures("every_figure_drawn")
 def test_observers_that_diverged_leave_figures(tmp_path):
-    result = make_identification(geared(), tmp_path)
+    result = make_identification(geared_study(), tmp_path)
     trace = result.trace.copy()
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
@@ -224,11 +227,11 @@ def test_observers_that_diverged_leave_figures(tmp_path):
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
 def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
-    result = make_identification(geared(), tmp_path)
+    result = make_identification(geared_study(), tmp_path)
     trace = result.trace.copy()
     for side in ("motor", "load"):
         trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))
-    figure = drawn_of(dataclasses.replace(result, trace=trace))["recursive"].figure
+    figure = draw_by_name(dataclasses.replace(result, trace=trace))["recursive"].figure
     low, high = figure.axes[1].get_ylim()
     margin = 0.1 * (high - low)
     assert low + margin < 0.08 < high - margin

@@ -27,19 +27,21 @@ def make_refined_study(function, *axes, figures=(MAP,), depth=3, seeds=1):
     config = read_config(rigid_study(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
     points = Points(config)
 
-    def rows(vertices):
+    def make_rows(vertices):
         frame = pd.DataFrame(points.columns(vertices))
         return frame.assign(**dict.fromkeys(metric_columns(config.build()), 1.0) | {"seed": 0, "finite": True})
 
-    vertices, _ = refine_boundary(points.refinement.grid, lambda v: function(rows(v)).to_numpy(float), lambda a, b: a != b)
-    frame = rows(vertices)
+    vertices, _ = refine_boundary(
+        points.refinement.grid, lambda v: function(make_rows(v)).to_numpy(float), lambda a, b: a != b
+    )
+    frame = make_rows(vertices)
     frame["motor.converged"] = function(frame)
     frame[RMSE] = frame[LAMBDA]
     frames = [frame.assign(seed=seed) for seed in range(seeds)]
     return StudyResult(config, pd.concat(frames, ignore_index=True).sample(frac=1.0, random_state=0, ignore_index=True))
 
 
-def disc(frame):
+def converges_in_disc(frame):
     return (np.log2(frame[LAMBDA]) - 2.0) ** 2 + ((frame[ALPHA] - 5.0) / 2.0) ** 2 < 1.3
 
 
@@ -52,12 +54,12 @@ def map_values(ax):
     return next(c for c in ax.collections if isinstance(c, QuadMesh)).get_array()
 
 
-def legend(drawing):
+def legend_texts(drawing):
     return [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
 
 
 def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
-    result = make_refined_study(disc, figures=[MAP | {"value": "motor.converged"}, MAP])
+    result = make_refined_study(converges_in_disc, figures=[MAP | {"value": "motor.converged"}, MAP])
     assert len(result.frame) < 0.5 * 33**2
     converged, error = draw(result)
     values = map_values(panels(converged)[0])
@@ -65,14 +67,14 @@ def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
     assert not np.ma.is_masked(values) and np.isfinite(values).all()
     alphas, lambdas = np.linspace(1.0, 9.0, 33), np.geomspace(1.0, 16.0, 33)
     grid = pd.DataFrame({LAMBDA: np.repeat(lambdas, 33), ALPHA: np.tile(alphas, 33)})
-    np.testing.assert_array_equal(values, disc(grid).to_numpy(float).reshape(33, 33))
-    assert legend(converged) == []
+    np.testing.assert_array_equal(values, converges_in_disc(grid).to_numpy(float).reshape(33, 33))
+    assert legend_texts(converged) == []
     # far from the boundary a vertex of the coarse grid stands for the block around it
     blocks = map_values(panels(error)[0])
     np.testing.assert_allclose(blocks[:4, :4], 1.0)
     np.testing.assert_allclose(blocks[4:6, :2], 2.0)
     np.testing.assert_allclose(blocks[-4:, :4], 16.0)
-    assert legend(error) == ["motor not converged"]
+    assert legend_texts(error) == ["motor not converged"]
     inside = result.frame[result.frame["motor.converged"]]
     assert f"best ★ {inside[LAMBDA].min():.2g} rad/s" in panels(error)[0].get_title()
     for drawing in (converged, error):
@@ -81,11 +83,11 @@ def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
 
 
 def test_only_what_was_simulated_is_counted_as_missing():
-    result = make_refined_study(disc)
+    result = make_refined_study(converges_in_disc)
     frame = result.frame
     frame["finite"] = (frame[LAMBDA] < 16.0) | (frame[ALPHA] < 9.0)
     (drawing,) = draw(result)
-    assert legend(drawing)[-1] == "diverged (1 points)"
+    assert legend_texts(drawing)[-1] == "diverged (1 points)"
     gone = np.ma.getmaskarray(map_values(panels(drawing)[0])) | np.isnan(map_values(panels(drawing)[0]).filled(0.0))
     assert gone.sum() == 5 * 5  # its block, cut by the edges of the map
 
@@ -93,8 +95,8 @@ def test_only_what_was_simulated_is_counted_as_missing():
 def test_panels_medians_and_lines_over_what_is_not_drawn():
     noise = listed_axis(NOISE, 0.0, 1e-4, 1e-3)
 
-    def shrinking(frame):
-        return disc(frame) & (frame[ALPHA] < 7.0 - 2000.0 * frame[NOISE])
+    def converges_in_half_disc(frame):
+        return converges_in_disc(frame) & (frame[ALPHA] < 7.0 - 2000.0 * frame[NOISE])
 
     figures = [
         MAP | {"value": "motor.converged", "facet": NOISE},
@@ -102,7 +104,7 @@ def test_panels_medians_and_lines_over_what_is_not_drawn():
         {"kind": "heatmap", "x": ALPHA, "y": NOISE, "value": "motor.converged"},
         {"kind": "line", "x": ALPHA, "value": RMSE, "series": LAMBDA},
     ]
-    result = make_refined_study(shrinking, noise, figures=figures, seeds=2)
+    result = make_refined_study(converges_in_half_disc, noise, figures=figures, seeds=2)
     by_panel, together, of_noise, lines = draw(result)
     panel_values = np.array([map_values(ax) for ax in panels(by_panel)])
     assert panel_values.shape == (3, 33, 33)
@@ -133,9 +135,9 @@ def test_a_map_shows_no_more_places_than_can_be_seen():
 
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
-    result = make_refined_study(disc, seeds=seeds)
+    result = make_refined_study(converges_in_disc, seeds=seeds)
     points = Points(result.config)
-    coarse = disc(pd.DataFrame(points.columns(points.coarse_points(np.arange(25))))).mean()
+    coarse = converges_in_disc(pd.DataFrame(points.columns(points.coarse_points(np.arange(25))))).mean()
     simulated = len(result.frame) // seeds
     assert headline(result)[0] == (
         f"{simulated} of 1089 grid points simulated ({100 * simulated / 1089:.2g} %), {len(result.frame)} runs. "
@@ -144,7 +146,7 @@ def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
 
 
 def test_an_unfinished_study_is_drawn_as_far_as_it_goes():
-    result = make_refined_study(disc, figures=[MAP, MAP | {"value": "motor.converged"}])
+    result = make_refined_study(converges_in_disc, figures=[MAP, MAP | {"value": "motor.converged"}])
     part = result.frame.iloc[:40]
     for drawing in draw(StudyResult(result.config, part)):
         assert panels(drawing)

@@ -98,7 +98,7 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning, tmp_path):
     assert all(low <= x * (1 + 1e-9) and x <= high * (1 + 1e-9) for line in ax.lines for x in line.get_xdata())
 
 
-def bound_to(summary, binding):
+def set_binding(summary, binding):
     """The summary, as if some constraints of the motor had bound."""
     summary = copy.deepcopy(summary)
     motor = summary["limits"]["motor"]
@@ -117,7 +117,7 @@ def bound_to(summary, binding):
 
 def test_map_and_sentence_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
-        result = dataclasses.replace(tuning, summary=bound_to(tuning.summary, binding))
+        result = dataclasses.replace(tuning, summary=set_binding(tuning.summary, binding))
         drawn = {d.name: d for d in draw_tuning(result)}
         legends = {
             name: [text.get_text() for legend in drawn[name].figure.legends for text in legend.get_texts()]

@@ -141,7 +141,7 @@ def test_bad_input(tmp_path, client, monkeypatch):
         compute_bundle(Bundle(str(tmp_path / "nowhere"), "", Layout(1, 1), "scan", False, (0,)))
 
 
-def _fails(job):
+def _raise_error(job):
     raise {"input": InputError("the job's line"), "module": ModuleNotFoundError("No module named 'x'")}[job]
 
 
@@ -150,9 +150,9 @@ def test_errors_of_workers_reach_who_asked(client, monkeypatch):
         assert isinstance(workers, Cluster) and workers.workers == 2 and not workers.local
         assert list(workers.map_jobs(abs, [-3, -2, -1])) == [3, 2, 1]
         with pytest.raises(InputError, match="the job's line"):
-            list(workers.map_jobs(_fails, ["input"]))
+            list(workers.map_jobs(_raise_error, ["input"]))
         with pytest.raises(InputError, match="its workers lack a module"):
-            list(workers.map_jobs(_fails, ["module"]))
+            list(workers.map_jobs(_raise_error, ["module"]))
         asking = [cluster.version("jaxbl")]
         monkeypatch.setattr(cluster, "version", lambda name: asking.pop() if asking else "0.0.1")
         with pytest.raises(InputError, match=r"worker .* has jaxbl 0\.0\.1; install .* there"):
@@ -172,7 +172,7 @@ def test_jobs_are_taken_as_they_are_needed(client):
 _GO_ON = Event()
 
 
-def _waits(job):
+def _wait_to_go_on(job):
     return job and _GO_ON.wait(60.0)
 
 
@@ -180,7 +180,7 @@ def test_a_scheduler_that_is_lost_is_said():
     # one thread, so that the job that waits begins after the other
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**options) as there, Client(there, set_as_default=False) as connection, connect(connection) as workers:
-        results = workers.map_jobs(_waits, [False, True])
+        results = workers.map_jobs(_wait_to_go_on, [False, True])
         assert next(results) is False
         connection.close()
         try:

@@ -40,18 +40,18 @@ def test_counted_work():
 def test_measured_costs_are_those_of_the_machine(monkeypatch):
     """The machine is made up, and its times follow from its costs."""
 
-    def times(config, devices, cases):
-        took = {}
+    def time_programs(config, devices, cases):
+        seconds = {}
         for backend, path, lanes in cases:
             operations = count_operations(config, [path])
-            took[backend, path, lanes] = KNOWN.sample_seconds(backend, operations, Layout(1, lanes))
+            seconds[backend, path, lanes] = KNOWN.sample_seconds(backend, operations, Layout(1, lanes))
             if backend == "scan" and lanes > 10_000:
                 # the cache is too small
-                took[backend, path, lanes] *= 2.0
+                seconds[backend, path, lanes] *= 2.0
         equations = count_operations(config, [cases[0][1]]).equations
-        return took, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
+        return seconds, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
 
-    monkeypatch.setattr(under_test, "_time_programs", times)
+    monkeypatch.setattr(under_test, "_time_programs", time_programs)
     costs = measure_costs(jax.devices()[:1])
     for backend in ("fused", "scan"):
         np.testing.assert_allclose(costs.of(backend), KNOWN.of(backend), rtol=1e-6)
@@ -70,17 +70,17 @@ def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
 
 
 def test_the_backend_that_takes_less_time():
-    def chosen(platform, layout, samples=10**7, devices=1, programs=1):
+    def choose(platform, layout, samples=10**7, devices=1, programs=1):
         backends = dict.fromkeys(("fused", "scan"), Layout(*layout)), dict.fromkeys(("fused", "scan"), samples)
-        works = dict.fromkeys(("fused", "scan"), Operations(300.0, 100.0, 200.0, 800))
-        return choose_backend([SimpleNamespace(platform=platform)] * devices, works, *backends, programs)
+        operations = dict.fromkeys(("fused", "scan"), Operations(300.0, 100.0, 200.0, 800))
+        return choose_backend([SimpleNamespace(platform=platform)] * devices, operations, *backends, programs)
 
-    assert chosen("cpu", (1, 3)) == "fused"
+    assert choose("cpu", (1, 3)) == "fused"
     # seed after seed would pay for each what lanes share
-    assert chosen("cpu", (1000, 3)) == "scan"
+    assert choose("cpu", (1000, 3)) == "scan"
     # but XLA takes longer to compile
-    assert chosen("cpu", (1000, 3), 1000) == "fused"
-    assert chosen("cpu", (1000, 3), programs=100_000) == "fused"
+    assert choose("cpu", (1000, 3), 1000) == "fused"
+    assert choose("cpu", (1000, 3), programs=100_000) == "fused"
     # the scan starts kernels for each time step; several GPUs share lanes by it alone
-    assert [chosen("gpu", (1, 3)), chosen("gpu", (1, 3), devices=2), chosen("tpu", (1, 3))] == ["fused", "scan", "scan"]
-    assert chosen("gpu", (1000, 3)) == "scan"
+    assert [choose("gpu", (1, 3)), choose("gpu", (1, 3), devices=2), choose("tpu", (1, 3))] == ["fused", "scan", "scan"]
+    assert choose("gpu", (1000, 3)) == "scan"

@@ -26,7 +26,7 @@ AXES = [listed_axis(NOISE, 0.0, 1e-3), spaced_axis(ALPHA, 2.0, 40.0, 3), listed_
 BOUND = ["motor.convergence_time_bound", "load.convergence_time_bound"]
 
 
-def by_point(frame, paths=(NOISE, ALPHA, LAMBDA)):
+def sort_by_point(frame, paths=(NOISE, ALPHA, LAMBDA)):
     return frame.sort_values([*paths, "seed"], ignore_index=True)
 
 
@@ -44,7 +44,7 @@ def reference_frame(study):
     """All 36 lanes in one chunk on one device."""
     engine = Engine(study, Layout(3, 12), jax.devices()[:1])
     assert len(engine) == 1
-    return by_point(engine.run(engine.chunk(0)))
+    return sort_by_point(engine.run(engine.chunk(0)))
 
 
 def test_a_lane_is_the_single_run_of_its_point(study, reference_frame):
@@ -67,7 +67,7 @@ def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference_
     engine = Engine(config, devices=jax.devices()[:devices])
     # padded: the last chunk of points is not full, or there are more seeds than are left
     assert len(engine) == 1 if chunk == 36 else len(engine) > 1
-    frame = by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())]))
+    frame = sort_by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.chunk_order())]))
     exact = [column for column in frame if engine.layout.seeds > 1 or column not in BOUND]
     assert_equal(frame[exact], reference_frame[exact])
     assert_equal(frame, reference_frame, rtol=1e-15)
@@ -150,7 +150,9 @@ def test_a_study_goes_on_with_the_backend_of_its_first_chunks(tmp_path, study):
         sweep(config, tmp_path, backend="fused")
     result = sweep(config, tmp_path)
     assert result.source.backend == "scan"
-    pd.testing.assert_frame_equal(by_point(result.frame), by_point(sweep(config, backend="scan").frame), check_exact=True)
+    pd.testing.assert_frame_equal(
+        sort_by_point(result.frame), sort_by_point(sweep(config, backend="scan").frame), check_exact=True
+    )
 
 
 def test_seeds_alone_are_scanned():
@@ -273,7 +275,7 @@ def test_an_estimate_runs_every_seed(monkeypatch):
 VISCOUS = "effects.motor.viscous_friction.viscous"
 
 
-def unstable(*values, precision="float64"):
+def unstable_study(*values, precision="float64"):
     """Viscous friction as an effect is explicit in time: 1e4 N m s/rad is far beyond its step."""
     effects = [{"kind": "motor.viscous_friction", "viscous": 0.0}]
     return rigid_study(
@@ -283,7 +285,7 @@ def unstable(*values, precision="float64"):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_diverging_lanes_are_flagged_and_leave_their_neighbours_alone(precision):
-    result = sweep(unstable(0.0, 0.01, 1e4, 0.02, precision=precision))
+    result = sweep(unstable_study(0.0, 0.01, 1e4, 0.02, precision=precision))
     diverged = result.frame[VISCOUS] == 1e4
     assert diverged.sum() == 2
     assert (result.frame["finite"] == ~diverged).all()
@@ -292,7 +294,7 @@ def test_diverging_lanes_are_flagged_and_leave_their_neighbours_alone(precision)
         result.frame.loc[diverged, ["motor.velocity_rmse", "motor.f_plus", "motor.convergence_time"]].isna().all(axis=None)
     )
     assert "2 runs diverged" in headline(result)[1]
-    stable_frame = sweep(unstable(0.0, 0.01, 0.02, precision=precision)).frame
+    stable_frame = sweep(unstable_study(0.0, 0.01, 0.02, precision=precision)).frame
     assert_equal(result.frame[~diverged].reset_index(drop=True), stable_frame)
     assert len(headline(StudyResult(result.config, stable_frame))) == 2
 

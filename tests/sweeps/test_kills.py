@@ -76,7 +76,7 @@ def expected_frame(folder, expected):
     }
 
 
-def check(folder, expected):
+def check_completion(folder, expected):
     """The study goes on to its end, and is what it would have been."""
     sweep(study(), folder)
     assert read_parts(folder) == expected
@@ -101,7 +101,7 @@ def test_killed_at_random_moments(tmp_path, undisturbed_run, repeats):
             before = after
             if process.exitcode == 0:
                 break
-        check(folder, expected)
+        check_completion(folder, expected)
 
 
 def test_shares_of_which_one_is_killed(tmp_path, undisturbed_run):
@@ -114,7 +114,7 @@ def test_shares_of_which_one_is_killed(tmp_path, undisturbed_run):
     assert [process.exitcode for process in processes] == [0, -signal.SIGKILL, 0]
     before = expected_frame(tmp_path / "study", expected)
     assert 2 * len(expected) // 3 <= len(before) < len(expected)
-    check(tmp_path / "study", expected)
+    check_completion(tmp_path / "study", expected)
     assert before.items() <= expected_frame(tmp_path / "study", expected).items()
 
 
@@ -135,23 +135,23 @@ def run_dask(module, *words):
         process.join()
 
 
-def worker(address, folder):
+def run_worker(address, folder):
     words = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), "--death-timeout", "60")
     return run_dask("distributed.cli.dask_worker", address, *words)
 
 
-def scheduler(port):
+def run_scheduler(port):
     return run_dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
 
 
-def until(true, seconds=120.0):
+def wait_until(true, seconds=120.0):
     latest = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < latest
         time.sleep(0.02)
 
 
-def count(folder):
+def count_parts(folder):
     return len(list((folder / "points").glob("part-*"))) if (folder / "points").is_dir() else 0
 
 
@@ -162,27 +162,27 @@ def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, undisturbed_
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     address = f"tcp://127.0.0.1:{port}"
-    with worker(address, tmp_path / "a") as first, worker(address, tmp_path / "b"):
-        with scheduler(port):
+    with run_worker(address, tmp_path / "a") as first, run_worker(address, tmp_path / "b"):
+        with run_scheduler(port):
             client = start_process(_sweep, folder, address)
-            until(lambda: count(folder) >= 8)
+            wait_until(lambda: count_parts(folder) >= 8)
             # a worker, wherever it is, and a late one is welcome
             first.kill()
-            with worker(address, tmp_path / "c"):
-                until(lambda: count(folder) >= 30)
+            with run_worker(address, tmp_path / "c"):
+                wait_until(lambda: count_parts(folder) >= 30)
                 client.kill()
                 client.join()
                 before = expected_frame(folder, expected)
                 client = start_process(_sweep, folder, address)
-                until(lambda: count(folder) >= 60)
+                wait_until(lambda: count_parts(folder) >= 60)
         # the scheduler is gone
         client.join(60.0)
         assert client.exitcode == 1
         after = expected_frame(folder, expected)
         assert before.items() <= after.items() and len(after) < len(expected)
-    with scheduler(port), worker(address, tmp_path / "d"):
+    with run_scheduler(port), run_worker(address, tmp_path / "d"):
         client = start_process(_sweep, folder, address)
         client.join(120.0)
         assert client.exitcode == 0
     assert after.items() <= expected_frame(folder, expected).items()
-    check(folder, expected)
+    check_completion(folder, expected)

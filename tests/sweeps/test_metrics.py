@@ -28,12 +28,12 @@ H = 1e-3
 
 
 @eqx.filter_jit
-def run(experiment):
+def scan_signals(experiment):
     figures, selected = scan(experiment, jnp.asarray(2), (ALL_METRICS,), lambda state, signals: (signals, state.identifier))
     return figures, selected
 
 
-def by_numpy(experiment, signals, identifier):
+def metrics_by_numpy(experiment, signals, identifier):
     """All columns again, from the whole trace and the last state of the identifier."""
     steps = experiment.run.steps
     late = slice(steps - steps // 4, None)
@@ -115,8 +115,8 @@ CASES = {
 def test_columns_against_numpy_on_the_whole_trace(case):
     # steps that no block length and no quarter divides
     experiment = paper_experiment(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
-    figures, (signals, identifier) = run(experiment)
-    expected = by_numpy(experiment, signals, identifier)
+    figures, (signals, identifier) = scan_signals(experiment)
+    expected = metrics_by_numpy(experiment, signals, identifier)
     figures = add_gain_metrics(figures, observer_gains(experiment))
     assert set(figures) == set(expected) == set(metric_columns(experiment))
     for name, value in expected.items():
@@ -137,12 +137,12 @@ def test_columns_against_numpy_on_the_whole_trace(case):
 def test_converged_needs_the_whole_last_quarter():
     """A tolerance that the velocity error leaves for the last time within the last quarter."""
     experiment = paper_experiment(time_constant=0.01, start=0.3, steps=1023, noise=1e-4)
-    _, (signals, _) = run(experiment)
+    _, (signals, _) = scan_signals(experiment)
     error = np.abs(np.asarray(signals.motor.true.velocity - signals.motor.velocity_estimate))
     peak = 768 + int(np.argmax(error[768:]))
     for factor, converged in ((0.999, False), (1.001, True)):
         tight = eqx.tree_at(lambda e: e.run.velocity_tolerance, experiment, jnp.asarray(factor * error[peak]))
-        figures, _ = run(tight)
+        figures, _ = scan_signals(tight)
         assert figures["motor.converged"] == converged
 
 

@@ -41,7 +41,7 @@ def disk_study(tmp_path_factory):
     return folder, sweep(thirty_run_study(), folder)
 
 
-def keys(address):
+def read_objects(address):
     """Names below an address, with their content."""
     bucket, _, prefix = address.removeprefix("s3://").partition("/")
     client = boto3.client("s3")
@@ -57,20 +57,24 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, disk_study, computed_chunk
     study = sweep(thirty_run_study(), address)
     assert sorted(computed_chunks) == list(range(8))
     pd.testing.assert_frame_equal(study.frame, result.frame, check_exact=True)
-    stored = keys(address)
+    stored = read_objects(address)
     assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
     assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == read_parts(
         folder
     )
     # again: only read
     assert sweep(thirty_run_study(), address).cost["lanes"] == 0
-    assert keys(address) == stored
+    assert read_objects(address) == stored
     assert status(address).finished
     pd.testing.assert_frame_equal(open_study(address).frame, result.frame, check_exact=True)
     with pytest.raises(InputError, match="holds another study"):
         sweep(thirty_run_study(sweep={"seeds": 3, "chunk": 4}), address)
     sweep(thirty_run_study(axes=[listed_axis(ALPHA, 5.0, 9.0)]), address, overwrite=True)
-    assert set(keys(address)) == {"manifest.json", "study.toml", *(f"points/part-0000{seed}.parquet" for seed in (0, 1))}
+    assert set(read_objects(address)) == {
+        "manifest.json",
+        "study.toml",
+        *(f"points/part-0000{seed}.parquet" for seed in (0, 1)),
+    }
 
 
 def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_chunks):
@@ -84,7 +88,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_ch
         _ = open_study(address).frame
     assert len(sweep(thirty_run_study(), address).damaged) == 1
     assert sorted(computed_chunks) == [2, 5]
-    assert "damaged/part-00002.parquet" in keys(address)
+    assert "damaged/part-00002.parquet" in read_objects(address)
     (to_path(address) / "manifest.json").unlink()
     with pytest.raises(InputError, match="has lost its manifest"):
         open_study(address)
@@ -96,7 +100,7 @@ def test_a_report_in_a_store(bucket):
     address = f"{bucket}/c"
     figure = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
     write_sweep_report(sweep(thirty_run_study(figures=[figure]), address), to_path(address))
-    stored = keys(address)
+    stored = read_objects(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
     assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
 

@@ -28,15 +28,15 @@ def study(**more):
     return small_study(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
 
 
-def over_kinds(kinds, backend):
+def sweep_kinds(kinds, backend):
     axes = [listed_axis("observer.kind", *kinds), listed_axis("drive.motor_inertia", 0.05, 0.06)]
     return jaxbl.sweep(rigid_study(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes), backend=backend).frame
 
 
 def test_a_sweep_over_the_kind_by_both_loops():
-    fused = over_kinds(OBSERVERS, "fused")
+    fused = sweep_kinds(OBSERVERS, "fused")
     # differentiators of order 5 take all operations that those of order 2 to 4 do
-    scanned = over_kinds([kind for kind in OBSERVERS if kind[-1] not in "234"], "scan")
+    scanned = sweep_kinds([kind for kind in OBSERVERS if kind[-1] not in "234"], "scan")
     assert list(fused["observer.kind"].unique()) == list(OBSERVERS)
     conditions = [name for name in fused if "margin" in name or "bound" in name or "worst" in name]
     usual = fused["observer.kind"] == "super_twisting"

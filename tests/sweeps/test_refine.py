@@ -47,11 +47,11 @@ def trace_boundary(function, grid):
     return mask.reshape(full.shape), full, batches
 
 
-def square(n, depth, dimensions=2):
+def square_grid(n, depth, dimensions=2):
     return CellGrid([n] * dimensions, [True] * dimensions, depth)
 
 
-def corners(values):
+def list_corner_values(values):
     """Corner values of every cell, (2^d, cells along each axis)."""
     ends = (slice(None, -1), slice(1, None))
     return np.array([values[corner] for corner in itertools.product(ends, repeat=values.ndim)])
@@ -59,13 +59,13 @@ def corners(values):
 
 def find_boundary_cells(full):
     """Cells whose corners disagree."""
-    corner_values = corners(full)
+    corner_values = list_corner_values(full)
     return (corner_values != corner_values[0]).any(axis=0)
 
 
-def simulated_cells(mask):
+def find_simulated_cells(mask):
     """Cells all of whose corners were simulated."""
-    return corners(mask).all(axis=0)
+    return list_corner_values(mask).all(axis=0)
 
 
 def label_boundary_pieces(full):
@@ -95,7 +95,7 @@ def label_boundary_pieces(full):
 def assert_traced(mask, full, depth):
     """Every piece of the boundary that a coarse edge crosses an odd number of times is simulated whole; so is every piece
     of which any cell is."""
-    labels, cells = label_boundary_pieces(full), simulated_cells(mask)
+    labels, cells = label_boundary_pieces(full), find_simulated_cells(mask)
     touched = np.unique(labels[cells & (labels >= 0)])
     missed = np.isin(labels, touched) & (labels >= 0) & ~cells
     assert not missed.any()
@@ -129,7 +129,7 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_the_boundary_is_traced_from_end_to_end(name):
     function, n, depth = SHAPES[name]
-    grid = square(n, depth, function.__code__.co_argcount)
+    grid = square_grid(n, depth, function.__code__.co_argcount)
     mask, full, _ = trace_boundary(function, grid)
     assert_traced(mask, full, depth)
 
@@ -138,15 +138,15 @@ def test_the_boundary_is_traced_from_end_to_end(name):
 def test_one_piece_is_found_whole(name):
     """If the coarse grid sees a piece at all, the study has every cell of the full grid's boundary."""
     function, n, depth = SHAPES[name]
-    mask, full, _ = trace_boundary(function, square(n, depth))
-    assert not (find_boundary_cells(full) & ~simulated_cells(mask)).any()
+    mask, full, _ = trace_boundary(function, square_grid(n, depth))
+    assert not (find_boundary_cells(full) & ~find_simulated_cells(mask)).any()
 
 
 def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
     circle = SHAPES["circle"][0]
     shares = []
     for depth in (3, 5, 6):
-        mask, full, batches = trace_boundary(circle, square(17, depth))
+        mask, full, batches = trace_boundary(circle, square_grid(17, depth))
         shares.append(mask.sum() / find_boundary_cells(full).sum())
         assert len(batches) <= 2 * depth + 1
     # about two vertices for each cell of the boundary on the finest level, as many again on all others
@@ -156,25 +156,25 @@ def test_cost_of_a_circle_grows_with_its_length_not_with_its_area():
 
 def test_nothing_is_added_where_all_agree():
     for dimensions in (1, 2, 3):
-        grid = square(5, 4, dimensions)
+        grid = square_grid(5, 4, dimensions)
         mask, _, batches = trace_boundary(lambda x, *_: x < 2.0, grid)
         assert batches == [5**dimensions]
         np.testing.assert_array_equal(np.flatnonzero(mask), grid.coarse_vertices())
 
 
 def test_what_the_coarse_grid_does_not_see_stays_unseen():
-    mask, _, batches = trace_boundary(lambda x, y: np.hypot(x - 0.51, y - 0.52) < 0.005, square(5, 6))
+    mask, _, batches = trace_boundary(lambda x, y: np.hypot(x - 0.51, y - 0.52) < 0.005, square_grid(5, 6))
     assert batches == [25]
     assert mask.sum() == 25
 
 
 def test_axes_that_are_not_refined_have_a_grid_of_their_own():
-    def shifted(c, x, y, e):
+    def crosses_shifted_edge(c, x, y, e):
         return (x + 0.2 * c + 0.0 * e > 0.5) & (y > 0.3)
 
     grid = CellGrid([3, 5, 9, 2], [False, True, True, False], 3)
     assert grid.sizes == (3, 33, 65, 2)
-    mask, full, batches = trace_boundary(shifted, grid)
+    mask, full, batches = trace_boundary(crosses_shifted_edge, grid)
     together = len(batches)
     for i, j in itertools.product(range(3), range(2)):
         part = full[i, :, :, j]
@@ -184,7 +184,7 @@ def test_axes_that_are_not_refined_have_a_grid_of_their_own():
 
 
 @st.composite
-def functions(draw):
+def cut_waves(draw):
     """A few waves on a grid of one to three dimensions, cut at a level."""
     dimensions = draw(st.integers(1, 3))
     n = draw(st.integers(2, 5))
@@ -201,11 +201,11 @@ def functions(draw):
     def function(*places):
         return sum(np.sin(sum(k * x for k, x in zip(ks, places, strict=True)) + p) for ks, p in waves) > cut
 
-    return function, square(n, depth, dimensions), depth
+    return function, square_grid(n, depth, dimensions), depth
 
 
 @settings(max_examples=150, deadline=None)
-@given(functions())
+@given(cut_waves())
 def test_any_boundary_is_traced(case):
     function, grid, depth = case
     mask, full, _ = trace_boundary(function, grid)
@@ -217,7 +217,7 @@ def test_any_boundary_is_traced(case):
 def test_random_labels_are_traced(seed, dimensions):
     """No smoothness at all: boundaries everywhere, with every way of touching the edge of the grid."""
     rng = np.random.default_rng(seed)
-    grid = square(3, 3, dimensions)
+    grid = square_grid(3, 3, dimensions)
     full = rng.random(grid.sizes) < rng.choice([0.02, 0.1, 0.5])
     mask, full, _ = trace_boundary(lambda *_: full, grid)
     assert_traced(mask, full, 3)
@@ -255,7 +255,7 @@ def test_true_and_false_disagree_whatever_the_tolerance():
 GAINS = [spaced_axis(LAMBDA, 0.5, 8.0, 5), spaced_axis(ALPHA, 1.0, 9.0, 3, "linear")]
 
 
-def points(*axes, **sweep):
+def make_points(*axes, **sweep):
     return Points(read_config(small_study(axes=list(axes), sweep={"refine": 2, **sweep})))
 
 
@@ -276,7 +276,7 @@ def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
 
 
 def test_what_is_refined():
-    study = points(
+    study = make_points(
         listed_axis(NOISE, 0.0, 1e-4),
         *GAINS,
         listed_axis("observer.load.alpha", 0.2, 0.4, zip="g"),
@@ -295,14 +295,14 @@ def test_what_is_refined():
 
 def test_what_is_compared():
     def columns(*axes, **sweep):
-        return points(*axes, **sweep).refinement.criterion.columns
+        return make_points(*axes, **sweep).refinement.criterion.columns
 
     load = spaced_axis("observer.load.alpha", 0.1, 1.0, 3)
     assert columns(load) == ("load.converged", "finite")
     assert columns(load, GAINS[0]) == ("motor.converged", "load.converged", "finite")
     assert columns(spaced_axis(NOISE, 1e-5, 1e-3, 3)) == ("motor.converged", "load.converged", "finite")
     assert columns(load, refine_metric="motor.chatter") == ("motor.chatter", "finite")
-    refinement = points(load, refine_metric="motor.chatter", refine_tolerance=0.5).refinement
+    refinement = make_points(load, refine_metric="motor.chatter", refine_tolerance=0.5).refinement
     assert refinement.criterion.tolerances == (0.5, 0.0)
 
 
@@ -435,7 +435,7 @@ def test_the_boundary_of_the_full_grid_at_257(precision):
     assert_traced(mask, full, 4)
     boundary = find_boundary_cells(full)
     assert boundary.sum() > 250
-    assert not (boundary & ~simulated_cells(mask)).any()
+    assert not (boundary & ~find_simulated_cells(mask)).any()
     assert mask.mean() < 0.06
 
 
@@ -525,30 +525,30 @@ def refined_study(tmp_path_factory):
     return folder, sweep(study(), folder)
 
 
-def files(folder):
+def read_files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def manifest(folder):
+def read_manifest(folder):
     return json.loads((folder / "manifest.json").read_text())
 
 
-def parts(folder):
+def count_parts(folder):
     return len(list(folder.glob("points/part-*.parquet")))
 
 
 def test_a_refined_study_in_a_folder(refined_study, computed_chunks):
     folder, result = refined_study
-    assert manifest(folder)["finished"]
-    assert manifest(folder)["rows"] == len(result.frame)
-    assert manifest(folder)["parts"] == parts(folder) > 3
+    assert read_manifest(folder)["finished"]
+    assert read_manifest(folder)["rows"] == len(result.frame)
+    assert read_manifest(folder)["parts"] == count_parts(folder) > 3
     pd.testing.assert_frame_equal(open_study(folder).frame, result.frame)
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
     computed_chunks.clear()
-    before = files(folder)
+    before = read_files(folder)
     second = sweep(study(), folder)
     assert (computed_chunks, second.cost["lanes"]) == ([], 0)
-    assert files(folder) == before
+    assert read_files(folder) == before
     lines = headline(open_study(folder))
     share = f"{100 * len(result.frame) / 33**2:.2g}"
     assert lines[0].startswith(f"{len(result.frame)} of 1089 grid points simulated ({share} %), {len(result.frame)} runs. ")
@@ -570,24 +570,24 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(
         sweep(study(), tmp_path / "study", progress=interrupt)
     # the next one may have been computed while that was written
     assert computed_chunks in (list(range(stop + 1)), list(range(stop + 2)))
-    assert not manifest(tmp_path / "study")["finished"]
+    assert not read_manifest(tmp_path / "study")["finished"]
     assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
     calls.clear()
     # with other chunks asked for: those of the folder stay
     result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: calls.append(done))
     pd.testing.assert_frame_equal(result.frame, refined_study[1].frame)
-    assert computed_chunks == list(range(parts(refined_study[0])))
+    assert computed_chunks == list(range(count_parts(refined_study[0])))
     dones, totals = zip(*calls, strict=True)
     assert dones[-1] == totals[-1] == len(result.frame)
     assert list(totals) == sorted(totals) and all(d <= t for d, t in calls)
-    expected = {key: manifest(refined_study[0])[key] for key in ("parts", "rows", "finished")}
-    assert {key: manifest(tmp_path / "study")[key] for key in expected} == expected
+    expected = {key: read_manifest(refined_study[0])[key] for key in ("parts", "rows", "finished")}
+    assert {key: read_manifest(tmp_path / "study")[key] for key in expected} == expected
 
 
 @pytest.mark.parametrize("damage", ["truncated", "missing", "other rows", "one too many"])
 def test_a_part_that_is_not_right_is_computed_again(tmp_path, refined_study, computed_chunks, damage):
     folder = tmp_path / "study"
-    for name, content in files(refined_study[0]).items():
+    for name, content in read_files(refined_study[0]).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     part = folder / "points" / "part-00002.parquet"
@@ -598,7 +598,7 @@ def test_a_part_that_is_not_right_is_computed_again(tmp_path, refined_study, com
     elif damage == "other rows":
         part.write_bytes((folder / "points" / "part-00001.parquet").read_bytes())
     else:
-        (folder / "points" / f"part-{parts(folder):05d}.parquet").write_bytes(part.read_bytes())
+        (folder / "points" / f"part-{count_parts(folder):05d}.parquet").write_bytes(part.read_bytes())
     result = sweep(study(), folder)
     assert computed_chunks == ([] if damage == "one too many" else [2])
     pd.testing.assert_frame_equal(result.frame, refined_study[1].frame)

@@ -32,7 +32,7 @@ def study(changes=None, **tables):
     return rigid_study(changes, **{"axes": [listed_axis(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
 
 
-def files(folder):
+def read_files(folder):
     """Every file of a folder with its content."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
@@ -46,7 +46,7 @@ def finished_study(tmp_path_factory):
 @pytest.fixture
 def study_copy(finished_study, tmp_path):
     """A copy of the finished study's folder."""
-    for name, content in files(finished_study[0]).items():
+    for name, content in read_files(finished_study[0]).items():
         (tmp_path / "study" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "study" / name).write_bytes(content)
     return tmp_path / "study"
@@ -54,7 +54,7 @@ def study_copy(finished_study, tmp_path):
 
 def test_what_a_study_leaves(finished_study):
     folder, result = finished_study
-    assert set(files(folder)) == {"study.toml", "manifest.json", *(f"points/part-0000{i}.parquet" for i in range(3))}
+    assert set(read_files(folder)) == {"study.toml", "manifest.json", *(f"points/part-0000{i}.parquet" for i in range(3))}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["finished"]
     assert (manifest["parts"], manifest["rows"]) == (3, 9)
@@ -67,11 +67,11 @@ def test_what_a_study_leaves(finished_study):
 
 
 def test_finished_study_is_only_read(study_copy, finished_study, computed_chunks):
-    before = files(study_copy)
+    before = read_files(study_copy)
     result = sweep(study(), study_copy)
     assert computed_chunks == []
     assert result.cost["lanes"] == 0
-    assert files(study_copy) == before
+    assert read_files(study_copy) == before
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
     pd.testing.assert_frame_equal(open_study(study_copy).frame, finished_study[1].frame)
 
@@ -133,11 +133,11 @@ OTHER = {
 
 @pytest.mark.parametrize("case", OTHER)
 def test_another_study_in_the_folder_stays_as_it_is(study_copy, case):
-    before = files(study_copy)
+    before = read_files(study_copy)
     with pytest.raises(InputError, match=r"holds another study \('small'") as error:
         sweep(study(**OTHER[case]), study_copy)
     assert str(study_copy) in str(error.value)
-    assert files(study_copy) == before
+    assert read_files(study_copy) == before
 
 
 def test_only_title_notes_and_figures_changed_is_the_same_study(study_copy, computed_chunks):
@@ -176,11 +176,11 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
         data = json.loads(file.read_text())
         content(data)
         file.write_text(json.dumps(data))
-    before = files(study_copy)
+    before = read_files(study_copy)
     with pytest.raises(InputError, match=r"lost its manifest\.json; 'jaxbl repair|manifest\.json: is") as error:
         open_study(study_copy)
     assert "\n" not in str(error.value)
-    assert files(study_copy) == before
+    assert read_files(study_copy) == before
     # as many chunks as there were, whatever is asked for now
     result = sweep(study(sweep={"seeds": 3, "chunk": 100}), study_copy)
     assert computed_chunks == [] and result.damaged == ()
@@ -217,7 +217,7 @@ def flip_bit(folder, random):
 def test_flipped_bits_are_noticed_and_healed(study_copy, finished_study, repeats):
     """None gives other numbers in silence, and one more sweep makes all well."""
     random, damaged_count, flips = Random(7), 0, repeats(20, 1000)
-    before = files(study_copy)
+    before = read_files(study_copy)
     for _ in range(flips):
         path = flip_bit(study_copy, random)
         with suppress(InputError):
@@ -226,7 +226,7 @@ def test_flipped_bits_are_noticed_and_healed(study_copy, finished_study, repeats
         pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
         damaged_count += len(result.damaged)
         shutil.rmtree(study_copy / "damaged", ignore_errors=True)
-        contents = files(study_copy)
+        contents = read_files(study_copy)
         assert contents.keys() == before.keys()
         assert {name for name in contents if contents[name] != before[name]} <= {"manifest.json"}, path
     assert damaged_count > flips / 2
@@ -263,11 +263,11 @@ def test_a_part_of_another_study_is_refused(study_copy, tmp_path):
     (study_copy / "manifest.json").write_text(json_with_checksum(manifest | {"checksums": {}, "finished": False}))
     part = study_copy / "points" / "part-00001.parquet"
     part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
-    before = files(study_copy)
+    before = read_files(study_copy)
     for read in (lambda: sweep(study(), study_copy), lambda: open_study(study_copy).frame, lambda: repair(study_copy)):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is of another study \('small', other numbers\)"):
             read()
-    assert {name: content for name, content in files(study_copy).items() if name != "manifest.json"} == {
+    assert {name: content for name, content in read_files(study_copy).items() if name != "manifest.json"} == {
         name: content for name, content in before.items() if name != "manifest.json"
     }
 
@@ -299,14 +299,14 @@ def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, comput
     axes = [{"path": ALPHA, "start": 1.0, "stop": 40.0, "num": 5, "scale": "log"}]
     refined = study(axes=axes, sweep={"seeds": 1, "chunk": 2, "refine": 3})
     result = sweep(refined, tmp_path / "study")
-    parts, points = list(computed_chunks), files(tmp_path / "study" / "points")
+    parts, points = list(computed_chunks), read_files(tmp_path / "study" / "points")
     coarse = len(Engine(read_config(refined)))
     assert len(parts) > coarse
     (tmp_path / "study" / "manifest.json").unlink()
     whole_part_count, store = repair(tmp_path / "study")
     assert (whole_part_count, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
     second = sweep(refined, tmp_path / "study")
-    assert computed_chunks == parts and files(tmp_path / "study" / "points") == points
+    assert computed_chunks == parts and read_files(tmp_path / "study" / "points") == points
     pd.testing.assert_frame_equal(second.frame, result.frame)
 
 
@@ -351,7 +351,7 @@ def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished_study):
         patched.setattr("jaxbl.sweeps.parts.pq.write_table", fill_disk)
         with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
             sweep(study(), tmp_path / "study")
-    assert {*files(tmp_path / "study")} == {"study.toml", "manifest.json"}
+    assert {*read_files(tmp_path / "study")} == {"study.toml", "manifest.json"}
     pd.testing.assert_frame_equal(sweep(study(), tmp_path / "study").frame, finished_study[1].frame)
 
 
@@ -359,7 +359,7 @@ def test_folder_with_other_files_stays_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="is not empty and holds no study"):
         sweep(study(), tmp_path, overwrite=True)
-    assert files(tmp_path) == {"thesis.tex": b"mine"}
+    assert read_files(tmp_path) == {"thesis.tex": b"mine"}
 
 
 def test_a_file_in_place_of_the_folder(tmp_path):
@@ -390,13 +390,13 @@ def test_folders_without_a_study_or_without_points(tmp_path, study_copy):
 
 
 def test_a_record_is_known_by_its_content(tmp_path):
-    def of(text, name="a.csv"):
+    def identity_of(text, name="a.csv"):
         (tmp_path / name).write_text(text)
         return identity(read_config(rigid_study(excitation={"kind": "recorded", "file": str(tmp_path / name)})))
 
-    first = of("t,u\n0,1\n1,2\n")
-    assert of("t,u\n0,1\n1,3\n") != first
-    assert of("t,u\n0,1.0\n1,2.0\n", "b.csv") == first
+    first = identity_of("t,u\n0,1\n1,2\n")
+    assert identity_of("t,u\n0,1\n1,3\n") != first
+    assert identity_of("t,u\n0,1.0\n1,2.0\n", "b.csv") == first
 
 
 def test_files_of_others_are_never_removed(tmp_path):
@@ -477,7 +477,7 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
 
 def test_a_study_in_an_object_store_is_read_alike(finished_study):
     address = UPath("memory://reading/study")
-    for name, content in files(finished_study[0]).items():
+    for name, content in read_files(finished_study[0]).items():
         (address / name).write_bytes(content)
     stored_study = open_study("memory://reading/study")
     pd.testing.assert_frame_equal(stored_study.frame, finished_study[1].frame)

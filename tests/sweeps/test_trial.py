@@ -139,10 +139,10 @@ def test_backends(monkeypatch):
     trials = [run(study, backend=backend) for backend in ("fused", "scan")]
     pd.testing.assert_frame_equal(trials[0].trace, trials[1].trace, rtol=1e-9)
 
-    def unsupported(*_):
+    def raise_unsupported(*_):
         raise Unsupported("a step of its own")
 
-    monkeypatch.setattr("jaxbl.fused.single_run.record_run", unsupported)
+    monkeypatch.setattr("jaxbl.fused.single_run.record_run", raise_unsupported)
     with pytest.raises(
         InputError, match=r"backend: the fused loop does not support a step of its own; use 'scan', or leave it out"
     ):

@@ -46,7 +46,7 @@ def _short_curve(curve, able, lanes, *remainder):
 
 
 @functools.cache
-def reference(lanes):
+def reference_metrics(lanes):
     return _reference_metrics(lanes, STEPS)
 
 
@@ -69,11 +69,11 @@ def test_figures_are_those_of_the_reference(name, precision, folder):
     assert set(figures) == set(METRIC_NAMES)
     assert all(len(values) == min(entry.lanes, 70) for values in figures.values())
     # which raises where they are not
-    _check_entry(entry, precision, figures, reference(min(entry.lanes, 70)))
+    _check_entry(entry, precision, figures, reference_metrics(min(entry.lanes, 70)))
 
 
 def test_a_wrong_result_is_not_timed():
-    true = reference(64)
+    true = reference_metrics(64)
     wrong = {name: 1.01 * values for name, values in true.items()}
     entry = Entry("someone", lambda workload: lambda: wrong, 64)
     with pytest.raises(NoResult, match=r"someone, float64: .* is off by 0.01"):
@@ -86,19 +86,19 @@ def test_a_wrong_result_is_not_timed():
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
     used, parts, thread_counts, curve = [], [], [], run._measure_curve
 
-    def only_ours(folder, count, devices):
+    def make_fused_entry(folder, count, devices):
         used.append(count)
         return [
             entry._replace(lanes=2**10) for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME
         ]
 
-    def few(able, lanes, *remainder):
+    def short_curve(able, lanes, *remainder):
         thread_counts.append(lanes)
         return curve(able, min(lanes, 128), *remainder)
 
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(run, "make_entries", only_ours)
-    monkeypatch.setattr(run, "_measure_curve", few)
+    monkeypatch.setattr(run, "make_entries", make_fused_entry)
+    monkeypatch.setattr(run, "_measure_curve", short_curve)
     result = run.bench(quick=True, progress=lambda done, total: parts.append((done, total)))
     assert set(used) == {result.machine["cores"]} == {count_cores()}
     assert parts[-1][0] == parts[-1][1]
@@ -109,19 +109,19 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
 
 
 def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
-    def wrong(workload):
+    def zero_metrics(workload):
         return lambda: {name: np.zeros(workload.lanes) for name in METRIC_NAMES}
 
-    def ours_and_a_wrong_one(folder, count, devices):
+    def make_right_and_wrong_entries(folder, count, devices):
         ours = next(entry for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME)
-        return [ours._replace(lanes=2**10), Entry(run.CPP_NAME, wrong, 2**10)]
+        return [ours._replace(lanes=2**10), Entry(run.CPP_NAME, zero_metrics, 2**10)]
 
     def compare(name, *_):
         if name == "gain_map":
             raise NoResult("gain_map: motor.velocity_rmse is off by 0.1 of it")
         return {"name": name, "lanes": 4, "seeds": 2, "steps": 10, "deviation": 0.0, "jaxbl": 1e8, "c++": 1e8}
 
-    monkeypatch.setattr(run, "make_entries", ours_and_a_wrong_one)
+    monkeypatch.setattr(run, "make_entries", make_right_and_wrong_entries)
     monkeypatch.setattr(run, "compare_study", compare)
     monkeypatch.setattr(run, "_measure_curve", functools.partial(_short_curve, run._measure_curve))
     monkeypatch.setattr("jax.config.update", lambda *_: None)

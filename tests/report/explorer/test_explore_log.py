@@ -18,7 +18,7 @@ ANGLE = 5.0 * np.sin(2.0 * TIME)
 RIPPLE = 0.1 * np.cos(3.0 * ANGLE)
 
 
-def trace():
+def make_trace():
     columns = {
         "t": TIME,
         "u": np.cos(TIME),
@@ -35,7 +35,7 @@ def trace():
     return frame
 
 
-def summary(unit="rad"):
+def make_summary(unit="rad"):
     units = {"theta_e": unit, "theta_s": "rad"}
     explained = {"speed": {"explained": 0.1}, "position": {"explained": 0.9}, "turn": {"explained": 0.2}}
     return {
@@ -45,7 +45,7 @@ def summary(unit="rad"):
 
 
 def test_columns_and_what_is_said_of_them(tmp_path):
-    log = write_log(summary(), trace(), tmp_path)
+    log = write_log(make_summary(), make_trace(), tmp_path)
     stored_table = pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert stored_table["t"].dtype == np.float64 and stored_table["u"].dtype == np.float32
     np.testing.assert_array_equal(stored_table["t"], TIME)
@@ -70,7 +70,7 @@ def test_columns_and_what_is_said_of_them(tmp_path):
 
 
 def test_a_linear_axis_has_forces_and_no_turns(tmp_path):
-    log = write_log(summary("m"), trace(), tmp_path)
+    log = write_log(make_summary("m"), make_trace(), tmp_path)
     units = {coordinate["column"]: coordinate["unit"] for coordinate in log["coordinates"]}
     assert units["theta_e"] == "m" and units["motor.velocity"] == "m/s" and units["u"] == "N"
     assert "motor.turn" not in units and log["groups"][0]["name"] == "motor: missing force"
@@ -90,9 +90,9 @@ def test_an_identification_and_an_element(tmp_path):
         write_log(result, frame.loc[:, ["t", "u"]], tmp_path)
 
 
-def stored(folder):
+def write_identification(folder):
     """A folder as `jaxbl identify` leaves it."""
-    trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
+    make_trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
     (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
     result = {
         "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
@@ -107,7 +107,7 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
     assert log_source(tmp_path) is None
     with pytest.raises(InputError, match="holds no study"):
         study_source(tmp_path)
-    stored(tmp_path)
+    write_identification(tmp_path)
     (tmp_path / "trace.parquet").write_bytes(b"no table")
     source = log_source(tmp_path)
     assert source is not None
@@ -118,28 +118,29 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
 @needs_chromium
 def test_lines_coordinates_and_moments(tmp_path):
     output = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
-    write_page(tmp_path, ("log",), write_log(summary(), trace(), tmp_path) | output)
+    write_page(tmp_path, ("log",), write_log(make_summary(), make_trace(), tmp_path) | output)
     with open_pages(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
         assert page.locator("#overhead").inner_text().startswith("Over motor position θe, and over")
 
-        def sizes():
+        def read_sizes():
             rows = (row.split("\t") for row in page.locator("#sizes tbody tr").all_inner_texts())
             return {name: [float(number) for number in values] for name, *values in rows}
 
         # the moving average leaves what is slow, and takes the fast part away
         ripple = [np.sqrt(np.mean(part**2)) for part in (RIPPLE[100:3000], RIPPLE[3000:])]
         assert (
-            sizes()["model as given"] == pytest.approx(ripple, rel=0.05) and max(sizes()["with the missing effects"]) < 2e-3
+            read_sizes()["model as given"] == pytest.approx(ripple, rel=0.05)
+            and max(read_sizes()["with the missing effects"]) < 2e-3
         )
         page.select_option("#cutoff", "none")
         page.locator("#sizes td:text-is('0.01')").first.wait_for()
-        assert sizes()["model as given"] == pytest.approx(ripple, rel=1e-3)
+        assert read_sizes()["model as given"] == pytest.approx(ripple, rel=1e-3)
         # with one effect less: another line, another map
         page.locator("#lines input").nth(2).check()
         page.wait_for_selector("#over2 figure:nth-child(3)")
-        assert sizes()[f"with the missing effects, without {HOSTILE}"][0] == pytest.approx(
+        assert read_sizes()[f"with the missing effects, without {HOSTILE}"][0] == pytest.approx(
             np.sqrt(np.mean((RIPPLE[100:3000] + 0.02) ** 2)), rel=1e-3
         )
         # the mean in a cell of position and speed is the ripple at that position

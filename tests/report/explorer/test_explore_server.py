@@ -13,102 +13,102 @@ from jaxbl.report.explorer.folder import Source
 from jaxbl.report.explorer.server import served
 
 
-def write(out: Path, served: bool) -> bool:
+def write_page(out: Path, served: bool) -> bool:
     (out / "index.html").write_text("<p>page</p>")
     (out / "points.parquet").write_bytes(bytes(range(100)))
     return False
 
 
-def ask(asked):
-    if asked == {"at": 2}:
+def answer(question):
+    if question == {"at": 2}:
         raise RuntimeError("out of memory")
-    if asked != {"at": 1}:
+    if question != {"at": 1}:
         raise InputError("at: should be 1")
     return {"value": 2.0}
 
 
 @pytest.fixture
 def server():
-    with served(Source("", [], write, {"run": ask}, lambda: None, lambda: None)) as explorer:
+    with served(Source("", [], write_page, {"run": answer}, lambda: None, lambda: None)) as explorer:
         threading.Thread(target=explorer.serve_forever, daemon=True).start()
         yield explorer
         explorer.shutdown()
 
 
-def call(server, path, method="GET", body=None, **headers):
+def request_path(server, path, method="GET", body=None, **headers):
     """Status, headers and content of an answer; `path` behind the token, or whole from "/"."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port)
     token = server.url.split("/")[3]
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path if path.startswith("/") else f"/{token}/{path}", body, named)
-    answer = connection.getresponse()
-    result = answer.status, answer.headers, answer.read()
+    http_headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path if path.startswith("/") else f"/{token}/{path}", body, http_headers)
+    response = connection.getresponse()
+    reply = response.status, response.headers, response.read()
     connection.close()
-    return result
+    return reply
 
 
 def test_the_page_and_parts_of_its_files(server):
-    status, headers, _ = call(server, "")
+    status, headers, _ = request_path(server, "")
     assert status == 302 and headers["Location"] == f"{server.url}1/index.html"
-    status, headers, content = call(server, "1/index.html")
+    status, headers, content = request_path(server, "1/index.html")
     assert (status, headers["Content-Type"], content) == (200, "text/html", b"<p>page</p>")
     assert "script-src 'self'" in headers["Content-Security-Policy"] and headers["Referrer-Policy"] == "no-referrer"
-    status, headers, content = call(server, "1/points.parquet", Range="bytes=10-19")
+    status, headers, content = request_path(server, "1/points.parquet", Range="bytes=10-19")
     assert (status, headers["Content-Range"], content) == (206, "bytes 10-19/100", bytes(range(10, 20)))
-    assert call(server, "1/points.parquet", Range="bytes=90-900")[2] == bytes(range(90, 100))
-    assert call(server, "1/points.parquet", Range="bytes=100-120")[0] == 416
-    assert len(call(server, "1/points.parquet")[2]) == 100
+    assert request_path(server, "1/points.parquet", Range="bytes=90-900")[2] == bytes(range(90, 100))
+    assert request_path(server, "1/points.parquet", Range="bytes=100-120")[0] == 416
+    assert len(request_path(server, "1/points.parquet")[2]) == 100
 
 
 @pytest.mark.parametrize(
     "path", ["1/../server.py", "1/%2e%2e/x", "2/index.html", "1/", "1", "x/index.html", "1/points.parquet/x"]
 )
 def test_nothing_else_is_read(server, path):
-    call(server, "")
-    assert call(server, path)[0] == 404
+    request_path(server, "")
+    assert request_path(server, path)[0] == 404
 
 
 def test_only_this_machine_with_the_token(server):
     assert server.server_address[0] == "127.0.0.1"
-    call(server, "")
+    request_path(server, "")
     address = f"127.0.0.1:{server.server_port}"
     for path in ("/", "/1/index.html", "/wrong/1/index.html", "/%ff/"):
-        status, _, content = call(server, path)
+        status, _, content = request_path(server, path)
         assert status == 403 and json.loads(content) == {"error": "open the address that jaxbl explore printed"}
-    assert call(server, "1/index.html", Host="evil.example")[0] == 403
-    assert call(server, "1/index.html", Origin="http://evil.example")[0] == 403
-    assert call(server, "1/index.html", Origin="null")[0] == 403
-    assert call(server, "1/index.html", Origin=f"https://{address}")[0] == 403
-    assert call(server, "1/index.html", Origin=f"http://{address}")[0] == 200
+    assert request_path(server, "1/index.html", Host="evil.example")[0] == 403
+    assert request_path(server, "1/index.html", Origin="http://evil.example")[0] == 403
+    assert request_path(server, "1/index.html", Origin="null")[0] == 403
+    assert request_path(server, "1/index.html", Origin=f"https://{address}")[0] == 403
+    assert request_path(server, "1/index.html", Origin=f"http://{address}")[0] == 200
 
 
 def test_questions(server):
     kind = {"Content_Type": "application/json"}
-    assert call(server, "1/run", "POST", '{"at": 1}', **kind)[::2] == (200, b'{"value": 2.0}')
+    assert request_path(server, "1/run", "POST", '{"at": 1}', **kind)[::2] == (200, b'{"value": 2.0}')
     for body, reason in (
         ('{"at": 3}', "at: should be 1"),
         ("{", "Expecting property name"),
         (b"\xff", "codec can't decode"),
     ):
-        status, _, content = call(server, "1/run", "POST", body, **kind)
+        status, _, content = request_path(server, "1/run", "POST", body, **kind)
         assert status == 400 and reason in json.loads(content)["error"]
-    status, _, content = call(server, "1/run", "POST", '{"at": 2}', **kind)
+    status, _, content = request_path(server, "1/run", "POST", '{"at": 2}', **kind)
     assert status == 500 and json.loads(content) == {"error": "RuntimeError: out of memory"}
-    assert call(server, "1/run", "POST", '{"at": 1}')[0] == 404
-    assert call(server, "1/other", "POST", '{"at": 1}', **kind)[0] == 404
-    assert call(server, "1/run", "POST", "[" * 70_000, **kind)[0] == 413
-    assert call(server, "1/run", "POST", '{"at": 1}', Origin="http://evil.example", **kind)[0] == 403
+    assert request_path(server, "1/run", "POST", '{"at": 1}')[0] == 404
+    assert request_path(server, "1/other", "POST", '{"at": 1}', **kind)[0] == 404
+    assert request_path(server, "1/run", "POST", "[" * 70_000, **kind)[0] == 413
+    assert request_path(server, "1/run", "POST", '{"at": 1}', Origin="http://evil.example", **kind)[0] == 403
 
 
 def test_what_no_browser_asks_is_refused_without_a_traceback(server, capfd):
-    call(server, "")
+    request_path(server, "")
     kind = {"Content_Type": "application/json"}
-    assert call(server, "1/run", "POST", "[" * 60_000, **kind)[0] == 400
-    assert call(server, "1/run", "POST", "", Content_Length="9" * 5000, **kind)[0] == 413
-    assert call(server, "1/points.parquet", Range=f"bytes=0-{'9' * 5000}")[0] == 200
-    assert call(server, f"{'1' * 5000}/index.html")[0] == 404
-    assert call(server, "/" + "x" * 70_000)[0] == 414
-    assert call(server, "1/index.html", "HEAD")[0] == call(server, "1/index.html", "OPTIONS")[0] == 501
+    assert request_path(server, "1/run", "POST", "[" * 60_000, **kind)[0] == 400
+    assert request_path(server, "1/run", "POST", "", Content_Length="9" * 5000, **kind)[0] == 413
+    assert request_path(server, "1/points.parquet", Range=f"bytes=0-{'9' * 5000}")[0] == 200
+    assert request_path(server, f"{'1' * 5000}/index.html")[0] == 404
+    assert request_path(server, "/" + "x" * 70_000)[0] == 414
+    assert request_path(server, "1/index.html", "HEAD")[0] == request_path(server, "1/index.html", "OPTIONS")[0] == 501
     assert capfd.readouterr().err == ""
 
 
@@ -141,16 +141,16 @@ def test_a_page_loaded_again_is_the_newest():
 
     with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        assert call(server, "")[1]["Location"] == f"{server.url}1/index.html"
-        assert call(server, "1/index.html")[2] == b"3"
+        assert request_path(server, "")[1]["Location"] == f"{server.url}1/index.html"
+        assert request_path(server, "1/index.html")[2] == b"3"
         # by the browser's button, which asks for this version
-        status, headers, _ = call(server, "1/index.html")
+        status, headers, _ = request_path(server, "1/index.html")
         assert (status, headers["Location"]) == (302, f"{server.url}2/index.html")
-        assert call(server, "2/index.html")[2] == b"2"
-        assert call(server, "2/index.html")[1]["Location"] == f"{server.url}3/index.html"
+        assert request_path(server, "2/index.html")[2] == b"2"
+        assert request_path(server, "2/index.html")[1]["Location"] == f"{server.url}3/index.html"
         # nothing is to come: it stays
-        assert call(server, "3/index.html")[2] == call(server, "3/index.html")[2] == b"1"
-        assert call(server, "1/index.html")[1]["Location"] == f"{server.url}3/index.html"
+        assert request_path(server, "3/index.html")[2] == request_path(server, "3/index.html")[2] == b"1"
+        assert request_path(server, "1/index.html")[1]["Location"] == f"{server.url}3/index.html"
         server.shutdown()
 
 
@@ -166,14 +166,14 @@ def test_results_that_cannot_be_read_are_told_and_read_later():
     with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         for name in ("study.toml: is missing", "no space left"):
-            status, _, content = call(server, "")
+            status, _, content = request_path(server, "")
             assert (status, json.loads(content)) == (503, {"error": name})
-        assert call(server, "")[0] == 302
+        assert request_path(server, "")[0] == 302
         server.shutdown()
 
 
 def test_a_port_of_another_program(server):
-    source = Source("", [], write, {}, lambda: None, lambda: None)
+    source = Source("", [], write_page, {}, lambda: None, lambda: None)
     with (
         pytest.raises(InputError, match=f"--port {server.server_port}: .*; choose another one"),
         served(source, server.server_port),

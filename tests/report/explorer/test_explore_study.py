@@ -26,16 +26,16 @@ HOSTILE = "</script><script>alert(1)</script> <b>a</b> \u202e"
 AXES = [listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 2.0, 50.0, 6), spaced_axis(LAMBDA, 1.0, 20.0, 5)]
 
 
-def product(frame):
+def product_error(frame):
     return frame[ALPHA] * frame[LAMBDA] * (1.0 + 1e3 * frame[NOISE]) + 0.1 * frame["seed"]
 
 
-def study(**columns):
+def make_study_result(**columns):
     data = rigid_study({"title": HOSTILE}, axes=AXES, sweep={"seeds": 3})
-    return make_result(data, motor__velocity_rmse=product, motor__f_plus=lambda frame: 1.0, **columns)
+    return make_result(data, motor__velocity_rmse=product_error, motor__f_plus=lambda frame: 1.0, **columns)
 
 
-def source(result, lead=()):
+def make_source(result, lead=()):
     return Source(
         result.config.title,
         lead,
@@ -51,9 +51,9 @@ def read_data(folder):
 
 
 def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
-    result = study(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
+    result = make_study_result(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
     shuffled = result.frame.sample(frac=1.0, random_state=0).iloc[5:]
-    write_static(source(result.__class__(result.config, shuffled), ["found"]), tmp_path / "out")
+    write_static(make_source(result.__class__(result.config, shuffled), ["found"]), tmp_path / "out")
     data, table = read_data(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
     assert (data["rows"], data["found"], data["title"]) == (180, 175, HOSTILE)
     paths = [path["path"] for axis in data["axes"] for path in axis["paths"]]
@@ -70,7 +70,7 @@ def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
 def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
     columns = {"motor__stiffness_error": lambda frame: -2.0, "finite": lambda frame: frame["seed"] != 1}
     result = make_result(small_study(axes=AXES, sweep={"seeds": 3}), **columns)
-    write_static(source(result, []), tmp_path)
+    write_static(make_source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
     stiffness_error = table["motor.stiffness_error"]
     assert stiffness_error.isna().mean() == pytest.approx(1.0 / 3.0) and set(stiffness_error.dropna()) == {2.0}
@@ -82,8 +82,8 @@ def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
 def test_zipped_axes_are_one(tmp_path):
     axes = [spaced_axis(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
             {"path": NOISE, "values": [1e-5, 1e-4, 1e-4], "zip": "pair"}]  # fmt: skip
-    result = make_result(rigid_study(axes=axes), motor__velocity_rmse=product)
-    write_static(source(result, []), tmp_path)
+    result = make_result(rigid_study(axes=axes), motor__velocity_rmse=product_error)
+    write_static(make_source(result, []), tmp_path)
     table = pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert len(table) == 9 and [len(axis["paths"]) for axis in read_data(tmp_path)["axes"]] == [1, 2, 1]
     np.testing.assert_allclose(table["motor.velocity_rmse"], result.frame["motor.velocity_rmse"], rtol=1e-6)
@@ -93,14 +93,14 @@ def test_folders_of_others_are_refused(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
     with pytest.raises(InputError, match="mine: is not empty, and was not written by jaxbl explore"):
-        write_static(source(study(), []), tmp_path / "mine")
+        write_static(make_source(make_study_result(), []), tmp_path / "mine")
     assert (tmp_path / "mine" / "index.html").read_text() == "mine"
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file: is a file; --static should name a folder"):
-        write_static(source(study()), tmp_path / "file")
+        write_static(make_source(make_study_result()), tmp_path / "file")
     for _ in range(2):
-        write_static(source(study(), []), tmp_path / "again")
-    other = source(study())._replace(identity="another study")
+        write_static(make_source(make_study_result(), []), tmp_path / "again")
+    other = make_source(make_study_result())._replace(identity="another study")
     with pytest.raises(InputError, match="again: holds the page of other results; choose another folder, or remove it"):
         write_static(other, tmp_path / "again")
 
@@ -112,8 +112,8 @@ def read_pointer_values(values):
 
 @needs_chromium
 def test_values_regions_cuts_and_a_point_as_config(tmp_path):
-    result = study(motor__converged=lambda frame: frame["seed"] > 0)
-    page_file = write_static(source(result, [HOSTILE]), tmp_path / "out")
+    result = make_study_result(motor__converged=lambda frame: frame["seed"] > 0)
+    page_file = write_static(make_source(result, [HOSTILE]), tmp_path / "out")
     with open_pages(page_file, color_scheme="dark") as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
@@ -200,7 +200,7 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
     effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
     columns = {"motor__velocity_rmse": lambda frame: frame[ALPHA] - 10.0, "motor__f_plus": lambda frame: 1.0}
     result = make_result(rigid_study(axes=axes, effects=effects), **columns)
-    with open_pages(write_static(source(result), tmp_path / "out")) as (page,):
+    with open_pages(write_static(make_source(result), tmp_path / "out")) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # from the least to the largest, which no logarithm shows
         assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
@@ -392,7 +392,7 @@ def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
     result = make_result(
         rigid_study(axes=[spaced_axis(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: 2.0 * frame[ALPHA]
     )
-    page_file = write_static(source(result), tmp_path / "out")
+    page_file = write_static(make_source(result), tmp_path / "out")
     with open_pages(page_file) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} motor.velocity_rmse']")
         page.select_option("#log", "false")
