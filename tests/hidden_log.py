@@ -74,7 +74,10 @@ def select_samples(log: Log, rows: Any) -> Log:
 
 
 def simulate_study(study: dict[str, Any], seed: int = 1) -> pd.DataFrame:
-    """Simulate a study's drive under its multisine: readings as in the package's trace, true velocities and torque."""
+    """Simulate a study's drive under its multisine: readings as in the package's trace, true velocities and torque.
+
+    The multisine and the torque of the dead zone are written out here, so that a log shares nothing with the package.
+    """
     drive, law, settings, excitation = study["drive"], study.get("transmission"), study["run"], study["excitation"]
     period, harmonics = settings.get("sample_period", 1e-3), np.arange(1, 9)
     t = period * np.arange(round(settings["duration"] / period))

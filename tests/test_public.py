@@ -123,8 +123,8 @@ def test_the_import_check_sees_imports():
 def globals_of(code):
     """Names that functions take from their module."""
     yield from (instruction.argval for instruction in dis.get_instructions(code) if instruction.opname == "LOAD_GLOBAL")
-    for inner in filter(inspect.iscode, code.co_consts):
-        yield from globals_of(inner)
+    for constant in filter(inspect.iscode, code.co_consts):
+        yield from globals_of(constant)
 
 
 def test_every_name_is_defined():

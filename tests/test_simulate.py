@@ -65,12 +65,12 @@ def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
 
 @pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
 def test_matched_regressor_beats_none_in_the_dead_zone(discretisation):
-    matched, none = (
+    matched, without = (
         identification_errors(scan_metrics(paper_experiment(discretisation, time_constant=0.02, regressor_filter=kind)))
         for kind in ("matched", "none")
     )
-    for ours, papers in zip(matched["dead_zone_error"], none["dead_zone_error"], strict=True):
-        assert 5.0 * ours < papers
+    for matched_error, paper_error in zip(matched["dead_zone_error"], without["dead_zone_error"], strict=True):
+        assert 5.0 * matched_error < paper_error
 
 
 def simulate_independently(experiment, noise, steps):

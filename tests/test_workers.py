@@ -102,12 +102,12 @@ def test_programs_are_forgotten_once_they_are_many(monkeypatch):
 
 
 def test_what_is_being_done_is_heard_while_someone_listens():
-    heard = []
+    announcements = []
     announce("before")
-    with subscribe(heard.append):
+    with subscribe(announcements.append):
         announce("trying load.gravity")
     announce("afterwards")
-    assert heard == ["trying load.gravity"]
+    assert announcements == ["trying load.gravity"]
 
 
 @pytest.fixture

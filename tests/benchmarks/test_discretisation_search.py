@@ -53,19 +53,19 @@ def test_schemes_without_noise(order):
     h, lipschitz = 0.02, 2.0 ** (order + 1)
     t = h * np.arange(1500)
     unit = h**order * lipschitz
-    bias, remainder = {}, {}
+    bias, chatter = {}, {}
     for name, scheme in audit.SCHEMES.items():
         y = 0.5 * t**2 if order >= 2 else t
         start = [0.0, 0.0 if order >= 2 else 1.0, 1.0, *[0.0] * 3][: order + 1]
         velocity = t if order >= 2 else 0.0 * t + 1.0
         late_velocity = audit.late_velocity(scheme, order, lipschitz, h, y, start)
         bias[name] = np.abs(late_velocity - velocity[-late_velocity.size :]).max()
-        still = audit.late_velocity(scheme, order, lipschitz, h, 0.0 * t, [1e-3, *[0.0] * order])
-        remainder[name] = np.abs(np.diff(still)).max()
+        estimates_at_rest = audit.late_velocity(scheme, order, lipschitz, h, 0.0 * t, [1e-3, *[0.0] * order])
+        chatter[name] = np.abs(np.diff(estimates_at_rest)).max()
     rounding = 2**order * np.finfo(float).eps * 450.0 / h
-    first, alone, own_states, exact = audit.SCHEMES
+    first, correction_alone, own_states, exact = audit.SCHEMES
     assert bias[exact] <= 4.0 * rounding
-    assert remainder[exact] <= 1e-12 * unit
+    assert chatter[exact] <= 1e-12 * unit
     assert bias[own_states] == pytest.approx(0.5 * h if order >= 2 else 0.0, abs=4.0 * rounding)
-    assert remainder[own_states] <= 1e-12 * unit
-    assert min(remainder[first], remainder[alone]) > 0.1 * unit
+    assert chatter[own_states] <= 1e-12 * unit
+    assert min(chatter[first], chatter[correction_alone]) > 0.1 * unit

@@ -40,8 +40,8 @@ def test_runs_are_those_of_the_fit(log, from_rest):
     assert actual.residual.shape == (8, 250, 2)
     assert np.sqrt(np.mean(np.square(expected))) > 1.5
     assert actual.residual == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
-    for have, want in zip(jax.tree.leaves(actual.states), jax.tree.leaves(start), strict=True):
-        assert have[:, 0] == pytest.approx(np.asarray(want), rel=1e-4, abs=1e-6)
+    for actual_start, expected_start in zip(jax.tree.leaves(actual.states), jax.tree.leaves(start), strict=True):
+        assert actual_start[:, 0] == pytest.approx(np.asarray(expected_start), rel=1e-4, abs=1e-6)
 
 
 def test_torques_may_be_added_sample_by_sample(log):

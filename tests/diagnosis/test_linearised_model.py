@@ -198,25 +198,27 @@ def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
     variants = variants_of(first.experiment, names, lambda name: LOG)
     columns_of(variants, first.signals[0])
     model = linearise(2, theta=0.1)
-    (signals,), selected = model.signals, first.signals[0].shared
-    assert len(selected) > 100
-    shared = MotionTorques(model.experiment, model.parts[0], selected)
-    for variant, together, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
-        assert together.keys() == alone.keys()
-        for point, torque in alone.items():
+    (signals,), shared_part = model.signals, first.signals[0].shared
+    assert len(shared_part) > 100
+    shared = MotionTorques(model.experiment, model.parts[0], shared_part)
+    for variant, shared_torques, own_torques in zip(
+        variants, columns_of(variants, shared), columns_of(variants, signals), strict=True
+    ):
+        assert shared_torques.keys() == own_torques.keys()
+        for point, torque in own_torques.items():
             np.testing.assert_allclose(
-                together[point], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=variant.name
+                shared_torques[point], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=variant.name
             )
 
 
 def test_a_candidate_may_act_in_one_part_only():
     model = linearise(1, idle=1)
     variants = variants_of(model.experiment, ["actuator.gain_error"], model.scales)
-    acting, idle = model.choose(variants).coefficients
-    assert np.isfinite(acting).all()
-    assert len(acting) == len(idle)
+    driven_part, idle_part = model.choose(variants).coefficients
+    assert np.isfinite(driven_part).all()
+    assert len(driven_part) == len(idle_part)
     # one gain for both parts
-    np.testing.assert_array_equal(acting[: -model.states], idle[: -model.states])
+    np.testing.assert_array_equal(driven_part[: -model.states], idle_part[: -model.states])
 
 
 @pytest.mark.parametrize("growth", [0.0, 5.0, 10.0, 15.0, 20.0, 25.0])
@@ -226,10 +228,10 @@ def test_what_rounding_takes_is_known(growth):
     rng = np.random.default_rng(5)
     time = np.linspace(0.0, 1.0, count)[:, None]
     # what grows is one motion, which all states take part in
-    mixed = np.exp(growth * time) * rng.standard_normal(states) + rng.standard_normal((count, states))
-    columns = np.concatenate([rng.standard_normal((count, 3)) + np.exp(growth * time), mixed], axis=1)
+    state_columns = np.exp(growth * time) * rng.standard_normal(states) + rng.standard_normal((count, states))
+    columns = np.concatenate([rng.standard_normal((count, 3)) + np.exp(growth * time), state_columns], axis=1)
     gram = columns.T @ columns
-    basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
+    basis = np.linalg.qr(state_columns / np.linalg.norm(state_columns, axis=0))[0]
     remainder = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
     true = float(remainder[:, 0] @ remainder[:, 0])
     error, loss_estimate = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]

@@ -27,14 +27,14 @@ POLE = 0.9
 
 def make_coordinates(**more):
     crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
-    near = np.zeros(COUNT, int)
+    reversal_class = np.zeros(COUNT, int)
     for row in crossing:
-        near[max(row - 12, 0) : row + 12] = 1 if VELOCITY[row + 1] > 0.0 else 2
+        reversal_class[max(row - 12, 0) : row + 12] = 1 if VELOCITY[row + 1] > 0.0 else 2
     values = {
         "all": CoordinateValues(np.zeros(COUNT, int), classes=("everywhere",)),
         "direction": CoordinateValues((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
         "reversals": CoordinateValues(
-            near, classes=("away from reversals", "reversals to forward", "reversals to backward")
+            reversal_class, classes=("away from reversals", "reversals to forward", "reversals to backward")
         ),
         "|speed|": CoordinateValues(np.abs(VELOCITY), "rad/s", symbol="|ω|"),
         "speed": CoordinateValues(VELOCITY, "rad/s", symbol="ω"),

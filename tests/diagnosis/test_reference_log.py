@@ -28,14 +28,14 @@ def log(tmp_path_factory):
 def test_smoothing_leaves_torque_where_friction_jumps_and_little_elsewhere(log):
     with jax.enable_x64(True):
         model = as_arrays(prepare(read_config(STUDY)), float)
-        held = ReferenceLog(segments_of(log, model.sides), {"motor": 25.0, "load": 25.0})
-        dry = held.rounding(model)
-        smooth = held.rounding(set_leaves(model, {"effects.load.coulomb_friction.torque": np.asarray(0.0)}))
-        actual = held.with_slow(held.compare(model))
+        reference_log = ReferenceLog(segments_of(log, model.sides), {"motor": 25.0, "load": 25.0})
+        dry = reference_log.rounding(model)
+        smooth = reference_log.rounding(set_leaves(model, {"effects.load.coulomb_friction.torque": np.asarray(0.0)}))
+        actual = reference_log.with_slow(reference_log.compare(model))
     assert dry.keys() >= {"torque_motor", "torque_load"}
     assert dry["torque_load"] > 3.0 * smooth["torque_load"]
     # it is in what the true model leaves
     assert dry["torque_load"] < 1.5 * actual["torque_load"]
     with jax.enable_x64(True):
         bending = as_arrays(make_effect("load.presliding_friction", torque=1.0, length=0.01), float)
-        assert held.rounding(with_effects(model, (bending,))) == {}
+        assert reference_log.rounding(with_effects(model, (bending,))) == {}

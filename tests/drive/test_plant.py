@@ -17,9 +17,11 @@ FREE = PAPER | {"motor_viscous": 0.0, "load_viscous": 0.0}
 
 @pytest.mark.parametrize("law", LAWS)
 def test_second_order_against_scipy(law):
-    ours, theirs = LAWS[law]
-    expected = integrate_reference(theirs)
-    coarse, fine = (np.abs(simulate_plant(make_plant(law=ours), substeps) - expected).max() for substeps in (64, 1024))
+    package_law, numpy_law = LAWS[law]
+    expected = integrate_reference(numpy_law)
+    coarse, fine = (
+        np.abs(simulate_plant(make_plant(law=package_law), substeps) - expected).max() for substeps in (64, 1024)
+    )
     # the hard gap is only piecewise smooth: of second order in the mean
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.1 if law == "dead_zone" else 5e-3)
     assert fine < 1e-6

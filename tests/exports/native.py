@@ -72,10 +72,10 @@ class Native:
     def run(self, inputs):
         """Outputs (samples, outputs) of inputs (samples, inputs)."""
         inputs = np.ascontiguousarray(inputs, self.dtype)
-        out = np.empty((len(inputs), len(self.summary["outputs"])), self.dtype)
-        places = (array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, out))
-        self._library.go(ctypes.byref(self.state), ctypes.c_long(len(inputs)), *places)
-        return out
+        outputs = np.empty((len(inputs), len(self.summary["outputs"])), self.dtype)
+        pointers = (array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, outputs))
+        self._library.go(ctypes.byref(self.state), ctypes.c_long(len(inputs)), *pointers)
+        return outputs
 
 
 def draw_samples(count, sides, period=1e-3, seed=0):

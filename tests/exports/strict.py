@@ -21,8 +21,8 @@ def _square_root(x):
     return math.sqrt(x) if x >= 0.0 else math.nan
 
 
-def _cast_bits(value, old, new):
-    return struct.unpack(f"<{_CODES[new]}", struct.pack(f"<{_CODES[old]}", value))[0]
+def _cast_bits(value, from_type, to_type):
+    return struct.unpack(f"<{_CODES[to_type]}", struct.pack(f"<{_CODES[from_type]}", value))[0]
 
 
 def _round_to_nearest(x):
@@ -49,19 +49,19 @@ class Strict:
         leaves = self._step(*state, *inputs)
         return list(leaves[: self._count]), list(leaves[self._count :])
 
-    def _compile(self, closed, fixed):
-        """Return a function of the first `fixed` numbers, which gives that of the rest."""
-        names = [f"a{i}" for i in range(len(closed.jaxpr.invars))]
+    def _compile(self, closed_jaxpr, fixed_count):
+        """Return a function of the first `fixed_count` numbers, which gives that of the rest."""
+        names = [f"a{i}" for i in range(len(closed_jaxpr.jaxpr.invars))]
         self._within = False
         self._lines, self._number, self._constants = ([], []), 0, {}
-        results = self._write(closed, [(name, i >= fixed) for i, name in enumerate(names)], "    ")
-        outer, inner = self._lines
+        results = self._write(closed_jaxpr, [(name, i >= fixed_count) for i, name in enumerate(names)], "    ")
+        fixed_lines, varying_lines = self._lines
         text = "\n".join(
             [
-                f"def make({', '.join(names[:fixed])}):",
-                *outer,
-                f"    def run({', '.join(names[fixed:])}):",
-                *(f"    {line}" for line in inner),
+                f"def make({', '.join(names[:fixed_count])}):",
+                *fixed_lines,
+                f"    def run({', '.join(names[fixed_count:])}):",
+                *(f"    {line}" for line in varying_lines),
                 f"        return ({', '.join(name for name, _ in results)},)",
                 "    return run",
             ]
@@ -78,11 +78,11 @@ class Strict:
             return name
         return repr(np.asarray(value).item())
 
-    def _write(self, closed, operands, indent):
+    def _write(self, closed_jaxpr, operands, indent):
         """Write lines for a jaxpr. Values are names, and True if they depend on more than fixed numbers."""
-        jaxpr = closed.jaxpr
+        jaxpr = closed_jaxpr.jaxpr
         env = dict(zip(jaxpr.invars, operands, strict=True))
-        for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
+        for v, value in zip(jaxpr.constvars, closed_jaxpr.consts, strict=True):
             env[v] = self._constant(np.asarray(value)[()], np.dtype(v.aval.dtype)), False
 
         def read(v):
@@ -129,10 +129,10 @@ class Strict:
         self._put(varies, f"{out} = {self._expression(eqn, name, dtype, texts)}", indent)
         return [(out, varies)]
 
-    def _body(self, closed, operands, varies, indent):
+    def _body(self, closed_jaxpr, operands, varies, indent):
         """Write the lines of a loop or a choice: if it varies, all of them stay in it."""
         before, self._within = self._within, self._within or varies
-        results = self._write(closed, operands, f"{indent}    ")
+        results = self._write(closed_jaxpr, operands, f"{indent}    ")
         self._within = before
         return results
 

@@ -333,21 +333,21 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
         instance.restore(stored_state)
         assert (instance.run(torques[30:], 30) == first).all()
         # what the other one did changed nothing here
-        pair = []
+        alternating_rows = []
         instance.restore(stored_state)
         for i, torque in enumerate(torques[30:], 30):
-            pair.append(instance.run([torque], i)[0])
+            alternating_rows.append(instance.run([torque], i)[0])
             second.run([-torque], i - 30)
-        assert (np.array(pair) == first).all()
+        assert (np.array(alternating_rows) == first).all()
         bytes_of = instance.bytes_of(stored_state)
-        there = second.state_of(bytes_of)
-        second.restore(there)
+        restored = second.state_of(bytes_of)
+        second.restore(restored)
         assert (second.run(torques[30:], 30) == first).all()
         for other in (bytes_of[:-1], bytes_of + b"x", b"x" + bytes_of[1:]):
             with pytest.raises(FMICallException):
                 second.state_of(other)
         assert second.said[-1] == f"these {len(bytes_of)} bytes are no state of this model"
-        instance.release(stored_state), second.release(there)
+        instance.release(stored_state), second.release(restored)
 
 
 @COMPILED

@@ -142,16 +142,16 @@ def test_every_part_is_listed_with_its_path(tmp_path):
     ]
     config = study(*effects, title="rough -- new")
     export = jaxbl.export(config, tmp_path / "out", "mjcf")
-    content = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert export.summary.items() <= content.items()
+    export_json = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert export.summary.items() <= export_json.items()
     model_text, step, notes = write_mjcf(config)
-    groups = {fidelity: set(content[fidelity]) for fidelity in ("exactly", "approximated", "not said")}
+    groups = {fidelity: set(export_json[fidelity]) for fidelity in ("exactly", "approximated", "not said")}
     assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
     assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
     missing = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
     assert groups["not said"] == missing
     assert set(notes) == set().union(*groups.values())
-    assert content["time_step"] == step
+    assert export_json["time_step"] == step
     text = (export.folder / "model.xml").read_text(encoding="utf-8")
     assert text == model_text
     assert "drive.motor_inertia = 0.05 kg m²" in text

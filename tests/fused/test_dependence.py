@@ -43,9 +43,11 @@ def test_parts_make_the_whole(split_step):
         carry = step(values, carry, inputs)
         state, handed = shared(state, inputs)
         lane_leaves = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *lane_leaves, *handed)
-    result = iter(lane_leaves), iter(state)
-    together = tree.unflatten([next(result[0] if kind == Dependence.LANE else result[1]) for kind in kinds])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
+    leaf_iterators = iter(lane_leaves), iter(state)
+    joined_carry = tree.unflatten(
+        [next(leaf_iterators[0] if kind == Dependence.LANE else leaf_iterators[1]) for kind in kinds]
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), joined_carry, carry)
 
 
 def test_the_lanes_part_leaves_the_shared_work_to_the_other(split_step):
@@ -68,11 +70,16 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
     assert parts.is_stateless == [True, False, True, False]
     # neither the table nor a sine is left to the loop
     assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}
-    direct, read = jax.vmap(parts.compute_stateless)(inputs)
+    stateless_outputs, loop_inputs = jax.vmap(parts.compute_stateless)(inputs)
     last, handed = jax.lax.scan(sample, state, inputs)
     for i in range(9):
-        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(column[i] for column in read))
-        state, ways = new[:2], {True: iter(column[i] for column in direct), False: iter(new[2:])}
-        for alone, full in zip(parts.is_stateless, handed, strict=True):
-            np.testing.assert_allclose(next(ways[alone]), full[i], rtol=1e-6)
+        step_outputs = jax.core.eval_jaxpr(
+            parts.step.jaxpr, parts.step.consts, *state, *(column[i] for column in loop_inputs)
+        )
+        state, outputs = (
+            step_outputs[:2],
+            {True: iter(column[i] for column in stateless_outputs), False: iter(step_outputs[2:])},
+        )
+        for is_stateless, output in zip(parts.is_stateless, handed, strict=True):
+            np.testing.assert_allclose(next(outputs[is_stateless]), output[i], rtol=1e-6)
     np.testing.assert_allclose(state, last, rtol=1e-6)

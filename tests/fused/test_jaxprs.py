@@ -34,8 +34,8 @@ def test_products_are_joined_with_sums():
     closed = trace_inlined(function, *inputs)
     result = jaxpr_as_fun(join_multiply_add(closed, multiply_add))(*inputs)
     np.testing.assert_allclose(result, function(*inputs), rtol=1e-14)
-    plain, turned, remainder = (False, False), (True, False), (False, True)
-    assert calls == [plain, turned, remainder, plain, plain]
+    plain, negative_product, negative_sum = (False, False), (True, False), (False, True)
+    assert calls == [plain, negative_product, negative_sum, plain, plain]
 
 
 def test_operations_are_replaced_inside_of_calls_and_loops():

@@ -74,11 +74,11 @@ class Parts(LaneSimulator):
 @functools.cache
 def make_parts(half, precision):
     """Parts of a short run with half of the effects, and with all metrics or one."""
-    names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
+    names, law, metric_names = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
     full_experiment = make_experiment(names, law, steps=200, precision=precision)
     return Parts(
         full_experiment,
-        (metrics_reducer(asked),),
+        (metrics_reducer(metric_names),),
         tuple(path for path in leaf_paths(full_experiment) if path.startswith("effects.")),
         5,
         LANES,
@@ -126,11 +126,13 @@ def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
     values = spread_lane_values(
         full_experiment, [path for path in leaf_paths(full_experiment) if path.startswith("effects.")], 37
     )
-    asked = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
-    stride, selection = (HostSimulator(full_experiment, (reducer,), tuple(values), 37, 2)(values, 3) for reducer in asked)
-    assert len(selection) < len(stride)
-    for name, figure in selection.items():
-        np.testing.assert_array_equal(figure, stride[name], err_msg=name)
+    reducers = ALL_METRICS, metrics_reducer(("chatter", "f_plus", "torque_rmse"))
+    all_metrics, some_metrics = (
+        HostSimulator(full_experiment, (reducer,), tuple(values), 37, 2)(values, 3) for reducer in reducers
+    )
+    assert len(some_metrics) < len(all_metrics)
+    for name, figure in some_metrics.items():
+        np.testing.assert_array_equal(figure, all_metrics[name], err_msg=name)
 
 
 def test_what_no_axis_touches_is_computed_once():
@@ -138,8 +140,8 @@ def test_what_no_axis_touches_is_computed_once():
     full_experiment = make_experiment([], DeadZone(60.0, 0.05))
     values = spread_lane_values(full_experiment, ["observer.motor.alpha", "observer.motor.lambda"], 7)
     simulator = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 7, 1)
-    varied = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
-    assert simulator.carry_count < varied.carry_count
+    varied_parts = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
+    assert simulator.carry_count < varied_parts.carry_count
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(simulator._run_shared_part, SharedPartLoop)
     assert simulator._run_shared_part._loop is not None
@@ -162,8 +164,8 @@ def test_the_benchmarks_work_in_both_precisions(precision):
             np.testing.assert_allclose(figure, expected[name], rtol=1e-6)
         elif "rmse" in name:
             # a switching term makes an error of rounding one of a sample
-            apart = np.abs(figure / np.asarray(expected[name]) - 1.0)
-            assert np.median(apart) < 1e-3
+            deviation = np.abs(figure / np.asarray(expected[name]) - 1.0)
+            assert np.median(deviation) < 1e-3
 
 
 def test_the_kernel_of_accelerators_in_single_precision():
@@ -206,10 +208,10 @@ def test_a_processor_has_no_kernel_of_accelerators():
 
 
 def test_what_is_joined_for_a_gpu_computes_the_same():
-    result, joined = make_parts(True, "float64"), []
+    result, joined_terms = make_parts(True, "float64"), []
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
-        joined.append(a)
+        joined_terms.append(a)
         return (-a if minus_product else a) * b + (-c if minus_rest else c)
 
     random = np.random.default_rng(1)
@@ -219,7 +221,7 @@ def test_what_is_joined_for_a_gpu_computes_the_same():
         pairs = jax.jit(lambda *x, jaxprs=(other, part): [jaxpr_as_fun(jaxpr)(*x) for jaxpr in jaxprs])(*dtypes)
         for pair, expected in zip(*pairs, strict=True):
             np.testing.assert_allclose(pair, expected, rtol=1e-12)
-    assert len(joined) > 50
+    assert len(joined_terms) > 50
 
 
 def test_values_of_another_number_of_lanes_are_refused():
@@ -291,26 +293,26 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     monkeypatch.setattr(module, "_THREAD_WORK", 1)
     lanes, samples = 256, []
     # about the stiffness from which float32 and float64 overflow within the run
-    late = np.linspace(1.6965e5, 1.698e5, 64), np.linspace(1.703e5, 1.713e5, 64)
-    stiffness = np.concatenate([np.full(64, 60.0), *late, np.full(64, 1e6)])
+    overflowing = np.linspace(1.6965e5, 1.698e5, 64), np.linspace(1.703e5, 1.713e5, 64)
+    stiffness = np.concatenate([np.full(64, 60.0), *overflowing, np.full(64, 1e6)])
     tolerance = np.where(np.arange(lanes) % 4 == 0, 1e3, 1e-12)
     with jax.enable_x64(precision == "float64"):
         full_experiment = make_experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness, "run.velocity_tolerance": tolerance}
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
-        asked = metrics_reducer(("converged", "convergence_time"))
-        stride, staying = (
+        convergence_reducer = metrics_reducer(("converged", "convergence_time"))
+        full_simulator, staying_simulator = (
             HostSimulator(full_experiment, (reducer,), tuple(values), lanes, 1)
-            for reducer in (ALL_METRICS, asked._replace(done=None))
+            for reducer in (ALL_METRICS, convergence_reducer._replace(done=None))
         )
-        assert staying.carry_count < stride.carry_count
-        expected, stayed = stride(values, 3), staying(values, 3)
+        assert staying_simulator.carry_count < full_simulator.carry_count
+        expected, staying_metrics = full_simulator(values, 3), staying_simulator(values, 3)
         assert 0 < np.count_nonzero(expected["motor.converged"]) < lanes
-        assert set(stayed) < set(expected)
+        assert set(staying_metrics) < set(expected)
         # a side is not followed once its answer is known: what overflows later is not seen
-        assert (stayed["finite"] >= expected["finite"]).all()
-        assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        simulator = HostSimulator(full_experiment, (asked,), tuple(values), lanes, threads)
+        assert (staying_metrics["finite"] >= expected["finite"]).all()
+        assert np.count_nonzero(staying_metrics["finite"]) > np.count_nonzero(expected["finite"])
+        simulator = HostSimulator(full_experiment, (convergence_reducer,), tuple(values), lanes, threads)
         loop = simulator._loop
 
         def count_samples(arrays, upto, first, last, loop=loop, **options):
@@ -324,9 +326,9 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         actual = simulator(values, 3)
         # in the last block, those are left that keep the tolerance
         assert samples[-1] < lanes // 4
-        assert set(actual) == set(stayed)
+        assert set(actual) == set(staying_metrics)
         for name, figure in actual.items():
-            np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
+            np.testing.assert_array_equal(figure, staying_metrics[name], err_msg=name)
             if name != "finite":
                 np.testing.assert_array_equal(figure, expected[name], err_msg=name)
 
@@ -344,38 +346,40 @@ def test_all_lanes_may_leave(monkeypatch):
 def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
     work = Workload(40, 300, "float64")
     simulator = HostSimulator(work.experiment(), (CHAIN_METRICS,), tuple(RANGES), work.lanes, 2)
-    drawn = []
-    ahead = simulator._run_shared_part
+    drawn_seeds = []
+    run_shared_part = simulator._run_shared_part
     monkeypatch.setattr(
-        simulator, "_run_shared_part", lambda state, seed, *remainder: drawn.append(seed) or ahead(state, seed, *remainder)
+        simulator,
+        "_run_shared_part",
+        lambda state, seed, *remainder: drawn_seeds.append(seed) or run_shared_part(state, seed, *remainder),
     )
     first = simulator(work.values(), 1)
     for seed in (1, 2, 1):
-        again = simulator(work.values(), seed)
-    assert drawn == [1, 2]
+        metrics = simulator(work.values(), seed)
+    assert drawn_seeds == [1, 2]
     for name, figure in first.items():
-        np.testing.assert_array_equal(again[name], figure)
+        np.testing.assert_array_equal(metrics[name], figure)
     simulator.keep_seeds([2])
     for seed in (2, 1):
         simulator(work.values(), seed)
-    assert drawn == [1, 2, 1]
+    assert drawn_seeds == [1, 2, 1]
     # no room
     monkeypatch.setattr(module, "_CACHE_BYTES", 100)
     simulator.keep_seeds([])
     for seed in (2, 2):
         simulator(work.values(), seed)
-    assert drawn == [1, 2, 1, 2, 2]
+    assert drawn_seeds == [1, 2, 1, 2, 2]
 
 
 def test_an_unknown_operation_is_refused_by_name():
     full_experiment = make_experiment([], DeadZone(60.0, 0.05), steps=100)
-    odd = Reducer(
+    unknown_reducer = Reducer(
         lambda e: jnp.zeros_like(e.run.sample_period),
         lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),
         lambda e, total, state: {"odd": total},
     )
     with pytest.raises(Unsupported, match="erf"):
-        HostSimulator(full_experiment, (odd,), ("transmission.half_gap",), 9, 1)
+        HostSimulator(full_experiment, (unknown_reducer,), ("transmission.half_gap",), 9, 1)
     truth = Reducer(
         lambda e: jnp.asarray(False),
         lambda e, total, index, signals: total | (signals.motor.measured > 1.0),

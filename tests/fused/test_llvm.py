@@ -85,15 +85,15 @@ def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(sum_loop
 
 def test_rows_of_one_array_stand_for_several(sum_loop):
     inputs = loop_buffers()
-    pair = np.array([inputs["value 0"], inputs["carry 0"]])
-    remainder = list(inputs.values())[2:]
-    sum_loop([ArrayRows(pair), *remainder], 5, 0, 2)
-    np.testing.assert_array_equal(pair, [[1.0, 2.0], [110.0, 120.0]])
+    stacked = np.array([inputs["value 0"], inputs["carry 0"]])
+    other_buffers = list(inputs.values())[2:]
+    sum_loop([ArrayRows(stacked), *other_buffers], 5, 0, 2)
+    np.testing.assert_array_equal(stacked, [[1.0, 2.0], [110.0, 120.0]])
     with pytest.raises(ValueError, match="sample input 0 of a loop needs 5 contiguous numbers of type int32"):
-        sum_loop([ArrayRows(pair), remainder[0], ArrayRows(np.zeros((2, 5))), remainder[3]], 5, 0, 2)
+        sum_loop([ArrayRows(stacked), other_buffers[0], ArrayRows(np.zeros((2, 5))), other_buffers[3]], 5, 0, 2)
     with pytest.raises(ValueError, match="constant 0 of a loop is no row of one array"):
-        sum_loop([ArrayRows(np.zeros((3, 2))), *remainder[1:]], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((3, 2))), *other_buffers[1:]], 5, 0, 2)
     with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
-        sum_loop([ArrayRows(np.zeros((4, 2))[::2]), *remainder], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((4, 2))[::2]), *other_buffers], 5, 0, 2)
     with pytest.raises(ValueError, match="needs 6 arrays, not 7"):
-        sum_loop([ArrayRows(np.zeros((3, 2))), *remainder], 5, 0, 2)
+        sum_loop([ArrayRows(np.zeros((3, 2))), *other_buffers], 5, 0, 2)

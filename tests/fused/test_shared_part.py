@@ -40,25 +40,25 @@ def make_experiment(excitation, dtype):
     ids=["shared plant", "plants of their own"],
 )
 def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, path, states):
-    result = []
+    loops = []
 
-    class Noted(SharedPartLoop):
+    class RecordedLoop(SharedPartLoop):
         def __init__(self, shared):
             super().__init__(shared)
-            result.append((self, SharedPartScan(shared), shared))
+            loops.append((self, SharedPartScan(shared), shared))
 
-    monkeypatch.setattr(module, "SharedPartLoop", Noted)
+    monkeypatch.setattr(module, "SharedPartLoop", RecordedLoop)
     with jax.enable_x64(precision == "float64"):
         length = HostSimulator(make_experiment(excitation, precision), (ALL_METRICS,), (path,), 16, 1)._block_length
-        ((looped, scanned, shared),) = result
-        assert (looped._loop is not None) >= states
+        ((run_loop, run_scan, shared),) = loops
+        assert (run_loop._loop is not None) >= states
         # the plant's four states are not carried by each lane
         assert (len(shared.state) >= 4) == states
-        ours = theirs = [np.zeros((), leaf.dtype) for leaf in shared.state]
+        loop_state = scan_state = [np.zeros((), leaf.dtype) for leaf in shared.state]
         for first in range(0, 600, length):
-            ours, last, handed = looped(ours, 3, first, length)
-            theirs, *further = scanned(theirs, 3, first, length)
-            for actual, expected in zip((ours, last, handed), (theirs, *further), strict=True):
+            loop_state, loop_ends, outputs = run_loop(loop_state, 3, first, length)
+            scan_state, *scan_outputs = run_scan(scan_state, 3, first, length)
+            for actual, expected in zip((loop_state, loop_ends, outputs), (scan_state, *scan_outputs), strict=True):
                 for array, reference in zip(actual, expected, strict=True):
                     assert np.asarray(array).dtype == reference.dtype
                     # rounding, which a stiff shaft amplifies
@@ -66,8 +66,8 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
                     size = np.max(np.abs(np.asarray(reference, float))) + 1e-30
                     np.testing.assert_allclose(array, reference, rtol=tolerance, atol=tolerance * size)
         # both blocks in one stretch: the loop settles its state between them
-        full, twice, _ = looped([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
-        np.testing.assert_array_equal(full, ours)
-        assert [ends[-1] for ends in twice] == [ends[0] for ends in last]
-        assert len(handed) > 0
-        assert any(np.ptp(np.asarray(column, float)) > 0.0 for column in handed)
+        long_state, long_ends, _ = run_loop([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
+        np.testing.assert_array_equal(long_state, loop_state)
+        assert [ends[-1] for ends in long_ends] == [ends[0] for ends in loop_ends]
+        assert len(outputs) > 0
+        assert any(np.ptp(np.asarray(column, float)) > 0.0 for column in outputs)

@@ -91,14 +91,17 @@ def test_worse_assumptions_prove_less(certified_gains):
 
 def test_limits_are_met_or_not(certified_gains):
     final, time = certified_gains["final_accuracy"], certified_gains["reaching_time"]
-    wide = certify(*GAINS, **BOUNDS, accuracy=1.5 * final, reaching_time=time)
-    assert wide["accuracy"] == 1.5 * final
+    loose = certify(*GAINS, **BOUNDS, accuracy=1.5 * final, reaching_time=time)
+    assert loose["accuracy"] == 1.5 * final
     # a wider bound holds earlier
-    assert wide["reaching_time"] < time
-    assert wide["limits"] == {"accuracy": {"asked": 1.5 * final, "met": True}, "reaching_time": {"asked": time, "met": True}}
-    narrow = certify(*GAINS, **BOUNDS, accuracy=0.9 * final, reaching_time=0.5 * time)
-    assert narrow["accuracy"] == pytest.approx(certified_gains["accuracy"])
-    assert not any(limit["met"] for limit in narrow["limits"].values())
+    assert loose["reaching_time"] < time
+    assert loose["limits"] == {
+        "accuracy": {"asked": 1.5 * final, "met": True},
+        "reaching_time": {"asked": time, "met": True},
+    }
+    strict = certify(*GAINS, **BOUNDS, accuracy=0.9 * final, reaching_time=0.5 * time)
+    assert strict["accuracy"] == pytest.approx(certified_gains["accuracy"])
+    assert not any(limit["met"] for limit in strict["limits"].values())
 
 
 @pytest.mark.parametrize(("f_plus", "period"), [(14.08, 1e-4), (2.6, 5e-4)])
@@ -226,17 +229,17 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, tuned_st
     data = study() | {"observer": {"motor": certificate_data["gains"] | {"velocity_error": 0.1}}}
     data["run"]["duration"] = certificate_data["reaching_time"] + 0.5
     run = jaxbl.run(data).trace
-    late = run["t"] >= certificate_data["reaching_time"]
+    after_reaching = run["t"] >= certificate_data["reaching_time"]
     error = np.abs(run["motor.velocity_estimate"] - run["motor.velocity"])
-    assert 0.0 < error[late].max() <= certificate_data["accuracy"]
+    assert 0.0 < error[after_reaching].max() <= certificate_data["accuracy"]
 
 
 def test_a_finished_certificate_is_read_again(tmp_path, tuned_study, monkeypatch):
     tune(study(), tmp_path)
     monkeypatch.setattr(certificate, "certify", None)
     assert tune(study(), tmp_path).summary["certificates"] == tuned_study.summary["certificates"]
-    limited = tmp_path / "tune" / "certificate.json"
-    limited.write_text(limited.read_text()[:-20])
+    file = tmp_path / "tune" / "certificate.json"
+    file.write_text(file.read_text()[:-20])
     monkeypatch.undo()
     assert tune(study(), tmp_path).summary["certificates"] == tuned_study.summary["certificates"]
 

@@ -79,10 +79,12 @@ def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
     """That is the sum of absolute sensitivities."""
     period, unit = jnp.ones(()), np.eye(3)
     observer = Luenberger(*map(jnp.asarray, gains))
-    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, period)
-    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, period)
+    higher_states = np.zeros(3), *observer.correction(lambda v: 0.0 * v, period)
+    next_state, estimate = observer.step(
+        ObserverState(-unit[0], -unit[1], higher_states), unit[2], lambda v: 0.0 * v, period
+    )
     moved, seen_velocity, push = (
-        -np.column_stack([new.position, new.velocity]),
+        -np.column_stack([next_state.position, next_state.velocity]),
         np.asarray(estimate.velocity),
         np.array([0.5, 1.0]),
     )
@@ -91,9 +93,9 @@ def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
         sample_inputs = np.column_stack([states, noise])
         return sample_inputs @ moved, np.abs(sample_inputs @ seen_velocity)
 
-    result, worst, left = explore(step, list_noises, push[None]), NOISE * abs(seen_velocity[2]), seen_velocity[:2]
+    result, worst, row_vector = explore(step, list_noises, push[None]), NOISE * abs(seen_velocity[2]), seen_velocity[:2]
     for _ in range(400):
-        worst, left = worst + NOISE * abs(moved[2] @ left) + abs(push @ left), moved[:2] @ left
+        worst, row_vector = worst + NOISE * abs(moved[2] @ row_vector) + abs(push @ row_vector), moved[:2] @ row_vector
     assert share * worst <= result.worst <= worst * (1.0 + 1e-9)
 
 

@@ -276,8 +276,8 @@ def enough_damping(alpha):
     slow, fast = alpha - 1.0, alpha + 1.0
 
     def excess_time(damping):
-        out = 1.0 / damping - slow / damping**2 * np.log1p(damping / slow)
-        return out + 1.0 / damping + fast / damping**2 * np.log1p(-damping / fast)
+        outward_time = 1.0 / damping - slow / damping**2 * np.log1p(damping / slow)
+        return outward_time + 1.0 / damping + fast / damping**2 * np.log1p(-damping / fast)
 
     return brentq(excess_time, 1e-3, fast * (1.0 - 1e-12))
 

@@ -17,15 +17,15 @@ def test_two_displacements_and_their_gear_give_tables_of_a_study(tmp_path):
     frame |= {"theta_e": 10.0 * load + twist, "theta_s": load}
     path = tmp_path / "rig.csv"
     pd.DataFrame(frame).to_csv(path, index=False)
-    identify_element = jaxbl.identify_element(path, {}, gear_ratio=10.0)
-    assert identify_element.tables["transmission"]["law"] == "linear_shaft"
-    assert identify_element.tables["transmission"]["stiffness"] == pytest.approx(80.0, rel=5e-3)
-    (effect,) = identify_element.tables["effects"]
+    identification = jaxbl.identify_element(path, {}, gear_ratio=10.0)
+    assert identification.tables["transmission"]["law"] == "linear_shaft"
+    assert identification.tables["transmission"]["stiffness"] == pytest.approx(80.0, rel=5e-3)
+    (effect,) = identification.tables["effects"]
     assert effect["torque"] == pytest.approx(0.5, rel=0.02)
     drive = {"kind": "two_inertia", "motor_inertia": 0.1, "motor_viscous": 0.1, "load_inertia": 5.0, "load_viscous": 1.0}
-    remainder = {"drive": drive | {"gear_ratio": 10.0}, "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}}
+    tables = {"drive": drive | {"gear_ratio": 10.0}, "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}}
     gains = {side: {"lambda": 1.0, "alpha": 1.0} for side in ("motor", "load")}
-    assert read_config(remainder | {"observer": gains} | identify_element.tables).effects[0].torque == effect["torque"]
+    assert read_config(tables | {"observer": gains} | identification.tables).effects[0].torque == effect["torque"]
     with pytest.raises(jaxbl.InputError, match="log: unknown key 'gear'"):
         jaxbl.identify_element(path, {"gear": 1})
 
@@ -35,14 +35,14 @@ def test_an_element_needs_its_displacement_in_every_log(tmp_path):
     frame = pd.DataFrame({"t": t, "u": np.sin(t), "theta_e": 0.1 * np.sin(t), "theta_s": 0.01 * np.sin(t)})
     for name, columns in (("both", []), ("motor", ["theta_s"]), ("load", ["theta_e"])):
         frame.drop(columns=columns).to_parquet(tmp_path / f"{name}.parquet")
-    pair, motor, load = (tmp_path / f"{name}.parquet" for name in ("both", "motor", "load"))
-    for log, holdout in ((load, None), (pair, load), (motor, load)):
+    both_sides, motor, load = (tmp_path / f"{name}.parquet" for name in ("both", "motor", "load"))
+    for log, holdout in ((load, None), (both_sides, load), (motor, load)):
         with pytest.raises(
             jaxbl.InputError, match=r"load\.parquet: has no theta_e: an element is found from its displacement"
         ):
             jaxbl.identify_element(log, {}, holdout=holdout)
     with pytest.raises(jaxbl.InputError, match=r"load\.parquet: has no theta_e"):
         jaxbl.inspect(load, {"kind": "element"})
-    for log, holdout in ((pair, motor), (motor, pair)):
+    for log, holdout in ((both_sides, motor), (motor, both_sides)):
         with pytest.raises(jaxbl.InputError, match=r"motor\.parquet: has no load position, which .*both\.parquet has"):
             jaxbl.identify_element(log, {}, holdout=holdout)

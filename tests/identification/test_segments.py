@@ -66,18 +66,20 @@ def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(lagged_log):
 def test_effects_begin_with_what_the_inputs_before_left(lagged_log):
     """A dead time and a lag along a part of an input act as along the whole of it."""
     record, _, _ = lagged_log
-    late = [{"kind": "actuator.delay", "delay": 0.0246}, {"kind": "actuator.lag", "time_constant": 0.05}]
-    experiment = on_record(read_model(nominal_study(effects=late))[0], record)
-    still = {"motor": np.zeros(200)}
+    delays = [{"kind": "actuator.delay", "delay": 0.0246}, {"kind": "actuator.lag", "time_constant": 0.05}]
+    experiment = on_record(read_model(nominal_study(effects=delays))[0], record)
+    standstill = {"motor": np.zeros(200)}
     time, torque = record.time[:200], np.cos(30.0 * record.time[:200])
-    states, acting = effect_path(experiment, Path(time, torque, still, still))
+    states, acting_torques = effect_path(experiment, Path(time, torque, standstill, standstill))
     for first in (5, 40):
-        remainder = {"motor": np.zeros(200 - first)}
-        later, torques = effect_path(
-            experiment, Path(time[first:], torque[first:], remainder, remainder, before=torque[:first])
+        standstill_after = {"motor": np.zeros(200 - first)}
+        later_states, torques = effect_path(
+            experiment, Path(time[first:], torque[first:], standstill_after, standstill_after, before=torque[:first])
         )
-        np.testing.assert_allclose(torques, acting[first:], atol=1e-12)
-        np.testing.assert_allclose(jax.tree.leaves(later), [leaf[first:] for leaf in jax.tree.leaves(states)], atol=1e-12)
+        np.testing.assert_allclose(torques, acting_torques[first:], atol=1e-12)
+        np.testing.assert_allclose(
+            jax.tree.leaves(later_states), [leaf[first:] for leaf in jax.tree.leaves(states)], atol=1e-12
+        )
 
 
 def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):

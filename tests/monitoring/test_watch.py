@@ -49,9 +49,9 @@ def logs(tmp_path_factory):
 @pytest.fixture(scope="module")
 def growing_watch(logs):
     """The watch of the gap that grows, and the values it told of."""
-    heard = []
-    watch = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
-    return watch, heard
+    values = []
+    watch = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=values.append, **WINDOW)
+    return watch, values
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +74,10 @@ def run_command(*words):
 
 
 def test_a_gap_that_grows_is_followed_and_raises_an_alarm(growing_watch):
-    result, heard = growing_watch
+    result, told_values = growing_watch
     values = result.values
     assert list(values.columns) == watch_columns(result.task)
-    assert [row["t"] for row in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
+    assert [row["t"] for row in told_values] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
     before, after = values[values["t"] <= 5.0], values[values["t"] >= 13.5]
     for part, size in ((before, HALF_GAP), (after, 2.0 * HALF_GAP)):
         assert np.abs(part["half_gap"] / size - 1.0).max() < 0.01
@@ -291,12 +291,12 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
             lines.append(process.stdout.readline())
         values = (tmp_path / "out" / "watch.csv").read_text().splitlines()
         process.send_signal(number)
-        remainder, errors = process.communicate(timeout=120)
+        final_output, errors = process.communicate(timeout=120)
     assert process.returncode == (3 if alarm else 0), errors
     assert [line.split(" s ")[0].strip() for line in lines] == [f"{4.0 + 0.5 * i:.1f}" for i in range(12)]
     assert len(values) == 13
-    assert ("ALARM from 4.0 s on" in remainder) == alarm
-    assert "Half gap: 0.0" in remainder
+    assert ("ALARM from 4.0 s on" in final_output) == alarm
+    assert "Half gap: 0.0" in final_output
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
     assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten

@@ -30,11 +30,13 @@ NUMBERS = {
 @pytest.mark.parametrize("most", [10, 150, 10**9])
 def test_spread_is_that_of_pandas(monkeypatch, kind, most):
     rng = np.random.default_rng(3)
-    of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
-    values[(rng.random(3000) < 0.1) | (of == 7)] = np.nan
+    group_of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
+    values[(rng.random(3000) < 0.1) | (group_of == 7)] = np.nan
     monkeypatch.setattr(aggregates, "MOST_VALUES", most)
-    actual = spread(lambda: ((of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21, (0.05, 0.5, 0.95))
-    groups = pd.Series(values).groupby(of)
+    actual = spread(
+        lambda: ((group_of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21, (0.05, 0.5, 0.95)
+    )
+    groups = pd.Series(values).groupby(group_of)
     for name, expected in (("count", groups.count()), ("least", groups.min()), ("largest", groups.max())):
         np.testing.assert_array_equal(
             getattr(actual, name), expected.reindex(range(21), fill_value=[np.nan, 0][name == "count"])

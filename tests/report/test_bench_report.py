@@ -39,9 +39,9 @@ def test_files_and_figures(bench_result, tmp_path):
 def test_the_table_says_who_where_and_how_far_from_the_ceiling(bench_result):
     lines = throughput_lines(bench_result)
     assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
-    ours = next(line for line in lines if line.startswith(FUSED_NAME))
+    fused_line = next(line for line in lines if line.startswith(FUSED_NAME))
     assert lines[3].split() == ["float32", "lanes", "best", "median", "of", "C++", "first", "off", "by"]
-    assert ours.split()[4:] == ["1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
+    assert fused_line.split()[4:] == ["1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
     # those of both precisions below one another, within a terminal
     assert [line.split()[0] for line in lines if "lanes  " in line] == ["float32", "float64"]
     assert all(len(line) <= 80 for line in lines[3:])

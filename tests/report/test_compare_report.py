@@ -33,12 +33,12 @@ AXES = [spaced_axis(ALPHA, 5.0, 20.0, 3), listed_axis(LAMBDA, 4.0, 8.0)]
 @pytest.fixture(scope="module")
 def studies_folder(tmp_path_factory):
     """Two studies, of which the second moves further at more points."""
-    place = tmp_path_factory.mktemp("studies")
-    more = [spaced_axis(ALPHA, 5.0, 80.0, 5), AXES[1]]
-    for name, axes, amplitude in (("before", AXES, 0.1), ("after", more, 0.4)):
+    folder = tmp_path_factory.mktemp("studies")
+    wider_axes = [spaced_axis(ALPHA, 5.0, 80.0, 5), AXES[1]]
+    for name, axes, amplitude in (("before", AXES, 0.1), ("after", wider_axes, 0.4)):
         study = rigid_study({"excitation.amplitude": amplitude, "title": name}, axes=axes, sweep={"seeds": 4})
-        sweep(read_config(study), place / name, backend="scan")
-    return place
+        sweep(read_config(study), folder / name, backend="scan")
+    return folder
 
 
 def test_command_writes_text_json_and_figure(studies_folder, run_command):

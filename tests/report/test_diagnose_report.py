@@ -112,28 +112,28 @@ def test_the_headline_has_verdict_numbers_and_gap():
 
 def test_the_observers_residual_is_given_where_they_converge():
     assert not any("observers" in line for line in diagnosis_lines(SUMMARY))
-    calls = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
-    nothing = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
-    silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
+    clear = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
+    noisy = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
+    diverged = {"converged": False, "rms": None, "noise": None, "correlation": None}
 
     def observer_lines(**observed):
         where = {side: SUMMARY["where"][side] | {"observed": residual} for side, residual in observed.items()}
         return [line for line in diagnosis_lines(change_summary(where=where)) if "observers" in line]
 
-    assert observer_lines(motor=nothing, load=calls) == [
+    assert observer_lines(motor=noisy, load=clear) == [
         "By the observers' equivalent control: motor side, no more than its noise (0.02 N m rms); load side, 2.1 N m rms "
         "(its noise 0.2), correlation 0.99 with the smoother's."
     ]
-    assert observer_lines(motor=silent, load=calls)[0].startswith(
+    assert observer_lines(motor=diverged, load=clear)[0].startswith(
         "By the observers' equivalent control: load side, 2.1 N m rms"
     )
-    assert observer_lines(motor=silent) == []
+    assert observer_lines(motor=diverged) == []
 
 
 def test_other_verdicts_say_what_is_left():
     assert diagnosis_lines(change_summary(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
-    remainder = {"load.drift": {"evidence": 30.0, "share": 0.01}}
-    lines = diagnosis_lines(change_summary(verdict="unknown_effect", findings=[], rest=remainder))
+    remaining_effects = {"load.drift": {"evidence": 30.0, "share": 0.01}}
+    lines = diagnosis_lines(change_summary(verdict="unknown_effect", findings=[], rest=remaining_effects))
     assert lines[0].startswith("Unknown: no known effect explains what is missing: motor side")
     assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
@@ -146,32 +146,32 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
         where = {"load": {"sentence": "load side, there"}}
         return diagnosis_lines(change_summary(verdict="unknown_effect", where_after=where, gap=gap, explained_share=share))
 
-    partly = (
+    partial_start = (
         "Partly explained: the model lacks load.coulomb_friction; with it, {} of the missing torque is explained on data "
     )
-    remainder = "not used for the fit. The rest is none of the known effects: load side, there."
+    known_end = "not used for the fit. The rest is none of the known effects: load side, there."
     first, _, _, second, *_ = part_lines(failed=["theta_e"])
-    assert first == partly.format("83 %") + remainder
+    assert first == partial_start.format("83 %") + known_end
     assert second == (
         "More is left than noise, the uncertainty of the numbers and torques too small to be named account for (1 % test): "
         "theta_e 0.0011 rad (at most 0.0012)."
     )
-    assert part_lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + remainder
-    assert part_lines(share=-0.2, remainder=True)[0] == partly.format("none") + remainder
+    assert part_lines(share=0.9987, remainder=True)[0] == partial_start.format("99.9 %") + known_end
+    assert part_lines(share=-0.2, remainder=True)[0] == partial_start.format("none") + known_end
     first, _, _, second, *_ = part_lines(far={"drive.motor_inertia": -25.0})
-    assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
+    assert first == partial_start.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
-    unsure = part_lines(powerless=True, little=True)
-    too_little = "the data not used for the fit are too noisy, or too few, to show it."
-    assert unsure[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {too_little}"
-    assert unsure[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
-    assert not any("less than half" in line for line in unsure)
-    gone = change_summary(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
-    lost = "Not confirmed: something is missing by the log, perhaps load.coulomb_friction; "
-    assert diagnosis_lines(gone)[0] == lost + too_little
+    weak_lines = part_lines(powerless=True, little=True)
+    weak_data_end = "the data not used for the fit are too noisy, or too few, to show it."
+    assert weak_lines[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {weak_data_end}"
+    assert weak_lines[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
+    assert not any("less than half" in line for line in weak_lines)
+    withdrawn_summary = change_summary(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
+    unconfirmed_start = "Not confirmed: something is missing by the log, perhaps load.coulomb_friction; "
+    assert diagnosis_lines(withdrawn_summary)[0] == unconfirmed_start + weak_data_end
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
-    alone = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
-    assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in alone
+    motor_line = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
+    assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in motor_line
     assert part_lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 

@@ -116,17 +116,17 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
 
 def test_what_did_not_converge_is_hatched(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure()])
-    none = draw_only_figure(tmp_path, data, motor__velocity_rmse=product_error)
-    selection = draw_only_figure(
+    plain_drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product_error)
+    partly_hatched = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=product_error, motor__converged=lambda frame: frame[ALPHA] > 5.0
     )
-    all_ = draw_only_figure(
+    fully_hatched = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=product_error, motor__converged=lambda frame: frame[ALPHA] < 0.0
     )
-    assert legend_texts(none) == []
-    assert legend_texts(selection) == legend_texts(all_) == ["motor not converged"]
+    assert legend_texts(plain_drawing) == []
+    assert legend_texts(partly_hatched) == legend_texts(fully_hatched) == ["motor not converged"]
     # the best is sought among those that converged
-    assert "best ★ 7.1" in panels(selection)[0].get_title()
+    assert "best ★ 7.1" in panels(partly_hatched)[0].get_title()
 
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):

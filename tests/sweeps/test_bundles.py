@@ -101,8 +101,8 @@ def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client
     folder = tmp_path / "study"
     first = submit(thirty_run_study(), folder, client)
     assert first.parts_in_all == 8 and not first.finished
-    latest = time.monotonic() + 60.0
-    while not status(folder).complete and time.monotonic() < latest:
+    deadline = time.monotonic() + 60.0
+    while not status(folder).complete and time.monotonic() < deadline:
         time.sleep(0.1)
     assert sorted(computed_chunks) == list(range(8))
     assert not status(folder).finished

@@ -19,22 +19,26 @@ KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 def test_counted_work():
     one_step, ten_steps = (read_config(small_study({"run.substeps": n})) for n in (1, 10))
     gains, plants = [LAMBDA, ALPHA], ["transmission.dead_zone"]
-    shared, operations = count_operations(ten_steps, gains), count_operations(ten_steps, plants)
+    gain_operations, plant_operations = count_operations(ten_steps, gains), count_operations(ten_steps, plants)
     # one and the same step, by all lanes or by each
-    assert shared.shared + shared.lane == pytest.approx(operations.shared + operations.lane, rel=0.1)
-    assert shared.shared > 3.0 * shared.lane
-    assert operations.lane > operations.shared
+    assert gain_operations.shared + gain_operations.lane == pytest.approx(
+        plant_operations.shared + plant_operations.lane, rel=0.1
+    )
+    assert gain_operations.shared > 3.0 * gain_operations.lane
+    assert plant_operations.lane > plant_operations.shared
     # nine plant steps more, each of them a tanh at least
     for paths, field in ((gains, "shared"), (plants, "lane")):
         extra = getattr(count_operations(ten_steps, paths), field) - getattr(count_operations(one_step, paths), field)
         assert 9 * 30 < extra < 9 * 100
     # position and velocity of both sides are among what a lane of its own carries
-    assert operations.carried - shared.carried >= 4 * 8
-    single = read_config(small_study({"run.precision": "float32"}))
-    assert count_operations(single, gains).carried == pytest.approx(count_operations(one_step, gains).carried / 2, rel=0.01)
+    assert plant_operations.carried - gain_operations.carried >= 4 * 8
+    single_precision = read_config(small_study({"run.precision": "float32"}))
+    assert count_operations(single_precision, gains).carried == pytest.approx(
+        count_operations(one_step, gains).carried / 2, rel=0.01
+    )
     # a run that is twice as long does not more a sample
-    longer = read_config(small_study({"run.duration": 2.0 * one_step.run.duration, "run.substeps": 1}))
-    assert count_operations(longer, [NOISE]).lane == pytest.approx(count_operations(one_step, [NOISE]).lane, rel=0.02)
+    long_run = read_config(small_study({"run.duration": 2.0 * one_step.run.duration, "run.substeps": 1}))
+    assert count_operations(long_run, [NOISE]).lane == pytest.approx(count_operations(one_step, [NOISE]).lane, rel=0.02)
 
 
 def test_measured_costs_are_those_of_the_machine(monkeypatch):

@@ -96,9 +96,9 @@ def test_killed_at_random_moments(tmp_path, undisturbed_run, repeats):
                 process.kill()
                 process.join()
                 kills += 1
-            after = expected_frame(folder, expected)
-            assert before.items() <= after.items(), "a chunk was computed twice"
-            before = after
+            parts_after = expected_frame(folder, expected)
+            assert before.items() <= parts_after.items(), "a chunk was computed twice"
+            before = parts_after
             if process.exitcode == 0:
                 break
         check_completion(folder, expected)
@@ -144,10 +144,10 @@ def run_scheduler(port):
     return run_dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
 
 
-def wait_until(true, seconds=120.0):
-    latest = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < latest
+def wait_until(condition, seconds=120.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
@@ -178,11 +178,11 @@ def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, undisturbed_
         # the scheduler is gone
         client.join(60.0)
         assert client.exitcode == 1
-        after = expected_frame(folder, expected)
-        assert before.items() <= after.items() and len(after) < len(expected)
+        parts_after = expected_frame(folder, expected)
+        assert before.items() <= parts_after.items() and len(parts_after) < len(expected)
     with run_scheduler(port), run_worker(address, tmp_path / "d"):
         client = start_process(_sweep, folder, address)
         client.join(120.0)
         assert client.exitcode == 0
-    assert after.items() <= expected_frame(folder, expected).items()
+    assert parts_after.items() <= expected_frame(folder, expected).items()
     check_completion(folder, expected)

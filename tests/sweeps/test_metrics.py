@@ -164,14 +164,14 @@ def test_some_metrics_alone():
     assert metric_columns(experiment, ["f_plus", "converged"]) == [
         "finite", "motor.converged", "motor.f_plus", "load.converged", "load.f_plus",
     ]  # fmt: skip
-    asked = under_test.metrics_reducer(("converged", "convergence_time"))
-    assert asked is under_test.metrics_reducer(("converged", "convergence_time"))
-    assert asked != under_test.metrics_reducer(("converged",))
+    reducer = under_test.metrics_reducer(("converged", "convergence_time"))
+    assert reducer is under_test.metrics_reducer(("converged", "convergence_time"))
+    assert reducer != under_test.metrics_reducer(("converged",))
     # one state for both, besides those that show whether the lane stays finite
-    assert {side: len(carry) for side, carry in asked.init(experiment).items()} == {"motor": 6, "load": 6}
+    assert {side: len(carry) for side, carry in reducer.init(experiment).items()} == {"motor": 6, "load": 6}
     assert [needs_gain_metrics(names) for names in (None, ("converged",), ("margin_alpha",))] == [True, False, True]
-    inputs = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics_reducer(("margin_alpha",)),))[0])
-    assert set(inputs) == {"finite", "motor.f_plus", "load.f_plus"}
+    shapes = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics_reducer(("margin_alpha",)),))[0])
+    assert set(shapes) == {"finite", "motor.f_plus", "load.f_plus"}
 
 
 @pytest.mark.parametrize(
@@ -193,11 +193,11 @@ def test_metrics_that_cannot_be_had(names, message):
 
 def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     counts = []
-    pieces = under_test.apply_elementwise
+    apply_elementwise = under_test.apply_elementwise
 
     def count_pieces(function, columns, **keys):
         counts.append((len(columns[0]), keys))
-        return pieces(function, columns, **keys)
+        return apply_elementwise(function, columns, **keys)
 
     monkeypatch.setattr(under_test, "apply_elementwise", count_pieces)
     # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
@@ -213,7 +213,9 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     # both sides by the program of six lanes
     assert counts == [(5, {"largest": 6}), (2, {"largest": 6})]
     for seed, lane in np.ndindex(2, 3):
-        alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
-        of_lane = {side: ObserverGains(*(gain if gain.ndim == 0 else gain[lane] for gain in g)) for side, g in gains.items()}
-        for name, value in add_gain_metrics(alone, of_lane).items():
+        lane_f_plus = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
+        lane_gains = {
+            side: ObserverGains(*(gain if gain.ndim == 0 else gain[lane] for gain in g)) for side, g in gains.items()
+        }
+        for name, value in add_gain_metrics(lane_f_plus, lane_gains).items():
             np.testing.assert_array_equal(result[name][seed, lane], value, err_msg=name)

@@ -27,8 +27,8 @@ pytestmark = pytest.mark.usefixtures("compiled_once")
 
 def trace_boundary(function, grid):
     """Simulated vertices as a mask of the fine grid, the function on all of it, and the sizes of the batches."""
-    places = [np.linspace(0.0, 1.0, size) for size in grid.sizes]
-    full = np.asarray(function(*np.meshgrid(*places, indexing="ij")))
+    grid_axes = [np.linspace(0.0, 1.0, size) for size in grid.sizes]
+    full = np.asarray(function(*np.meshgrid(*grid_axes, indexing="ij")))
     batches, requests = [], []
 
     def evaluate(vertices):
@@ -38,9 +38,9 @@ def trace_boundary(function, grid):
         return full.ravel()[vertices]
 
     vertices, values = refine_boundary(grid, evaluate, lambda a, b: a != b)
-    stride = np.concatenate(requests)
-    assert len(np.unique(stride)) == len(stride)
-    np.testing.assert_array_equal(vertices, np.sort(stride))
+    evaluated = np.concatenate(requests)
+    assert len(np.unique(evaluated)) == len(evaluated)
+    np.testing.assert_array_equal(vertices, np.sort(evaluated))
     np.testing.assert_array_equal(values, full.ravel()[vertices])
     mask = np.zeros(full.size, bool)
     mask[vertices] = True
@@ -264,9 +264,9 @@ def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
         axes = [spaced_axis(LAMBDA, 0.1, 37.0, num), spaced_axis(ALPHA, 0.3, 91.7, num, "linear")]
         plain, fine = (Points(read_config(small_study(axes=axes, sweep=s))) for s in ({}, {"refine": depth}))
         assert fine.coarse_size == plain.group_size
-        group_size = np.arange(plain.group_size)
-        expected = plain.columns(group_size)
-        for path, values in fine.columns(fine.coarse_points(group_size)).items():
+        coarse_points = np.arange(plain.group_size)
+        expected = plain.columns(coarse_points)
+        for path, values in fine.columns(fine.coarse_points(coarse_points)).items():
             np.testing.assert_array_equal(values, expected[path])
         # and all values are those of a grid that is as fine
         axes = [axis | {"num": (num - 1 << depth) + 1} for axis in axes]
@@ -395,9 +395,9 @@ def study(changes=None, refine=3, num=5, seeds=1, axes=None, **sweep_keys):
 def simulate_full_grid(data):
     """All points of the fine grid, by the engine that a refined study has."""
     engine = Engine(read_config(data), Layout(read_config(data).sweep.seeds, 2048))
-    group_size = np.arange(engine.points.group_size)
+    all_points = np.arange(engine.points.group_size)
     return pd.concat(
-        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split_points(g, group_size)],
+        [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split_points(g, all_points)],
         ignore_index=True,
     )
 

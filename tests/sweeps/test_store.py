@@ -205,9 +205,9 @@ def test_manifest_of_another_version(study_copy):
 
 def flip_bit(folder, random):
     """Flip a bit of one of a folder's files, which is returned."""
-    stride = sorted(path for path in folder.rglob("*") if path.is_file())
-    sizes = [path.stat().st_size for path in stride]
-    path = random.choices(stride, sizes)[0]
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    sizes = [path.stat().st_size for path in paths]
+    path = random.choices(paths, sizes)[0]
     content = path.read_bytes()
     index = random.randrange(len(content) * 8)
     path.write_bytes(bytes(byte ^ (1 << index % 8 if i == index // 8 else 0) for i, byte in enumerate(content)))

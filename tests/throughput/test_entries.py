@@ -41,8 +41,8 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("kernel")
 
 
-def _short_curve(curve, able, lanes, *remainder):
-    return curve(able, min(lanes, 64), *remainder)
+def _short_curve(curve, entries, lanes, *remainder):
+    return curve(entries, min(lanes, 64), *remainder)
 
 
 @functools.cache
@@ -60,10 +60,10 @@ def reference_metrics(lanes):
     ],
 )
 def test_figures_are_those_of_the_reference(name, precision, folder):
-    able, left_out = _select_runnable(make_entries(folder, 2, 2), folder)
+    runnable, left_out = _select_runnable(make_entries(folder, 2, 2), folder)
     if name in left_out:
         pytest.skip(left_out[name])
-    entry = next(entry for entry in able if entry.name == name)
+    entry = next(entry for entry in runnable if entry.name == name)
     with jax.enable_x64(precision == "float64"):
         figures = entry.make(Workload(min(entry.lanes, 70), STEPS, precision))()
     assert set(figures) == set(METRIC_NAMES)
@@ -74,13 +74,13 @@ def test_figures_are_those_of_the_reference(name, precision, folder):
 
 def test_a_wrong_result_is_not_timed():
     true = reference_metrics(64)
-    wrong = {name: 1.01 * values for name, values in true.items()}
-    entry = Entry("someone", lambda workload: lambda: wrong, 64)
+    off_by_a_percent = {name: 1.01 * values for name, values in true.items()}
+    entry = Entry("someone", lambda workload: lambda: off_by_a_percent, 64)
     with pytest.raises(NoResult, match=r"someone, float64: .* is off by 0.01"):
-        _check_entry(entry, "float64", wrong, true)
-    missing = true | {"motor.stiffness": np.full(64, np.nan)}
+        _check_entry(entry, "float64", off_by_a_percent, true)
+    undefined = true | {"motor.stiffness": np.full(64, np.nan)}
     with pytest.raises(NoResult, match=r"motor\.stiffness"):
-        _check_entry(entry, "float64", missing, true)
+        _check_entry(entry, "float64", undefined, true)
 
 
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
@@ -92,9 +92,9 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
             entry._replace(lanes=2**10) for entry in make_entries(folder, count, devices) if entry.name == run.FUSED_NAME
         ]
 
-    def short_curve(able, lanes, *remainder):
+    def short_curve(entries, lanes, *remainder):
         thread_counts.append(lanes)
-        return curve(able, min(lanes, 128), *remainder)
+        return curve(entries, min(lanes, 128), *remainder)
 
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setattr(run, "make_entries", make_fused_entry)
@@ -151,13 +151,13 @@ def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
     find = importlib.util.find_spec
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None if name == "numba" else find(name))
     monkeypatch.setenv("CXX", "no-such-compiler")
-    able, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "none")
+    runnable, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "none")
     assert "install g++" in left_out["c++, one core"]
     assert "jaxbl[bench]" in left_out["numba, prange"]
     monkeypatch.setenv("CXX", "false")
     _, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "broken")
     assert "cannot compile chain.cpp: exit code 1" in left_out["c++, one core"]
-    assert {"jaxbl fused, all cores", "NumPy, one lane"} <= {entry.name for entry in able}
+    assert {"jaxbl fused, all cores", "NumPy, one lane"} <= {entry.name for entry in runnable}
 
 
 def test_fewer_lanes_are_the_first_of_more():
