@@ -96,10 +96,10 @@ def call(monkeypatch, tmp_path):
 
     def run(*arguments):
         result = CliRunner().invoke(cli.app, list(map(str, arguments)), standalone_mode=False)
-        ended = result.exception if isinstance(result.exception, SystemExit) else None
-        if result.exception is not None and ended is None:
+        end = result.exception if isinstance(result.exception, SystemExit) else None
+        if result.exception is not None and end is None:
             raise result.exception
-        code = ended.code if ended else (result.return_value or 0)
+        code = end.code if end else (result.return_value or 0)
         return code, result.stdout.splitlines(), without_progress(result.stderr).splitlines()
 
     return run

@@ -34,15 +34,15 @@ def figure_kind(figure: Figure, format: str) -> Any:
     return tuple(zip(artists, mathematics, axes, strict=True)), len(figure.legends)
 
 
-def _save_kind(figure: Figure, file: Any, *, format: str, **how: Any) -> None:
+def _save_kind(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
     """`Figure.savefig` in tests."""
     kind = format, figure_kind(figure, format)
     if kind not in _pictures:
-        drawn = BytesIO()
-        _draw(figure, drawn, format=format, **how)
+        picture = BytesIO()
+        _draw(figure, picture, format=format, **options)
         # a constrained layout is found once, not before each drawing
         figure.set_layout_engine("none")
-        _pictures[kind] = drawn.getvalue()
+        _pictures[kind] = picture.getvalue()
     if isinstance(file, BytesIO):
         file.write(_pictures[kind])
     else:

@@ -34,10 +34,10 @@ def _read_durations() -> dict[str, float]:
     return json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.exists() else {}
 
 
-def _is_slow(item: pytest.Item, durations: Mapping[str, float]) -> bool:
-    function = _name_function(item.nodeid)
+def _is_slow(test: pytest.Item, durations: Mapping[str, float]) -> bool:
+    function = _name_function(test.nodeid)
     file = function.partition("::")[0]
-    fixtures = getattr(item, "fixturenames", ())
+    fixtures = getattr(test, "fixturenames", ())
     return any(name in durations for name in (function, *fixtures, *(f"{file}::{fixture}" for fixture in fixtures)))
 
 

@@ -33,10 +33,10 @@ def installed_effect(tmp_path_factory):
 
 def jaxbl(environment, *arguments):
     """Run a command in a process of its own."""
-    done = run_command(*arguments, cwd=ROOT, **environment)
-    assert done.returncode == 0, done.stderr
-    assert "warning" not in done.stderr
-    return done.stdout
+    result = run_command(*arguments, cwd=ROOT, **environment)
+    assert result.returncode == 0, result.stderr
+    assert "warning" not in result.stderr
+    return result.stdout
 
 
 def study_block():
@@ -93,6 +93,6 @@ def test_it_is_named_where_it_is_missing(installed_effect, logs, tmp_path):
 
 def test_the_reference_lists_it(installed_effect):
     code = "import docs.generate as g; print(g.page())"
-    done = run_python("-c", code, cwd=ROOT, **installed_effect)
-    assert done.returncode == 0, done.stderr
-    assert f"| `{NAME}` | Friction that builds up over a sliding length" in done.stdout
+    result = run_python("-c", code, cwd=ROOT, **installed_effect)
+    assert result.returncode == 0, result.stderr
+    assert f"| `{NAME}` | Friction that builds up over a sliding length" in result.stdout

@@ -117,14 +117,14 @@ def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
     install_package(tmp_path, "more_parts", SOURCE, {f"jaxbl.{group}": entries for group, entries in parts.items()})
     (tmp_path / "study.json").write_text(json.dumps(STUDY))
     script = SCRIPT.replace("PAGE", repr(str(ROOT / "docs" / "generate.py")))
-    done = run_python("-c", script, cwd=tmp_path, PYTHONPATH=os.pathsep.join([str(tmp_path), str(ROOT)]))
-    assert done.returncode == 0, done.stderr
+    result = run_python("-c", script, cwd=tmp_path, PYTHONPATH=os.pathsep.join([str(tmp_path), str(ROOT)]))
+    assert result.returncode == 0, result.stderr
     # what is wrong is left out with one line, and ends nothing
-    assert [line for line in done.stderr.splitlines() if "warning" in line] == [
+    assert [line for line in result.stderr.splitlines() if "warning" in line] == [
         "warning: jaxbl.metrics: 'broken' (more_parts:Nothing) is left out: "
         "AttributeError: module 'more_parts' has no attribute 'Nothing'"
     ]
-    content = json.loads(done.stdout)
+    content = json.loads(result.stdout)
     assert content["input"] == pytest.approx([-0.4, -0.39936, -0.39872])
     for name, true in (("stiffness", 1.0), ("cubic", 30.0)):
         assert content["identified"][name]["true"] == true

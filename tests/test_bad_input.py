@@ -79,8 +79,8 @@ EXPECTED_LINES = {
 
 def read_lines(kind: str, folder: Path, count: int = 0) -> dict[str, str]:
     """Lines about the inputs of a kind, by a process that ends where one takes too much."""
-    done = run_python(HERE / "bad_inputs.py", kind, folder, count, cwd=folder, timeout=1500.0)
-    assert done.returncode == 0, done.stderr[-5000:]
+    result = run_python(HERE / "bad_inputs.py", kind, folder, count, cwd=folder, timeout=1500.0)
+    assert result.returncode == 0, result.stderr[-5000:]
     return json.loads((folder / "said.json").read_text())
 
 
@@ -112,17 +112,17 @@ def test_generated_ones(kind, tmp_path, repeats):
 
 def test_a_command_ends_with_two_and_one_line(tmp_path):
     os.mkfifo(tmp_path / "log.csv")
-    done = run_command("inspect", "log.csv", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "jaxbl: log.csv: is a pipe or a device; a file is needed\n"
+    result = run_command("inspect", "log.csv", cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == "jaxbl: log.csv: is a pipe or a device; a file is needed\n"
 
 
 def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
     simulate_log().to_csv(tmp_path / "a\x1b[31mb.csv", index=False)
-    done = run_command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(r"a\x1b[31mb.csv: 4000 samples")
-    assert "\x1b" not in done.stdout
+    result = run_command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith(r"a\x1b[31mb.csv: 4000 samples")
+    assert "\x1b" not in result.stdout
 
 
 def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
@@ -130,8 +130,8 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     axes = [listed_axis(ALPHA, 5.0, 9.0)]
     figures = [{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}]
     (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid_study(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
-    done = run_command("sweep", "study.toml", cwd=tmp_path)
-    assert (done.returncode, without_progress(done.stderr)) == (0, "")
+    result = run_command("sweep", "study.toml", cwd=tmp_path)
+    assert (result.returncode, without_progress(result.stderr)) == (0, "")
     # and where the results may only be read, that is said before the figures are drawn
     folder = tmp_path / "results" / "study"
     folder.chmod(0o555)
@@ -140,10 +140,10 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     if before and shutil.which("setpriv") is None:
         return
     call = [*before, sys.executable, "-m", "jaxbl", "plot", folder]
-    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    result = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     folder.chmod(0o755)
     message = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
-    assert (done.returncode, without_progress(done.stderr)) == (2, f"jaxbl: {message}\n")
+    assert (result.returncode, without_progress(result.stderr)) == (2, f"jaxbl: {message}\n")
 
 
 @pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])

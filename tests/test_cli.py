@@ -66,20 +66,20 @@ def list_files(folder):
 
 
 def test_the_version_does_not_wait_for_jax(tmp_path):
-    done = jaxbl("--version", cwd=tmp_path, PYTHONPROFILEIMPORTTIME="1")
-    assert (done.returncode, done.stdout) == (0, f"jaxbl {version('jaxbl')}\n")
-    assert " jaxbl.cli\n" in done.stderr
-    assert " jax\n" not in done.stderr
+    result = jaxbl("--version", cwd=tmp_path, PYTHONPROFILEIMPORTTIME="1")
+    assert (result.returncode, result.stdout) == (0, f"jaxbl {version('jaxbl')}\n")
+    assert " jaxbl.cli\n" in result.stderr
+    assert " jax\n" not in result.stderr
 
 
 def test_help_does_not_wait_for_jax(tmp_path):
     heavy = "{'jax', 'numpy', 'pandas', 'matplotlib', 'scipy', 'pydantic'}"
     code = f"import sys, jaxbl, jaxbl.cli; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
-    done = jaxbl("--help", cwd=tmp_path)
-    assert done.returncode == 0
+    result = jaxbl("--help", cwd=tmp_path)
+    assert result.returncode == 0
     for command in ("simulate", "sweep", "verify", "tune", "plot"):
-        assert command in done.stdout
+        assert command in result.stdout
 
 
 def test_a_sweep_and_its_second_call(tmp_path):
@@ -260,8 +260,8 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     write_study(tmp_path, rigid_study({"run.durations": 1.0}), "wrong.toml")
     write_study(tmp_path, rigid_study(axes=[listed_axis("observer.motor.alfa", 1.0)]), "axis.toml")
     write_study(tmp_path, rigid_study(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
-    still = {"excitation.amplitude": 0.0, "observer.motor.velocity_error": 0.0}
-    write_study(tmp_path, rigid_study(still), "rest.toml")
+    at_rest = {"excitation.amplitude": 0.0, "observer.motor.velocity_error": 0.0}
+    write_study(tmp_path, rigid_study(at_rest), "rest.toml")
     write_study(tmp_path, rigid_study(axes=GAINS), "gains.toml")
     write_study(tmp_path, rigid_study(axes=GAINS, verify={"q": 1.2}), "q.toml")
     write_study(
@@ -573,9 +573,9 @@ def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
         study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
         shorten_study(study)
         write_study(tmp_path, study, f"{name}.toml")
-    done = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
-    assert (done.returncode, without_progress(done.stderr)) == (0, "")
-    results = json.loads(done.stdout.splitlines()[-1])
+    result = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
+    assert (result.returncode, without_progress(result.stderr)) == (0, "")
+    results = json.loads(result.stdout.splitlines()[-1])
     outcomes = {name: (code, without_progress(errors)) for name, (code, errors) in results.items()}
     assert outcomes == dict.fromkeys(SHIPPED, (0, ""))
 
@@ -667,11 +667,11 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
 
 def test_inspect_runs_without_a_word_on_stderr(tmp_path):
     (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
-    done = run_command(
+    result = run_command(
         "inspect", str(find_recording("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path
     )
-    assert (done.returncode, without_progress(done.stderr)) == (0, "")
-    assert "motion up to" in done.stdout
+    assert (result.returncode, without_progress(result.stderr)) == (0, "")
+    assert "motion up to" in result.stdout
 
 
 def test_a_refined_sweep_from_the_command_line(call, tmp_path):
@@ -692,8 +692,8 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
     _, second, _ = call("sweep", "study.toml")
     assert second == [line for line in first if not line.startswith("Compiled")]
-    _, drawn, _ = call("plot", "results/study")
-    assert drawn == second
+    _, plot_lines, _ = call("plot", "results/study")
+    assert plot_lines == second
 
 
 # of one length and structure: what one test has compiled serves the others
@@ -748,8 +748,8 @@ AGAIN = "interrupted; nothing was written. Start again with: jaxbl identify 'an 
 
 def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
-    more = ["--holdout", "an axis.csv", "--profile"]
-    assert call(*IDENTIFY, *more) == (130, [], [f"{AGAIN} {shlex.join(more)} --out 'results/an axis'"])
+    options = ["--holdout", "an axis.csv", "--profile"]
+    assert call(*IDENTIFY, *options) == (130, [], [f"{AGAIN} {shlex.join(options)} --out 'results/an axis'"])
     assert list_files(tmp_path / "results") == []
 
 
@@ -962,8 +962,8 @@ def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
     shipped_study = setup._find_shipped_study("gain_map.toml")
     assert shipped_study.is_file() and shipped_study.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
-    included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
-    assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
+    files = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert files == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
 
 
 def read_steps(lines):
@@ -1015,11 +1015,11 @@ def test_after_logs_what_is_open_by_what_was_found():
         assert steps[-1].command == "jaxbl explore out"
         return [step.command for step in steps[:-1]]
 
-    def identify_steps(rms, done=None, holdout=None, planned_file=None, **more):
+    def identify_steps(rms, task=None, holdout=None, planned_file=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
         return list_commands(
             after_identification(
-                done or make_task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file)
+                task or make_task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file)
             )
         )
 

@@ -280,8 +280,8 @@ def test_page_runs_as_written(page, tmp_path):
             blocks.append((language, text))
     request = tmp_path / "blocks.json"
     request.write_text(json.dumps(blocks), encoding="utf-8")
-    done = run_python(ROOT / "tests" / "page_process.py", request, cwd=clone, timeout=900.0, **env)
-    assert (done.returncode, without_progress(done.stderr)) == (0, ""), done.stderr
-    for (language, text), printed in zip(blocks, json.loads(done.stdout), strict=True):
+    result = run_python(ROOT / "tests" / "page_process.py", request, cwd=clone, timeout=900.0, **env)
+    assert (result.returncode, without_progress(result.stderr)) == (0, ""), result.stderr
+    for (language, text), output in zip(blocks, json.loads(result.stdout), strict=True):
         if language == "output":
-            assert set(zero_numbers(text)) <= set(zero_numbers(printed)), printed
+            assert set(zero_numbers(text)) <= set(zero_numbers(output)), output

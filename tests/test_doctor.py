@@ -16,12 +16,12 @@ def doctor_findings():
 def test_it_names_versions_devices_and_folders_and_tests_itself(doctor_findings, call, monkeypatch):
     monkeypatch.setattr(doctor, "examine", lambda: doctor_findings)
     code, lines, _ = call("doctor")
-    result = {one.name: one for one in doctor_findings}
-    assert {"jaxbl", "python", "packages", "devices", "cache", "results", "one run", "two backends"} <= set(result)
+    finding_by_name = {finding.name: finding for finding in doctor_findings}
+    assert {"jaxbl", "python", "packages", "devices", "cache", "results", "one run", "two backends"} <= set(finding_by_name)
     # tests keep no programs
-    assert [one.name for one in doctor_findings if not one.good] == ["cache"]
+    assert [finding.name for finding in doctor_findings if not finding.good] == ["cache"]
     assert code == 1 and lines[-1] == "Not in order: cache."
-    assert "jax " in result["packages"].found and all(len(line) <= 80 or "/" in line for line in lines)
+    assert "jax " in finding_by_name["packages"].found and all(len(line) <= 80 or "/" in line for line in lines)
     code, lines, _ = call("doctor", "--json")
     data = json.loads("\n".join(lines))
     assert data["exit"] == 1 and len(data["summary"]["findings"]) == len(doctor_findings)

@@ -11,7 +11,7 @@ from jaxbl.files import json_with_checksum, lock_folder, read_json, run_or_read
 @pytest.fixture
 def find_result(tmp_path):
     """Calls a task's results, and says how often it was done."""
-    done = []
+    tasks = []
     task = SimpleNamespace(record=SimpleNamespace(path=tmp_path / "axis.csv"), identity="abc")
 
     def write(result, folder):
@@ -20,12 +20,12 @@ def find_result(tmp_path):
 
     def call():
         def run(task):
-            done.append(task)
+            tasks.append(task)
             return SimpleNamespace(summary={"identity": "abc", "file": str(task.record.path)})
 
         file = tmp_path / "out" / "identification.json"
         assert run_or_read(task, file, run, write, overwrite=False)["identity"] == "abc"
-        return len(done)
+        return len(tasks)
 
     return call
 

@@ -58,9 +58,9 @@ def test_a_key_that_is_gone_is_reported_once_for_all_elements_of_a_list(compare)
 
 
 def test_numbers_within_the_tolerance_are_the_same(compare):
-    near = SUMMARY | {"numbers": [1.0, 2.0 + 1e-6, None]}
-    assert compare("summary.json", SUMMARY, near, 1e-6) == []
-    (difference,) = compare("summary.json", SUMMARY, near)
+    close_summary = SUMMARY | {"numbers": [1.0, 2.0 + 1e-6, None]}
+    assert compare("summary.json", SUMMARY, close_summary, 1e-6) == []
+    (difference,) = compare("summary.json", SUMMARY, close_summary)
     assert difference.relative == pytest.approx(5e-7)
 
 
@@ -71,11 +71,11 @@ def test_a_sentence_in_other_words_is_told_from_a_move(compare):
 
 def test_one_bit_of_a_table_is_reported(compare):
     table = pd.DataFrame({"metric": [1.0, 2.0, np.nan]})
-    changed = pd.DataFrame({"metric": [1.0, np.nextafter(2.0, 3.0), np.nan]})
-    (difference,) = compare("part.parquet", table, changed)
+    changed_table = pd.DataFrame({"metric": [1.0, np.nextafter(2.0, 3.0), np.nan]})
+    (difference,) = compare("part.parquet", table, changed_table)
     assert difference.place == "metric" and difference.what.startswith("1 of 3 numbers")
     assert difference.relative == pytest.approx(2.2e-16, rel=0.02)
-    assert compare("part.parquet", table, changed, 1e-9) == []
+    assert compare("part.parquet", table, changed_table, 1e-9) == []
     (difference,) = compare("part.parquet", table, table.rename(columns={"metric": "rmse"}).assign(metric=table["metric"]))
     assert (difference.place, difference.what) == ("rmse", "column is new")
     (difference,) = compare("part.parquet", table, table.fillna(0.0), 1e-9)

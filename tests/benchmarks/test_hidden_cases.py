@@ -70,12 +70,12 @@ def test_clutter_is_there_and_small_and_its_name_is_not_spurious(hidden_cases):
 
 
 def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
-    direct = _PLANTS["direct"]
-    machine = Machine(direct["drive"], None)
+    direct_plant = _PLANTS["direct"]
+    machine = Machine(direct_plant["drive"], None)
     hidden = ["motor.coulomb_friction", "load.gravity"]
-    drawn = [_add_known_effect(machine, hidden, direct, np.random.default_rng(seed)) for seed in range(20)]
-    assert drawn == [()] * 20
-    machines = [_add_known_effect(machine, hidden[:1], direct, np.random.default_rng(seed)) for seed in range(20)]
+    drawn_effects = [_add_known_effect(machine, hidden, direct_plant, np.random.default_rng(seed)) for seed in range(20)]
+    assert drawn_effects == [()] * 20
+    machines = [_add_known_effect(machine, hidden[:1], direct_plant, np.random.default_rng(seed)) for seed in range(20)]
     assert {effects[0]["kind"] for effects in machines if effects} == {"load.gravity"}
 
 

@@ -20,10 +20,12 @@ class Candidate:
         return {"value": value}
 
 
-def make_products(design, errors, scale, centre, **more):
+def make_products(design, errors, scale, centre, **options):
     """Two own numbers, one candidate; errors of unit variance are `errors` plus the columns."""
     full = np.column_stack([errors, design])
-    return Products(full.T @ full, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
+    return Products(
+        full.T @ full, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **options
+    )
 
 
 def draw_regression(size=1.0):

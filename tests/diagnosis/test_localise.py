@@ -25,7 +25,7 @@ VELOCITY = np.sum(SIZE * RATE * np.cos(RATE * TIME[:, None] + [0.0, 1.0, 2.0]), 
 POLE = 0.9
 
 
-def make_coordinates(**more):
+def make_coordinates(**further_coordinates):
     crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
     reversal_class = np.zeros(COUNT, int)
     for row in crossing:
@@ -42,7 +42,7 @@ def make_coordinates(**more):
         "position": CoordinateValues(POSITION, "rad", symbol="θe"),
         "time": CoordinateValues(TIME, "s", symbol="t"),
     }
-    return values | more
+    return values | further_coordinates
 
 
 def draw_noise(seed, pole=0.0):
@@ -56,8 +56,8 @@ def make_residual(torque, pole=0.0, level=0.1):
     return Residual("motor", TIME, torque, np.full(COUNT, level), correlation, 0.5 / PERIOD)
 
 
-def locate_torque(torque, seed=0, pole=0.0, **more):
-    return locate([make_residual(torque + 0.1 * draw_noise(seed, pole), pole)], [make_coordinates(**more)])
+def locate_torque(torque, seed=0, pole=0.0, **further_coordinates):
+    return locate([make_residual(torque + 0.1 * draw_noise(seed, pole), pole)], [make_coordinates(**further_coordinates)])
 
 
 @pytest.mark.parametrize("pole", [0.0, POLE], ids=["white", "correlated"])

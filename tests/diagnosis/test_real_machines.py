@@ -52,9 +52,9 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     assert summary["parameters"]["drive.motor_inertia"]["value"] == pytest.approx(95.1, rel=0.01)
     # behind the 100 Hz of the published figures
     driving = summary["gap"]["driving"]["motor"]
-    ((before, after, held),) = diagnosis.pairs["motor"]
+    ((before, after, is_held_out),) = diagnosis.pairs["motor"]
     error = [np.sqrt(np.mean(narrowed(finding, 100.0)[0].torque ** 2)) / driving for finding in (before, after)]
-    assert held
+    assert is_held_out
     assert error[0] == pytest.approx(0.66, abs=0.03)
     assert error[1] < 0.058
     assert summary["verdict"] == "unknown_effect"

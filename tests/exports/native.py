@@ -19,9 +19,9 @@ COMPILERS = [pytest.param(compiler, marks=pytest.mark.program(compiler)) for com
 
 def run_program(*command, cwd=None, **options):
     """Run a program; what it says is shown where it fails."""
-    done = subprocess.run(list(map(str, command)), cwd=cwd, capture_output=True, text=True, check=False, **options)
-    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
-    return done
+    result = subprocess.run(list(map(str, command)), cwd=cwd, capture_output=True, text=True, check=False, **options)
+    assert result.returncode == 0, f"{' '.join(map(str, command))}\n{result.stdout[-4000:]}\n{result.stderr[-4000:]}"
+    return result
 
 
 def write_harness(summary, header=True):

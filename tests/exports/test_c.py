@@ -25,9 +25,9 @@ GAINS = {
 }  # fmt: skip
 
 
-def study(kind="super_twisting", **more):
-    observer = {"kind": kind, "motor": GAINS, "load": GAINS} | more.pop("observer", {})
-    return small_study(identifier={"start": 0.1}, observer=observer, **more)
+def study(kind="super_twisting", **tables):
+    observer = {"kind": kind, "motor": GAINS, "load": GAINS} | tables.pop("observer", {})
+    return small_study(identifier={"start": 0.1}, observer=observer, **tables)
 
 
 def export_native(tmp_path, data, precision="double", **flags):

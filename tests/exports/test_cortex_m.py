@@ -52,8 +52,8 @@ def test_a_cortex_m4_computes_the_same_bits(tmp_path, kind):
     (tmp_path / "board.ld").write_text(_SCRIPT)
     build = ("arm-none-eabi-gcc", "-std=gnu99", "-O2", *UNCONTRACTED, *_CORE, "-T", "board.ld")
     run_program(*build, "drive.c", "board.c", "-lm", "-o", "board.elf", cwd=tmp_path)
-    done = run_program(*_MACHINE, "-kernel", "board.elf", cwd=tmp_path, stdin=-3, timeout=60)
-    words = (done.stdout + done.stderr).split()
+    result = run_program(*_MACHINE, "-kernel", "board.elf", cwd=tmp_path, stdin=-3, timeout=60)
+    words = (result.stdout + result.stderr).split()
     view = np.array([int(word, 16) for word in words], np.uint32).view(np.float32).reshape(-1, 2)
     native = Native(tmp_path)
     names = [output["name"] for output in native.summary["outputs"]]

@@ -40,9 +40,9 @@ def test_another_process_does_not_trace(tmp_path, monkeypatch):
     monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
     output = []
     for _ in range(2):
-        done = run_python("-c", SCRIPT, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        output.append(done.stdout.split())
+        result = run_python("-c", SCRIPT, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        output.append(result.stdout.split())
     assert output[0][0] == "1" and output[1][0] == "0"
     assert output[0][1:] == output[1][1:]
 

@@ -208,9 +208,9 @@ def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
 )
 def test_wrong_tables_get_one_line(table, message):
     arguments = rigid_study(tune=table)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as error:
         tune(arguments)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 def test_an_axis_over_no_path_names_the_nearest():

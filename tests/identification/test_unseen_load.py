@@ -63,8 +63,8 @@ def test_gap_and_friction_behind_the_gear_are_found(identification):
 def test_the_load_that_the_model_makes_of_it_is_the_true_one(identification):
     log, _ = simulate_geared_drive()
     # an angle that no channel holds: apart by a constant
-    apart = identification.trace["load.modelled_position"].to_numpy() - log.theta_s
-    assert np.std(apart[200:]) < 0.01 * np.std(log.theta_s)
+    error = identification.trace["load.modelled_position"].to_numpy() - log.theta_s
+    assert np.std(error[200:]) < 0.01 * np.std(log.theta_s)
 
 
 def test_a_log_without_torque_says_what_is_missing(tmp_path, log):

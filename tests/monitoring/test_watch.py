@@ -85,13 +85,13 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(growing_watch):
         assert (part["half_gap_from"] < part["half_gap"]).all()
         assert (part["half_gap_least"] < part["half_gap_from"]).all()
     # while it grows, a gap that was there within the window
-    first, last = (np.interp(values["t"] - ago, np.arange(0.0, SECONDS, 1e-3), GROWN * HALF_GAP) for ago in (4.0, 0.0))
+    first, last = (np.interp(values["t"] - delay, np.arange(0.0, SECONDS, 1e-3), GROWN * HALF_GAP) for delay in (4.0, 0.0))
     assert (values["half_gap"] > 0.99 * first).all()
     assert (values["half_gap"] < 1.01 * last).all()
-    passed, raised = 6.0, values["t"][values["alarm"]]
-    assert passed < raised.iloc[0] < passed + 6.0
-    assert len(raised) == (values["t"] >= raised.iloc[0]).sum()
-    assert result.summary["alarm"]["t"] == raised.iloc[0]
+    crossing_time, alarm_times = 6.0, values["t"][values["alarm"]]
+    assert crossing_time < alarm_times.iloc[0] < crossing_time + 6.0
+    assert len(alarm_times) == (values["t"] >= alarm_times.iloc[0]).sum()
+    assert result.summary["alarm"]["t"] == alarm_times.iloc[0]
     assert result.summary["alarm"]["half_gap"] > LIMIT
 
 
@@ -228,10 +228,10 @@ def test_values_are_the_same_whatever_pieces_rows_come_in(logs):
 def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
     """Lines say so, and it is no error."""
     rows = pd.read_csv(logs / "same.csv")
-    still = rows.copy()
-    still[["u", "theta_e", "theta_s"]] = [0.0, 0.3, 0.05]
+    standstill = rows.copy()
+    standstill[["u", "theta_e", "theta_s"]] = [0.0, 0.3, 0.05]
     log = tmp_path / "log.csv"
-    still.to_csv(log, index=False)
+    standstill.to_csv(log, index=False)
     task = read_watch_task(log, logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
     result = run_watch(task, ended=end_after_looks(8))
     assert (result.summary["values"], result.summary["determined"], result.summary["alarm"]) == (12, 0, None)

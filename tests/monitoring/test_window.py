@@ -110,8 +110,8 @@ def test_standard_errors_are_the_scatter():
 def test_what_determines_nothing_gives_nothing():
     rows = observer_rows()
     assert fill_window({name: values[:9000] for name, values in rows.items()}).estimate() == {}  # not full
-    still = {name: np.full_like(values, values[1]) for name, values in rows.items()}
-    assert fill_window(still).estimate() == {}
+    standstill = {name: np.full_like(values, values[1]) for name, values in rows.items()}
+    assert fill_window(standstill).estimate() == {}
     # one flank alone: the gap and the zero of the twist can't be told apart
     flank = rows | {"twist": 0.15 + 0.2 * np.abs(rows["twist"])}
     flank["motor.torque"] = filter_late(hinge_torque(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
@@ -123,13 +123,13 @@ def test_what_determines_nothing_gives_nothing():
 
 def test_samples_after_a_break_do_not_count_until_the_observers_have_settled():
     rows = observer_rows(20_000)
-    spoilt = {name: values.copy() for name, values in rows.items()}
+    spoilt_rows = {name: values.copy() for name, values in rows.items()}
     for side in ("motor", "load"):
-        spoilt[f"{side}.torque"][12_000:12_090] += 100.0
-    assert abs(fill_window(spoilt).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
+        spoilt_rows[f"{side}.torque"][12_000:12_090] += 100.0
+    assert abs(fill_window(spoilt_rows).estimate()["motor"].numbers["stiffness"].value / STIFFNESS - 1.0) > 1e-3
     window = Window(prepare_window(axis()), 10.0)
-    window.add({name: values[:12_000] for name, values in spoilt.items()}, restarts=True)
-    window.add({name: values[12_000:] for name, values in spoilt.items()}, restarts=True)
+    window.add({name: values[:12_000] for name, values in spoilt_rows.items()}, restarts=True)
+    window.add({name: values[12_000:] for name, values in spoilt_rows.items()}, restarts=True)
     assert window.estimate()["motor"].numbers["stiffness"].value == pytest.approx(STIFFNESS, rel=1e-3)
 
 

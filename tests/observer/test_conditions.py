@@ -156,9 +156,9 @@ def test_gains_are_judged_by_every_condition():
     assert list(summary["least_lambda"]) == list(conditions.CONDITIONS)
     assert summary["peak_ratio"] == pytest.approx(0.54, abs=0.005)
     assert 1.0 < summary["largest_f_plus"] <= 1.1
-    missed = conditions.judge_gains(1.5, 1.0, 1.0)
-    assert (missed["peak_ratio"], set(missed["least_lambda"].values())) == (None, {None})
-    assert not any(missed["holds"].values())
+    failing = conditions.judge_gains(1.5, 1.0, 1.0)
+    assert (failing["peak_ratio"], set(failing["least_lambda"].values())) == (None, {None})
+    assert not any(failing["holds"].values())
 
 
 @settings(deadline=None, max_examples=100)

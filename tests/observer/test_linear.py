@@ -38,20 +38,20 @@ def run_observer(observer, measured, acceleration, period):
 
 def prediction_matrix(period=H):
     """The prediction of position, velocity and disturbance as a matrix, and what the nominal input adds."""
-    still = np.array([*map(float, predict_next(0.0, 0.0, nominal_acceleration, period)), 0.0])
+    offset = np.array([*map(float, predict_next(0.0, 0.0, nominal_acceleration, period)), 0.0])
     columns = [
         np.array([*map(float, predict_next(x, v, nominal_acceleration, period, disturbance=d)), d]) for x, v, d in np.eye(3)
     ]
-    return np.stack(columns, axis=1) - np.outer(still, [1.0, 1.0, 1.0]), still
+    return np.stack(columns, axis=1) - np.outer(offset, [1.0, 1.0, 1.0]), offset
 
 
 def simulate_estimator(shares, measured, states):
     """The estimates of x_hat = x_predicted + L (y - x_predicted), by scipy's simulation of the linear system."""
-    a, still = (part[:states] for part in prediction_matrix())
+    a, offset = (part[:states] for part in prediction_matrix())
     a, gain, read = a[:, :states], np.array(shares)[:states, None], np.eye(1, states)
     correct = np.eye(states) - gain @ read
     # inputs are the measurement and one, the state is the predicted one
-    system = (a @ correct, np.hstack([a @ gain, still[:, None]]), correct, np.hstack([gain, np.zeros((states, 1))]), 1.0)
+    system = (a @ correct, np.hstack([a @ gain, offset[:, None]]), correct, np.hstack([gain, np.zeros((states, 1))]), 1.0)
     inputs = np.column_stack([measured, np.ones_like(measured)])
     return dlsim(system, inputs, x0=np.array([measured[0], 0.0, 0.0])[:states])[1]
 

@@ -187,8 +187,10 @@ def test_nan_without_excitation(law):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_one_twist_does_not_determine_two_unknowns(dtype):
-    held = np.full(100, 0.3)
-    _, estimates, excitation = identify(Identifier(regressor_filter="none"), SIGMOID, held, {"motor": held}, dtype=dtype)
+    constant_twist = np.full(100, 0.3)
+    _, estimates, excitation = identify(
+        Identifier(regressor_filter="none"), SIGMOID, constant_twist, {"motor": constant_twist}, dtype=dtype
+    )
     assert all(np.isnan(value) for value in estimates["motor"].values())
     assert abs(excitation) < 1e-6
 

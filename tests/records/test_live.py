@@ -95,10 +95,10 @@ def test_a_gap_in_time_begins_anew():
 def test_late_repeated_and_unreadable_rows_are_left_out():
     rows = make_rows(400)
     order = np.r_[0:100, 99, 98, 100:400]
-    mixed = rows[order]
-    mixed[250, 2] = np.nan
-    mixed[300, 0] = np.inf
-    parts, counts = poll_blocks(mixed[:101], mixed[101:])
+    disordered = rows[order]
+    disordered[250, 2] = np.nan
+    disordered[300, 0] = np.inf
+    parts, counts = poll_blocks(disordered[:101], disordered[101:])
     assert counts == {DISORDERED: 2, UNREADABLE: 2, LOST: 2}
     assert sum(len(part.torque) for part in parts) == 400
 
@@ -272,8 +272,8 @@ def test_what_is_no_text_is_not_followed(tmp_path):
 def datagrams():
     """A source, and a function that sends to it."""
     source = Datagrams("udp://127.0.0.1:0", NAMES)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        yield source, lambda *data: [out.sendto(part, ("127.0.0.1", source.port)) for part in data]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        yield source, lambda *data: [sender.sendto(part, ("127.0.0.1", source.port)) for part in data]
     source.close()
 
 
@@ -298,14 +298,14 @@ def test_a_header_says_the_order_and_may_come_with_each_datagram(datagrams):
 
 def test_no_datagram_ends_a_stream(datagrams):
     source, send = datagrams
-    bad = [b"", b"hello", b"t,u,x,y\n", b"1,2,3", b"\x00" * 9, b"\xff\xfe", bytes(range(256)) + b"!" * 5]
-    send(*bad)
+    bad_datagrams = [b"", b"hello", b"t,u,x,y\n", b"1,2,3", b"\x00" * 9, b"\xff\xfe", bytes(range(256)) + b"!" * 5]
+    send(*bad_datagrams)
     assert source.poll(0.1) is None
-    assert source.counts == {MALFORMED: len(bad) - 1}  # nothing is in the first
+    assert source.counts == {MALFORMED: len(bad_datagrams) - 1}  # nothing is in the first
     assert source.fault.startswith("; the last: ")
     send(b"0,1,2,3", b"4,5", b"6,7,8,nan")
     np.testing.assert_array_equal(source.poll(0.1)[1], [[0, 1, 2, 3], [6, 7, 8, np.nan]])
-    assert source.counts == {MALFORMED: len(bad)}
+    assert source.counts == {MALFORMED: len(bad_datagrams)}
 
 
 def test_addresses_are_checked():

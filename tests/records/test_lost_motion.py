@@ -16,12 +16,12 @@ def fit_frame(frame, expected=GEAR_RATIO):
     return fit_gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
 
 
-def simulate_load(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
+def simulate_load(seed, *, gap=0.02, drift=0.0, changes=(61.0,), turns_around=False):
     """To and fro, or around and around, under a load that pulls to one side and changes it at some times."""
     random = np.random.default_rng(seed)
     t = 0.02 * np.arange(6000)
     to_and_fro = 2.0 * np.abs((t + random.uniform(0.0, 30.0)) / 15.0 % 2.0 - 1.0)
-    load = 1.3 * t + 0.3 * np.sin(0.2 * t) if around else to_and_fro
+    load = 1.3 * t + 0.3 * np.sin(0.2 * t) if turns_around else to_and_fro
     forwards = np.sign(np.gradient(load))
     side = np.sign(np.prod([t - switch_times for switch_times in changes], axis=0)) * 0.5
     # what repeats with place and direction, and what wanders about a tenth of a second or a place
@@ -65,7 +65,7 @@ def test_intervals_by_the_side_of_the_load_cover_the_gap(options, repeats):
 def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around, repeats):
     for seed in range(repeats(4, 10)):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
-            fit = fit_frame(simulate_load(seed, around=around, **options), 1.0)
+            fit = fit_frame(simulate_load(seed, turns_around=around, **options), 1.0)
             assert fit.flank == "motion", (seed, options)
             assert not fit.exceeds_noise(1e-4) or fit.lost_motion < 0.005
 
@@ -73,8 +73,8 @@ def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around, r
 def test_places_where_the_load_hardly_pulls_do_not_count():
     """A quarter of the range where only half of the gap is crossed."""
     frame = simulate_load(3)
-    late = frame["t"] > 61.0
-    frame["theta_e"] -= np.where(late & (frame["theta_s"] < 0.5), 0.01, 0.0)
+    after_change = frame["t"] > 61.0
+    frame["theta_e"] -= np.where(after_change & (frame["theta_s"] < 0.5), 0.01, 0.0)
     fit = fit_frame(frame, 1.0)
     assert fit.lost_motion == pytest.approx(0.02, rel=0.05)
     assert fit.lost_motion_range[0] < 0.012 and fit.lost_motion_range[1] > 0.019

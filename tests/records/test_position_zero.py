@@ -13,13 +13,13 @@ def simulate_turning_log(
     random, period = np.random.default_rng(seed), 1e-3
     time = np.arange(8000) * period
     swing = 2.0 * np.pi * turns
-    place = swing * np.sin(2.0 * np.pi * 0.25 * time + seed)
-    speed = np.gradient(place, period)
+    position = swing * np.sin(2.0 * np.pi * 0.25 * time + seed)
+    speed = np.gradient(position, period)
     torque = 4e-5 * np.gradient(speed, period) + 1e-4 * speed + 0.015 * np.sign(speed) + 5e-4
-    read = place - zero + 1e-4 * random.standard_normal(len(time))
+    read = position - zero + 1e-4 * random.standard_normal(len(time))
     # the shaft winds up by what is transmitted, and cogging is not
     load = read - 1e-2 * torque if gear else None
-    torque += cogging * np.sin(10.0 * place + 0.4) + 0.5 * cogging * np.sin(5.0 * place)
+    torque += cogging * np.sin(10.0 * position + 0.4) + 0.5 * cogging * np.sin(5.0 * position)
     torque += 1e-3 * random.standard_normal(len(time))
     return TurningLog(torque, read, load, [slice(0, 4000), slice(4000, 8000)], period)
 

@@ -82,8 +82,8 @@ def test_the_model_that_is_given_stands(tmp_path):
 def test_friction_that_does_not_show_is_a_placeholder_of_its_own_unit(tmp_path):
     """A hundredth of the torque, at the rms speed."""
     t = 1e-3 * np.arange(4000)
-    place = np.sin(20.0 * t)
-    frame = pd.DataFrame({"t": t, "u": 0.01 * -400.0 * place - 1e-3 * 20.0 * np.cos(20.0 * t), "theta_e": place})
+    position = np.sin(20.0 * t)
+    frame = pd.DataFrame({"t": t, "u": 0.01 * -400.0 * position - 1e-3 * 20.0 * np.cos(20.0 * t), "theta_e": position})
     frame.to_csv(tmp_path / "log.csv", index=False)
     study, _, _ = propose_study(tmp_path / "log.csv")
     assert study["drive"]["motor_viscous"] == pytest.approx(0.01 * 4.0 / 20.0, rel=0.05)

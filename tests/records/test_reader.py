@@ -255,9 +255,9 @@ def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew,
         assert gearing.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
         assert any("lags theta_e" in n or "leads theta_e" in n for n in record.notes) == bool(skew)
         # undone on request
-        undone = read_record(path, {"theta_s": {"skew": "estimate"}})
-        assert any(note.startswith("theta_s: shifted by its skew") for note in undone.notes)
-        assert abs(undone.statistics.gearing.skew) < 4.0 * gearing.skew_error
+        corrected = read_record(path, {"theta_s": {"skew": "estimate"}})
+        assert any(note.startswith("theta_s: shifted by its skew") for note in corrected.notes)
+        assert abs(corrected.statistics.gearing.skew) < 4.0 * gearing.skew_error
 
 
 def test_a_given_skew_is_undone(tmp_path):
@@ -269,10 +269,10 @@ def test_a_given_skew_is_undone(tmp_path):
     assert record.start == pytest.approx(3e-3)
     np.testing.assert_allclose(record.torque, frame["u"][3:], atol=1e-9)
     np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], frame["theta_e"][3:], atol=1e-6)
-    late = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
-    gearing = read_record(write_frame(tmp_path, late)).statistics.channels["u"]
+    late_frame = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
+    gearing = read_record(write_frame(tmp_path, late_frame)).statistics.channels["u"]
     assert gearing.skew == pytest.approx(4e-3, abs=4.0 * gearing.skew_error + 1e-4)
-    record = read_record(write_frame(tmp_path, late), {"u": {"skew": 4e-3}})
+    record = read_record(write_frame(tmp_path, late_frame), {"u": {"skew": 4e-3}})
     assert abs(record.statistics.channels["u"].skew) < 2e-4
 
 
@@ -495,8 +495,8 @@ def test_columns_of_unequal_length_are_told(tmp_path):
 def test_doubts_are_remarks(tmp_path):
     frame = simulate_log()
     # one encoder of another drive
-    odd = frame.assign(theta_s=simulate_log(seed=5)["theta_s"])
-    notes = read_record(write_frame(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
+    unrelated = frame.assign(theta_s=simulate_log(seed=5)["theta_s"])
+    notes = read_record(write_frame(tmp_path, unrelated), gear_ratio=GEAR_RATIO).notes
     assert any(note.startswith("theta_e and theta_s are hardly related") for note in notes)
     warnings = read_record(write_frame(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).warnings
     assert any("if the stamps are not in s, set [log] t.unit" in warning for warning in warnings)
@@ -682,8 +682,8 @@ def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_pa
 
 @pytest.fixture
 def write_and_read(tmp_path):
-    def write(name, **how):
-        simulate_log(**how).to_csv(tmp_path / name, index=False)
+    def write(name, **options):
+        simulate_log(**options).to_csv(tmp_path / name, index=False)
         return read_record(tmp_path / name)
 
     return write

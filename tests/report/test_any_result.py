@@ -20,7 +20,7 @@ def study():
 
 def test_a_notebook_shows_figures_with_captions_and_texts(study):
     figures, heatmap = jaxbl.draw(study), jaxbl.draw(study, "heatmap_motor_chatter")
-    assert len(figures) == 2 and [drawn.name for drawn in heatmap] == ["heatmap_motor_chatter"]
+    assert len(figures) == 2 and [drawing.name for drawing in heatmap] == ["heatmap_motor_chatter"]
     html = heatmap._repr_html_()
     assert html.count("<figure>") == 1 and f"<figcaption>{heatmap[0].caption}</figcaption>" in html
     assert f"x {ALPHA} (rad/s²) from " in html.partition('alt="')[2].partition('"')[0]

@@ -81,19 +81,19 @@ def test_kinds_that_are_alike_are_said_first(point_choice):
 
 
 def test_the_point_figure_has_a_dot_at_each_ratio(point_choice):
-    (drawn,) = draw_choice(point_choice)
-    (ax,) = drawn.figure.axes
+    (drawing,) = draw_choice(point_choice)
+    (ax,) = drawing.figure.axes
     kinds = point_choice.summary["points"][0]["sides"]["motor"]["kinds"]
     assert [label.get_text() for label in ax.get_yticklabels()] == list(kinds)
     dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
     np.testing.assert_allclose(dots, [kind["ratio"] for kind in kinds.values()])
-    assert drawn.name == "observers" and "rad/s" in drawn.caption
+    assert drawing.name == "observers" and "rad/s" in drawing.caption
 
 
 def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
-    (drawn,) = draw(mapped_choice, "observers_motor")
-    (ax,) = drawn.figure.axes
-    short = short_names(KINDS)
+    (drawing,) = draw(mapped_choice, "observers_motor")
+    (ax,) = drawing.figure.axes
+    short_kinds = short_names(KINDS)
     cells = {text.get_position(): text.get_text() for text in ax.texts}
     assert len(cells) == 6
     for point in mapped_choice.summary["points"]:
@@ -102,18 +102,18 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
         # x is the last axis; a resolution of zero has no place on a logarithmic scale
         text = cells[float(resolution > 0.0), noise]
         first, _, second = text.partition("\n")
-        assert first == short[side["best"]] + "=" * bool(side["not_told_apart"])
+        assert first == short_kinds[side["best"]] + "=" * bool(side["not_told_apart"])
         assert bool(second) == (side["best"] != "super_twisting")
-    save(drawn.figure, tmp_path / "map.png")
-    plt.close(drawn.figure)
+    save(drawing.figure, tmp_path / "map.png")
+    plt.close(drawing.figure)
 
 
 def test_one_axis_is_drawn_as_lines(mapped_choice):
-    line = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
-    (drawn,) = draw_choice(line)
-    (ax,) = drawn.figure.axes
+    line_choice = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
+    (drawing,) = draw_choice(line_choice)
+    (ax,) = drawing.figure.axes
     assert [point.get_label() for point in ax.lines] == KINDS
-    errors = [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in line.summary["points"]]
+    errors = [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in line_choice.summary["points"]]
     np.testing.assert_allclose(ax.lines[2].get_ydata(), errors)
     # the same points are in the map
     np.testing.assert_allclose(
@@ -123,16 +123,16 @@ def test_one_axis_is_drawn_as_lines(mapped_choice):
 
 def test_points_won_are_counted(mapped_choice):
     first, second = choice_headline(mapped_choice.summary)
-    won = [point["sides"]["motor"]["best"] for point in mapped_choice.summary["points"]]
-    for kind in set(won):
-        assert f"{kind} at {won.count(kind)}" in first
+    winners = [point["sides"]["motor"]["best"] for point in mapped_choice.summary["points"]]
+    for kind in set(winners):
+        assert f"{kind} at {winners.count(kind)}" in first
     ratios = [point["sides"]["motor"]["kinds"]["kalman"]["ratio"] for point in mapped_choice.summary["points"]]
     assert f"kalman {min(ratios):.3g} to {max(ratios):.3g}" in second
 
 
 def test_short_names_are_different():
     names = ["super_twisting", "differentiator_3", "differentiator_1", "dirty_derivative", "slow_tracker", "steady_twin"]
-    result = short_names(names)
-    assert result["super_twisting"] == "ST"
-    assert result["differentiator_3"] == "D3"
-    assert len(set(result.values())) == len(names)
+    short_by_name = short_names(names)
+    assert short_by_name["super_twisting"] == "ST"
+    assert short_by_name["differentiator_3"] == "D3"
+    assert len(set(short_by_name.values())) == len(names)

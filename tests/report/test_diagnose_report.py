@@ -198,14 +198,14 @@ def test_a_torque_that_is_far_off_comes_first(relative, doubtful):
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
 def test_the_verdict_is_drawn(findings, tmp_path):
-    drawn = _verdict(change_summary(findings=findings, verdict="explained" if findings else "no_discrepancy"))
-    left, right = drawn.figure.axes
+    drawing = _verdict(change_summary(findings=findings, verdict="explained" if findings else "no_discrepancy"))
+    left, right = drawing.figure.axes
     assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"
     assert left.get_yticklabels()[0].get_text() == "motor position\n0.1 → 0.0011 rad"
     texts = [text.get_text().strip() for text in right.texts]
     expected = ["load.coulomb_friction: 0.93", "or load.stribeck_friction: 0.07"] if findings else ["no effect named"]
     assert texts == expected
-    assert save(drawn.figure, tmp_path / "gap.png").stat().st_size > 10_000
+    assert save(drawing.figure, tmp_path / "gap.png").stat().st_size > 10_000
 
 
 @dataclasses.dataclass
@@ -235,8 +235,8 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     record = _Named(unit_of=lambda path, unit: unit, path=tmp_path / "axis.csv")
     gap = {"holdout": {"separate": False}}
     part = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
-    drawn = _over_time(part)  # type: ignore[arg-type]
-    (ax,) = drawn.figure.axes
+    drawing = _over_time(part)  # type: ignore[arg-type]
+    (ax,) = drawing.figure.axes
     assert ax.get_ylabel() == "motor:\nmissing torque (N m)"
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["before", "after", "± 2 noise", "held out"]
-    assert save(drawn.figure, tmp_path / "before_after.png").stat().st_size > 10_000
+    assert save(drawing.figure, tmp_path / "before_after.png").stat().st_size > 10_000

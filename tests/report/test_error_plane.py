@@ -33,12 +33,12 @@ def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
 def test_why_there_is_no_majorant_is_said(changes, sentence):
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5} | changes
     trial = run(small_study({"observer.motor": gains, "run.duration": 1.0}))
-    drawn = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
-    assert drawn.caption.endswith(sentence) and len(drawn.figure.axes[0].get_lines()) == 1
+    drawing = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
+    assert drawing.caption.endswith(sentence) and len(drawing.figure.axes[0].get_lines()) == 1
 
 
 def test_marked_gains_whose_alpha_is_too_small_have_no_plane():
     mark = {"name": "a", "lambda_ratio": 1.0, "alpha_ratio": 2.0, "peak_ratio": 0.7}
     assert draw_worst_planes([mark | {"alpha_ratio": 0.9, "peak_ratio": None}, mark | {"alpha_ratio": None}]) is None
-    drawn = draw_worst_planes([mark] * 4)
-    assert [ax.get_title(loc="left") for ax in drawn.figure.axes] == ["a"] * 4
+    drawings = draw_worst_planes([mark] * 4)
+    assert [ax.get_title(loc="left") for ax in drawings.figure.axes] == ["a"] * 4

@@ -25,15 +25,15 @@ def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
     line = conditions_line("motor", result, "of a test")
     assert line.startswith(f"motor: at f⁺ = {bound:g} rad/s², of a test, ")
     assert text in line
-    drawn = draw_gain_plane("motor", result)
-    ax = drawn.figure.axes[0]
+    drawing = draw_gain_plane("motor", result)
+    ax = drawing.figure.axes[0]
     star = next(line for line in ax.lines if line.get_marker() == "*")
     (x,), (y,) = star.get_data()
     low, high = ax.get_ylim()
     assert (x, y) == (max(alpha, ax.get_xlim()[0]), max(lambda_, low))
     assert high > low > 0.0
     # above and on the right the same in units of f⁺
-    save(drawn.figure, tmp_path / "plane.png")
+    save(drawing.figure, tmp_path / "plane.png")
     top, right = ax.child_axes
     np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
     np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
@@ -55,10 +55,10 @@ def test_factors_lead_to_where_the_exact_condition_fails():
     result = judge_gains(1.24, 2.84, 1.97)
     line = conditions_line("motor", result, "of a test")
     factor = float(line.partition("fall by a factor of ")[2].partition(" ")[0])
-    grown = float(line.partition("grow by one of ")[2].partition(" ")[0])
-    for share, held in ((0.999, True), (1.001, False)):
-        assert judge_gains(1.24 / (factor * share), 2.84, 1.97)["holds"]["exact"] == held
-        assert judge_gains(1.24, 2.84, 1.97 * grown * share)["holds"]["exact"] == held
+    growth = float(line.partition("grow by one of ")[2].partition(" ")[0])
+    for share, holds in ((0.999, True), (1.001, False)):
+        assert judge_gains(1.24 / (factor * share), 2.84, 1.97)["holds"]["exact"] == holds
+        assert judge_gains(1.24, 2.84, 1.97 * growth * share)["holds"]["exact"] == holds
     # the dashed curve for that f⁺ goes through the gains
     ax = draw_gain_plane("motor", result).figure.axes[0]
     edge = next(line for line in ax.lines if line.get_color() == "black" and line.get_linestyle() == "--")

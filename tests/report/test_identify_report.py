@@ -127,17 +127,17 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_all_figures_are_drawn_with_units(case, tmp_path):
-    data, how, names = CASES[case]
-    result = make_identification(data, tmp_path, **how)
-    drawn = draw_identification(result)
-    assert [drawing.name for drawing in drawn] == names
-    for drawing in drawn:
+    data, options, names = CASES[case]
+    result = make_identification(data, tmp_path, **options)
+    drawings = draw_identification(result)
+    assert [drawing.name for drawing in drawings] == names
+    for drawing in drawings:
         assert drawing.caption.endswith(".")
         assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
         if drawing.name != "intervals":
             assert "(" in drawing.figure.axes[0].get_ylabel(), drawing.name
             assert "(" in drawing.figure.axes[-1].get_xlabel(), drawing.name
-    figures = {drawing.name: drawing.figure for drawing in drawn}
+    figures = {drawing.name: drawing.figure for drawing in drawings}
     if case == "measured":
         assert [ax.get_title(loc="left") for ax in figures["hysteresis"].axes] == [
             "by the motor side",
@@ -195,10 +195,10 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     axes = draw_by_name(result)["torque"].figure.axes
     rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
     assert len(rms) == 2
-    without = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
-    axes = draw_by_name(without)["torque"].figure.axes
-    more = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
-    assert min(rms) < 0.6 * min(more)
+    bare_result = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
+    axes = draw_by_name(bare_result)["torque"].figure.axes
+    rms_without = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
+    assert min(rms) < 0.6 * min(rms_without)
 
 
 def test_long_log_shows_its_largest_motion_in_full(tmp_path):
@@ -219,9 +219,9 @@ def test_observers_that_diverged_leave_figures(tmp_path):
     trace = result.trace.copy()
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
-    drawn = draw_identification(dataclasses.replace(result, trace=trace))
-    assert [drawing.name for drawing in drawn] == GEARED
-    for drawing in drawn:
+    drawings = draw_identification(dataclasses.replace(result, trace=trace))
+    assert [drawing.name for drawing in drawings] == GEARED
+    for drawing in drawings:
         save(drawing.figure, tmp_path / f"{drawing.name}.png")
 
 

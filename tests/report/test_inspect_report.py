@@ -30,14 +30,14 @@ CASES = {
 def test_all_figures_are_drawn_with_units(tmp_path, case):
     frame, log, names = CASES[case]
     frame.to_parquet(tmp_path / "log.parquet")
-    drawn = draw_inspection(inspect(tmp_path / "log.parquet", log))
-    assert [d.name for d in drawn] == names
-    for d in drawn:
+    drawings = draw_inspection(inspect(tmp_path / "log.parquet", log))
+    assert [d.name for d in drawings] == names
+    for d in drawings:
         assert d.caption.endswith(".")
         assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
         assert "(" in d.figure.axes[-1].get_xlabel()
         assert "(" in d.figure.axes[0].get_ylabel()
-    units = [ax.get_ylabel().split("\n")[-1] for ax in drawn[0].figure.axes]
+    units = [ax.get_ylabel().split("\n")[-1] for ax in drawings[0].figure.axes]
     if case == "load alone, linear":
         assert units == ["(N)", "(m)", "(m/s)"]
     if case == "both encoders":

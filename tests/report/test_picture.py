@@ -20,9 +20,9 @@ def draw_picture(tmp_path, draw):
     draw(left)
     right.barh([0, 1], [3.0, 4.0])
     right.set_yticks([0, 1], ["first", "second"])
-    drawn = Drawn("one", figure, "What it shows.")
+    drawing = Drawn("one", figure, "What it shows.")
     save(figure, tmp_path / "one.png")
-    return picture(drawn)
+    return picture(drawing)
 
 
 def test_lines_bars_names_and_a_description(tmp_path):
@@ -54,9 +54,9 @@ def test_cells_have_values_where_a_colour_bar_says_of_what(tmp_path, bar):
     mesh = ax.pcolormesh([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 2.0], np.ma.masked_equal([[1.0, 2.0, 3.0], [4.0, 5.0, 0.0]], 0.0))
     if bar:
         figure.colorbar(mesh, ax=ax, label="error (rad)")
-    drawn = Drawn("map", figure, "A map.")
+    drawing = Drawn("map", figure, "A map.")
     save(figure, tmp_path / "map.png")
-    (panel,) = picture(drawn).panels
+    (panel,) = picture(drawing).panels
     assert ("cells" in panel) == bar
     if bar:
         assert panel["cells"]["name"] == "error (rad)"

@@ -32,12 +32,12 @@ def test_observers_that_converge_are_drawn_thin(tmp_path):
     residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
-    drawn = draw_residuals(residuals, coordinates, result, observed=observed)[0]
-    above, below = (ax.get_legend_handles_labels()[1] for ax in drawn.figure.axes)
+    drawing = draw_residuals(residuals, coordinates, result, observed=observed)[0]
+    above, below = (ax.get_legend_handles_labels()[1] for ax in drawing.figure.axes)
     assert above[:2] == below == ["missing", "± 2 noise"] and len(above) == 3
-    assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawn.caption
-    assert drawn.figure.axes[0].lines[1].get_linewidth() < drawn.figure.axes[0].lines[0].get_linewidth()
-    assert save(drawn.figure, tmp_path / "over_time.png").stat().st_size > 10_000
+    assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawing.caption
+    assert drawing.figure.axes[0].lines[1].get_linewidth() < drawing.figure.axes[0].lines[0].get_linewidth()
+    assert save(drawing.figure, tmp_path / "over_time.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("unit", ["N m", "N"])
@@ -48,15 +48,15 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     residuals = {name: [residual] for name, (residual, _) in pairs.items()}
     coordinates = {name: [values] for name, (_, values) in pairs.items()}
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
-    drawn = {drawing.name: drawing for drawing in draw_residuals(residuals, coordinates, result, unit)}
-    assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
-    above, below = drawn["residual_torque"].figure.axes
+    drawings = {drawing.name: drawing for drawing in draw_residuals(residuals, coordinates, result, unit)}
+    assert list(drawings) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
+    above, below = drawings["residual_torque"].figure.axes
     assert sentence_of(result["motor"], unit) == " ".join(above.get_title("left").split())
     assert "nothing beyond noise" in below.get_title("left")
     assert above.get_ylabel().endswith(f"({unit})")
-    assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"
-    marks = [text.get_text() for text in drawn["residual_spectrum"].figure.axes[0].texts]
+    assert drawings["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"
+    marks = [text.get_text() for text in drawings["residual_spectrum"].figure.axes[0].texts]
     assert any(text.startswith("11 Hz") for text in marks)
-    for drawing in drawn.values():
+    for drawing in drawings.values():
         assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 10_000
         assert drawing.caption.endswith(".")

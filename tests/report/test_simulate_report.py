@@ -28,14 +28,14 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_all_figures_are_drawn_with_units(tmp_path, case):
     data, names = CASES[case]
-    drawn = draw_trial(run(data))
-    assert [d.name for d in drawn] == names
-    for d in drawn:
+    drawings = draw_trial(run(data))
+    assert [d.name for d in drawings] == names
+    for d in drawings:
         assert d.caption.endswith(".")
         assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
         for ax in d.figure.axes:
             assert "(" in ax.get_ylabel(), d.name
         assert "(" in d.figure.axes[-1].get_xlabel() or d.name == "dead_zone" or d.name.startswith("error_plane")
     if case == "sigmoid":
-        zone = next(d for d in drawn if d.name == "dead_zone").figure.axes
+        zone = next(d for d in drawings if d.name == "dead_zone").figure.axes
         assert [ax.get_ylabel() for ax in zone] == ["stiffness (N m/rad)", "dead zone (rad)", "half gap (rad)"]

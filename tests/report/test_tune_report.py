@@ -118,19 +118,19 @@ def set_binding(summary, binding):
 def test_map_and_sentence_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
         result = dataclasses.replace(tuning, summary=set_binding(tuning.summary, binding))
-        drawn = {d.name: d for d in draw_tuning(result)}
+        drawings = {d.name: d for d in draw_tuning(result)}
         legends = {
-            name: [text.get_text() for legend in drawn[name].figure.legends for text in legend.get_texts()]
+            name: [text.get_text() for legend in drawings[name].figure.legends for text in legend.get_texts()]
             for name in ("tuning_motor", "limits_motor")
         }
-        named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
-        assert named == [bool(binding)] * 2
-        assert ("Bold line: margin_exact, which binds." in drawn["tuning_motor"].caption) == bool(binding)
+        are_named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
+        assert are_named == [bool(binding)] * 2
+        assert ("Bold line: margin_exact, which binds." in drawings["tuning_motor"].caption) == bool(binding)
         lead = next(line for line in tune_headline(result.summary) if line.startswith("motor, what limits the gains: "))
-        assert lead.partition(": ")[2].partition(" (Chatter")[0] in drawn["limits_motor"].caption
+        assert lead.partition(": ")[2].partition(" (Chatter")[0] in drawings["limits_motor"].caption
         assert ("margin_exact = 1.1 (here" in lead) == bool(binding)
         assert ("no constraint binds" in lead) != bool(binding)
-        titles = [ax.get_title("left") for ax in drawn["limits_motor"].figure.axes]
+        titles = [ax.get_title("left") for ax in drawings["limits_motor"].figure.axes]
         assert ("← smaller λ: margin_exact" in titles) == bool(binding)
 
 

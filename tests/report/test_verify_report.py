@@ -22,8 +22,8 @@ def verify_report(verified_study, tmp_path_factory):
 
 def test_figures(verify_report):
     verdict, _, _ = verify_report
-    drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
-    assert list(drawn) == [
+    drawings = {drawing.name: drawing for drawing in draw_verdict(verdict)}
+    assert list(drawings) == [
         "atlas",
         "tuning_rules",
         "error_planes",
@@ -32,8 +32,8 @@ def test_figures(verify_report):
         "conservatism",
         "claimed_bound",
     ]
-    assert all(drawing.caption for drawing in drawn.values())
-    atlas = drawn["atlas"].figure
+    assert all(drawing.caption for drawing in drawings.values())
+    atlas = drawings["atlas"].figure
     legend = [text.get_text() for text in atlas.legends[0].get_texts()]
     for label in ("exact, ρ < 1", "simulated boundary", "usual pair (1.5, 1.1)", "small gains"):
         assert any(text.startswith(label) for text in legend), label
@@ -71,21 +71,23 @@ def test_page_and_lines(verify_report):
 def test_tuning_rules_in_figure_page_and_lines(verify_report):
     verdict, folder, lines = verify_report
     rules = verdict.summary["rules"]
-    (drawn,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
-    good, wrong = drawn.figure.axes
-    legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (good, wrong)]
+    (rules_drawing,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
+    sufficient_axes, failing_axes = rules_drawing.figure.axes
+    legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (sufficient_axes, failing_axes)]
     for rule in rules:
         assert (rule["title"] in legends[0]) == rule["sufficient"]
         assert (rule["title"] in legends[1]) != rule["sufficient"]
-    crosses = [line.get_xydata()[0] for line in wrong.lines if line.get_marker() == "x"]
-    failed = [rule["counterexample"] for rule in rules if not rule["sufficient"]]
-    expected = [(actual["alpha"] / actual["f_plus"], actual["lambda"] / actual["f_plus"] ** 0.5) for actual in failed]
+    crosses = [line.get_xydata()[0] for line in failing_axes.lines if line.get_marker() == "x"]
+    counterexamples = [rule["counterexample"] for rule in rules if not rule["sufficient"]]
+    expected = [
+        (actual["alpha"] / actual["f_plus"], actual["lambda"] / actual["f_plus"] ** 0.5) for actual in counterexamples
+    ]
     np.testing.assert_allclose(crosses, expected)
     page = (folder / "report.html").read_text()
     assert all(rule["source"].split(",")[0] in page for rule in rules)
-    (counted,) = [line for line in lines if "public tuning rules are sufficient" in line]
-    assert counted.startswith(f"{len(rules) - len(failed)} of {len(rules)} ")
-    assert sum(line.startswith("Tuning rule ") for line in lines) == len(failed) > 0
+    (count_line,) = [line for line in lines if "public tuning rules are sufficient" in line]
+    assert count_line.startswith(f"{len(rules) - len(counterexamples)} of {len(rules)} ")
+    assert sum(line.startswith("Tuning rule ") for line in lines) == len(counterexamples) > 0
 
 
 @needs_chromium

@@ -67,11 +67,11 @@ def test_processes_of_this_machine_give_the_same_table(tmp_path):
 
 
 def test_workers_of_a_client_that_was_lost_are_waited_for(tmp_path, client):
-    with ExitStack() as held:
-        held.enter_context(lock_folder(tmp_path / "study", shared=True))
+    with ExitStack() as stack:
+        stack.enter_context(lock_folder(tmp_path / "study", shared=True))
         with pytest.raises(FolderInUse):
             sweep(thirty_run_study(), tmp_path / "study")
-        Timer(1.0, held.pop_all().close).start()
+        Timer(1.0, stack.pop_all().close).start()
         assert sweep(thirty_run_study(), tmp_path / "study", scheduler=client).cost["lanes"] == 30
 
 
@@ -153,19 +153,19 @@ def test_errors_of_workers_reach_who_asked(client, monkeypatch):
             list(workers.map_jobs(_raise_error, ["input"]))
         with pytest.raises(InputError, match="its workers lack a module"):
             list(workers.map_jobs(_raise_error, ["module"]))
-        asking = [cluster.version("jaxbl")]
-        monkeypatch.setattr(cluster, "version", lambda name: asking.pop() if asking else "0.0.1")
+        requests = [cluster.version("jaxbl")]
+        monkeypatch.setattr(cluster, "version", lambda name: requests.pop() if requests else "0.0.1")
         with pytest.raises(InputError, match=r"worker .* has jaxbl 0\.0\.1; install .* there"):
             list(workers.map_jobs(abs, [1]))
 
 
 def test_jobs_are_taken_as_they_are_needed(client):
-    taken = []
+    taken_jobs = []
     with connect(client) as workers:
-        results = workers.map_jobs(abs, (taken.append(number) or number for number in itertools.count()))
+        results = workers.map_jobs(abs, (taken_jobs.append(number) or number for number in itertools.count()))
         assert [next(results) for _ in range(40)] == list(range(40))
         # in flight, and done but not yet asked for
-        assert len(taken) <= 40 + 2 * cluster._FEWEST_AHEAD
+        assert len(taken_jobs) <= 40 + 2 * cluster._FEWEST_AHEAD
         results.close()
 
 
@@ -179,7 +179,11 @@ def _wait_to_go_on(job):
 def test_a_scheduler_that_is_lost_is_said():
     # one thread, so that the job that waits begins after the other
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(**options) as there, Client(there, set_as_default=False) as connection, connect(connection) as workers:
+    with (
+        LocalCluster(**options) as cluster,
+        Client(cluster, set_as_default=False) as connection,
+        connect(connection) as workers,
+    ):
         results = workers.map_jobs(_wait_to_go_on, [False, True])
         assert next(results) is False
         connection.close()

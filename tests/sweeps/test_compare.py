@@ -21,13 +21,13 @@ def study(*axes, function=lambda frame: frame[ALPHA], seeds=6, changes=None, **c
     )
 
 
-def noisy_error(shift=lambda frame: 0.0, spread=0.1, seed=0, more=0.01):
+def noisy_error(shift=lambda frame: 0.0, spread=0.1, seed=0, own_spread=0.01):
     """An error under noise that runs of one seed share, and a little that they do not."""
 
     def function(frame):
         rng, other = np.random.default_rng(5), np.random.default_rng([1, seed])
         shared = rng.normal(size=100)[frame["seed"]]
-        return frame[ALPHA] * (1.0 + spread * shared + more * other.normal(size=len(frame)) + shift(frame))
+        return frame[ALPHA] * (1.0 + spread * shared + own_spread * other.normal(size=len(frame)) + shift(frame))
 
     return function
 
@@ -58,15 +58,15 @@ def test_points_beyond_noise_are_named_with_their_place_and_direction():
         motor__velocity_rmse=noisy_error(far_shift, seed=2),
     )
     later.source["seed"] += 50
-    apart = compare(first, later)
-    assert (apart.seeds, apart.paired) == (0, False)
-    assert next(m for m in apart.metrics if m.metric == RMSE).differs == 0
+    unpaired = compare(first, later)
+    assert (unpaired.seeds, unpaired.paired) == (0, False)
+    assert next(m for m in unpaired.metrics if m.metric == RMSE).differs == 0
 
 
 @pytest.mark.parametrize("paired", [True, False])
 def test_the_tests_are_those_of_scipy(paired):
-    first = study(function=noisy_error(more=0.05))
-    second = study(function=noisy_error(more=0.05, seed=1, shift=lambda frame: 0.1 * frame[LAMBDA] - 0.2))
+    first = study(function=noisy_error(own_spread=0.05))
+    second = study(function=noisy_error(own_spread=0.05, seed=1, shift=lambda frame: 0.1 * frame[LAMBDA] - 0.2))
     if not paired:
         second.source["seed"] += 10
     a, b = (result.frame.sort_values([ALPHA, LAMBDA, "seed"])[RMSE].to_numpy().reshape(100, 6) for result in (first, second))
@@ -171,7 +171,7 @@ def test_text_and_figure(axes):
     comparison = compare(first, second)
     lines = comparison_lines(comparison)
     assert max(len(part) for line in lines for part in line.split("\n")) <= 80
-    drawn = draw_comparison(comparison, first.config)
-    assert len(drawn) == (len(axes[0].get("values", [0, 0])) > 1)
+    drawings = draw_comparison(comparison, first.config)
+    assert len(drawings) == (len(axes[0].get("values", [0, 0])) > 1)
     names = {field.name for field in dataclasses.fields(comparison) if not field.name.startswith("_")}
     assert set(comparison.to_dict()) == names

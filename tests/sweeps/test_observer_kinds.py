@@ -24,8 +24,8 @@ GAINS = {
 }
 
 
-def study(**more):
-    return small_study(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
+def study(**tables):
+    return small_study(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | tables
 
 
 def sweep_kinds(kinds, backend):
@@ -78,9 +78,9 @@ def test_an_axis_over_gains_needs_kinds_that_have_them():
     ],
 )
 def test_wrong_observers_get_one_line(observer, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as error:
         read_config(small_study() | {"observer": observer})
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
