@@ -61,7 +61,7 @@ def _note_elsewhere(errors, origin, request):
 
 
 def check_figures(page, figures):
-    """So many figures have loaded and have a text; nothing serious is in the way of a screen reader or keyboard."""
+    """Assert that a page shows this number of figures, each with a text, and that screen reader and keyboard can use it."""
     images = page.evaluate("[...document.images].map((image) => [image.complete && image.naturalWidth > 0, image.alt])")
     assert len(images) == figures
     assert all(loaded and len(text) > 20 for loaded, text in images)

@@ -99,7 +99,7 @@ def start_command(*arguments, cwd, **environment):
 
 
 def run_command(*arguments, cwd, **environment):
-    """The same until it has ended: `returncode`, `stdout` and `stderr`."""
+    """Run `jaxbl` with these arguments to its end: `returncode`, `stdout` and `stderr`."""
     return run_python("-m", "jaxbl", *arguments, cwd=cwd, **environment)
 
 

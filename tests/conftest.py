@@ -42,14 +42,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_programs():
-    """Over many files, compiled programs would use up what the system lets a process map into memory."""
+    """Clear compiled programs after a file: those of many files would use up the memory maps of a process."""
     yield
     clear_programs_if_needed()
 
 
 @pytest.fixture
 def every_figure_drawn():
-    """For tests that look at files of figures, or at places that are known once a figure is drawn."""
+    """Draw every figure, for tests that look at files of figures or at places in them."""
     with every_figure():
         yield
 

@@ -70,7 +70,7 @@ def multisine_study(duration: float, **tables: Any) -> dict[str, Any]:
 
 
 def rigid_study(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
-    """The same for a single inertia, without a transmission and a load observer."""
+    """The small study with a single inertia, without a transmission and a load observer."""
     tables = {"drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.15}} | tables
     removals = {path: None for path in ("transmission", "observer.load") if path not in tables}
     return small_study(removals | (changes or {}), **tables)

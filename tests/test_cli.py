@@ -544,7 +544,7 @@ print(json.dumps(ended))
 
 
 def shorten_study(study):
-    """The same study on few points, over half a second."""
+    """Shorten a study to few points and half a second."""
     study["run"]["duration"] = 0.5
     tuned = study.get("tune", {})
     tuned["refine"] = 0

@@ -21,7 +21,7 @@ SITE = ROOT / "docs" / "_build" / "html"
 
 @pytest.fixture(scope="module")
 def pages():
-    """Its pages, as `make docs` builds them: only those that have changed since it last did."""
+    """Pages of the site, as `make docs` builds them: only pages that have changed since the last build."""
     words = "-m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html"
     assert words in (ROOT / "Makefile").read_text(encoding="utf-8")
     subprocess.run(

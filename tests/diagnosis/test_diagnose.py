@@ -335,7 +335,7 @@ def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
 
 
 def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
-    """And not called complete: friction of a third of the input goes unseen."""
+    """The log is not called complete, because friction of a third of the input goes unseen."""
     torque = 2e-3 * simulate_multisine_log().u
     simulate_direct_drive(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
     message = (

@@ -61,7 +61,7 @@ def test_chirp_against_scipy_and_steady_afterwards():
 
 @pytest.fixture(scope="module")
 def long_bits():
-    """That repeat only after the run: each tells its own index."""
+    """Bits of a sequence that repeats only after the run, so that each tells its own index."""
     return sample(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(60_000))
 
 

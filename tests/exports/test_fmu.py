@@ -68,7 +68,7 @@ for table in STUDIES["changed gap"]["effects"]:
 
 @pytest.fixture(autouse=True)
 def _for_this_machine(monkeypatch):
-    """To compile for Windows, too, takes half a second each."""
+    """Export for this machine alone, because a second compilation takes half a second."""
     monkeypatch.setattr("jaxbl.exports.fmu._WINDOWS", _WINDOWS._replace(compiler="not here"))
 
 
@@ -79,7 +79,7 @@ def windows_too(_for_this_machine, monkeypatch):
 
 @pytest.fixture
 def sources_alone(monkeypatch):
-    """For tests that need no binary."""
+    """Export without a binary."""
     offer_programs(monkeypatch)
 
 
@@ -91,7 +91,7 @@ def export_unit(data, folder, fmi=3, **options):
 
 @pytest.fixture(scope="module")
 def unit_of(tmp_path_factory):
-    """The same for a study by its name, exported once."""
+    """Return a function that exports a study by its name, once."""
     return functools.cache(lambda name, fmi: export_unit(STUDIES[name], tmp_path_factory.mktemp("unit"), fmi))
 
 
@@ -510,7 +510,7 @@ def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
 
 
 def offer_programs(monkeypatch, *programs):
-    """No other programs are found."""
+    """Let the export find these programs and no others."""
     monkeypatch.setattr(
         "jaxbl.exports.fmu.shutil.which", {program: shutil.which(program) or program for program in programs}.get
     )

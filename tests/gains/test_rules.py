@@ -127,7 +127,7 @@ def test_counterexamples_in_the_observers_own_states(name, judged_rules):
 
 @pytest.mark.parametrize("name", STATED)
 def test_coverage_is_the_share_of_cells(name, judged_rules):
-    """Counted by points drawn evenly over the logarithmic map."""
+    """The share is counted again by points drawn evenly over the logarithmic map."""
     draw = np.random.default_rng(7)
     alpha = ALPHA[0] * (ALPHA[-1] / ALPHA[0]) ** draw.random(20_000)
     lambda_ = LAMBDA[0] * (LAMBDA[-1] / LAMBDA[0]) ** draw.random(20_000)

@@ -26,7 +26,7 @@ def simulate_motion(seed, samples):
 
 
 def smooth_by_least_squares(readings):
-    """The same by one least-squares problem over all states, without a filter."""
+    """Smooth by one least-squares problem over all states, without a filter."""
     samples = len(readings)
     size = np.array([1.0, 1.0 / PERIOD, 1.0 / PERIOD**2]) * NOISE
     root = np.linalg.inv(np.linalg.cholesky(Q))

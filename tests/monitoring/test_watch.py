@@ -61,7 +61,7 @@ def steady_watch(logs):
 
 
 def end_after_looks(count):
-    """Ends a stream after so many looks at it, more than it takes to read its file."""
+    """Return a function that ends a stream after `count` looks, more than it takes to read its file."""
     left = iter(range(count))
     return lambda: next(left, None) is None
 

@@ -102,7 +102,7 @@ LANES = 300
 
 
 def compile_function(function):
-    """For up to so many cases, of whatever shape: one program of each precision."""
+    """Compile a function once in each precision, for up to `LANES` cases of any shape."""
     compiled = jax.jit(function)
 
     def call(*arguments):

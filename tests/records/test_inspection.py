@@ -119,7 +119,7 @@ def test_noise_identifies_nothing(tmp_path):
 
 
 def draw_odd_signal(random, count):
-    """Anything that may stand in a column."""
+    """Draw a signal that may stand in a column, however odd."""
     time = np.arange(count) / count
     return random.choice([
         random.standard_normal(count), np.cumsum(random.standard_normal(count)), np.sin(40.0 * random.random() * time),

@@ -17,7 +17,7 @@ def fit_frame(frame, expected=GEAR_RATIO):
 
 
 def simulate_load(seed, *, gap=0.02, drift=0.0, changes=(61.0,), turns_around=False):
-    """To and fro, or around and around, under a load that pulls to one side and changes it at some times."""
+    """Simulate a motor that turns to and fro, or on and on, under a load that changes its side at `changes`, s."""
     random = np.random.default_rng(seed)
     t = 0.02 * np.arange(6000)
     to_and_fro = 2.0 * np.abs((t + random.uniform(0.0, 30.0)) / 15.0 % 2.0 - 1.0)
