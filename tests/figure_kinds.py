@@ -1,5 +1,11 @@
-"""Figures in tests: one of each kind is drawn in a process, and its picture stands for the others of that kind."""
+"""Figures in tests: one of each kind is laid out and drawn, and its picture stands for the others of that kind, also in the
+other workers and in the commands that they start."""
 
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +18,11 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import TightLayoutEngine
 
-_draw = Figure.savefig
-_pictures: dict[tuple[str, Any], bytes] = {}
+_FOLDER = "FIGURE_KINDS"
+"""The variable of the environment that names the folder of pictures."""
+_draw, _lay_out = Figure.savefig, TightLayoutEngine.execute
 
 
 def _texts(ax: Axes) -> Iterator[str]:
@@ -23,43 +31,61 @@ def _texts(ax: Axes) -> Iterator[str]:
     yield from ax.get_legend_handles_labels()[1]
 
 
-def figure_kind(figure: Figure, format: str) -> Any:
+def _name_kind(figure: Figure, format: str) -> str:
     """Kinds of artists and of texts on each of the axes, with their scales; as SVG, of a page, kinds of artists alone."""
-    artists = [frozenset(type(artist).__name__ for artist in ax.get_children()) for ax in figure.axes]
+    artists = [{type(artist).__name__ for artist in ax.get_children()} for ax in figure.axes]
     if format == "svg":
-        return frozenset().union(*artists)
-    # what is to be set as mathematics is read by a parser
-    mathematics = (any("$" in text for text in _texts(ax)) for ax in figure.axes)
-    axes = ((ax.get_visible(), ax.get_xscale(), ax.get_yscale()) for ax in figure.axes)
-    return tuple(zip(artists, mathematics, axes, strict=True)), len(figure.legends)
+        kind = repr(sorted(set().union(*artists)))
+    else:
+        # what is to be set as mathematics is read by a parser
+        mathematics = (any("$" in text for text in _texts(ax)) for ax in figure.axes)
+        axes = ((ax.get_visible(), ax.get_xscale(), ax.get_yscale()) for ax in figure.axes)
+        kind = repr((list(zip(map(sorted, artists), mathematics, axes, strict=True)), len(figure.legends)))
+    return f"{hashlib.sha256(kind.encode()).hexdigest()[:16]}.{format}"
 
 
 def _save_kind(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
     """`Figure.savefig` in tests."""
-    kind = format, figure_kind(figure, format)
-    if kind not in _pictures:
+    known = Path(os.environ[_FOLDER], _name_kind(figure, format))
+    if not known.exists():
         picture = BytesIO()
         _draw(figure, picture, format=format, **options)
         # a constrained layout is found once, not before each drawing
         figure.set_layout_engine("none")
-        _pictures[kind] = picture.getvalue()
+        draft = known.with_suffix(f".{os.getpid()}")
+        draft.write_bytes(picture.getvalue())
+        draft.replace(known)
     if isinstance(file, BytesIO):
-        file.write(_pictures[kind])
+        file.write(known.read_bytes())
     else:
-        Path(file).write_bytes(_pictures[kind])
+        shutil.copyfile(known, file)
+
+
+def _lay_out_kind(engine: TightLayoutEngine, figure: Figure) -> None:
+    """`TightLayoutEngine.execute` in tests."""
+    if not Path(os.environ[_FOLDER], _name_kind(figure, "png")).exists():
+        _lay_out(engine, figure)
+
+
+def _remove_pictures(maker: int) -> None:
+    """Remove the folder of pictures where the process ends that made it, not with a fork of it."""
+    if os.getpid() == maker:
+        shutil.rmtree(os.environ[_FOLDER])
 
 
 def draw_figures_by_kind() -> None:
     """Draw one figure of each kind from here on."""
-    Figure.savefig = _save_kind
+    if _FOLDER not in os.environ:
+        os.environ[_FOLDER] = tempfile.mkdtemp()
+        atexit.register(_remove_pictures, os.getpid())
+    Figure.savefig, TightLayoutEngine.execute = _save_kind, _lay_out_kind
 
 
 @contextmanager
 def every_figure() -> Iterator[None]:
     """Draw every figure inside."""
-    before = Figure.savefig
-    Figure.savefig = _draw
+    Figure.savefig, TightLayoutEngine.execute = _draw, _lay_out
     try:
         yield
     finally:
-        Figure.savefig = before
+        Figure.savefig, TightLayoutEngine.execute = _save_kind, _lay_out_kind
