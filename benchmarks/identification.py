@@ -32,7 +32,7 @@ from scipy.optimize import brentq  # noqa: E402
 
 from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
-from jaxbl.identification import identify as whole, log_columns  # noqa: E402
+from jaxbl.identification import identify as identify_module, log_columns  # noqa: E402
 from jaxbl.identification.free_parameters import make_free_parameters  # noqa: E402
 from jaxbl.identification.intervals import spread  # noqa: E402
 from jaxbl.identification.logs import arrays, gains_for, on_record  # noqa: E402
@@ -156,7 +156,7 @@ def by_derivatives(experiment, paths, record):
 
 
 def by_trajectories(study, record):
-    estimates = whole.identify(record, study).summary["parameters"]
+    estimates = identify_module.identify(record, study).summary["parameters"]
     return {
         path: (estimate["value"], 0.5 * (estimate["interval"][1] - estimate["interval"][0]))
         for path, estimate in estimates.items()
@@ -383,14 +383,14 @@ class Stages:
 def stages():
     return Stages(
         [
-            (whole, "segments_of", "smoother"),
+            (identify_module, "segments_of", "smoother"),
             (ParameterSearch, "_coarse", "starts"),
             (ParameterSearch, "_whole", "fits"),
-            (whole, "gains_for", "gains"),
-            (whole, "observer_chain", "chain"),
-            (whole, "by_regression", "regression"),
-            (whole, "torque_errors", "torque errors"),
-            (whole, "columns_of", "columns of the trace"),
+            (identify_module, "gains_for", "gains"),
+            (identify_module, "observer_chain", "chain"),
+            (identify_module, "by_regression", "regression"),
+            (identify_module, "torque_errors", "torque errors"),
+            (identify_module, "columns_of", "columns of the trace"),
         ]
     )
 
@@ -403,20 +403,20 @@ def time_stages(options):
             record = twelve_log(seconds, 10 * int(seconds) + call)
             with stages() as parts:
                 start = time.perf_counter()
-                found = whole.identify(record, study)
-                took = time.perf_counter() - start
-            values = found.summary["parameters"]
+                identification = identify_module.identify(record, study)
+                identify_seconds = time.perf_counter() - start
+            values = identification.summary["parameters"]
             worst = max(
                 abs(values[path]["value"] - true) / values[path]["standard_error"]
                 for path, true in TWELVE.items()
                 if path in values
             )
-            how = found.summary["method"]["trajectory"]
-            rows.append({"log (s)": seconds, "call": call + 1, "s": took, **parts.seconds})
+            search = identification.summary["method"]["trajectory"]
+            rows.append({"log (s)": seconds, "call": call + 1, "s": identify_seconds, **parts.seconds})
             print(
                 rows[-1],
-                f"free {len(values)} worst {worst:.1f} deviations, window {how['window']}, "
-                f"{how['starts_agreeing']} of {how['starts']} starts agree",
+                f"free {len(values)} worst {worst:.1f} deviations, window {search['window']}, "
+                f"{search['starts_agreeing']} of {search['starts']} starts agree",
                 flush=True,
             )
     print(pd.DataFrame(rows).round(2).to_string(index=False))

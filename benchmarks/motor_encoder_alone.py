@@ -195,7 +195,7 @@ class Outcome:
         seconds: of wall time.
     """
 
-    shown: bool
+    shows_gap: bool
     error: float = math.nan
     covered: bool = False
     width: float = math.nan
@@ -251,7 +251,7 @@ def draw_drives(seed: int, count: int, refused: int) -> list[tuple[Drive, Trace]
 
 def line(drive: Drive, outcome: Outcome) -> str:
     """One row of the table."""
-    if outcome.shown:
+    if outcome.shows_gap:
         text = (
             f"{100.0 * outcome.error:+9.3f} %  ± {100.0 * outcome.width:7.3f} %  {'holds' if outcome.covered else 'MISSES'}"
         )
@@ -271,7 +271,7 @@ def summary(drives: list[Drive], outcomes: list[Outcome]) -> list[str]:
     """Figures over all drives."""
     lines = []
     with_gap = [outcome for drive, outcome in zip(drives, outcomes, strict=True) if drive.kind == "gap"]
-    accepted = [outcome for outcome in with_gap if outcome.shown]
+    accepted = [outcome for outcome in with_gap if outcome.shows_gap]
     if with_gap:
         lines.append(f"drives with a gap: {len(with_gap)}, refused {len(with_gap) - len(accepted)}")
     if accepted:
@@ -292,7 +292,7 @@ def summary(drives: list[Drive], outcomes: list[Outcome]) -> list[str]:
     for kind in REFUSED:
         of_kind = [outcome for drive, outcome in zip(drives, outcomes, strict=True) if drive.kind == kind]
         if of_kind:
-            lines.append(f"{kind}: refused {sum(not outcome.shown for outcome in of_kind)} of {len(of_kind)}")
+            lines.append(f"{kind}: refused {sum(not outcome.shows_gap for outcome in of_kind)} of {len(of_kind)}")
     lines.append(f"seconds for a log, median: {np.median([outcome.seconds for outcome in outcomes]):.1f}")
     return lines
 

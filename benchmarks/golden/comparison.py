@@ -30,12 +30,12 @@ class Difference(NamedTuple):
 
     file: str
     place: str
-    what: str
+    text: str
     relative: float = 0.0
     is_sentence: bool = False
 
     def __str__(self) -> str:
-        return f"{': '.join(filter(None, (self.file, self.place)))}: {self.what}"
+        return f"{': '.join(filter(None, (self.file, self.place)))}: {self.text}"
 
     @property
     def address(self) -> str:
@@ -87,7 +87,7 @@ class _Place(NamedTuple):
     """A difference of two values: where, how, and as in :class:`Difference`."""
 
     path: str
-    what: str
+    text: str
     relative: float = 0.0
     is_sentence: bool = False
 
@@ -147,7 +147,7 @@ def gather(file: str, places: Iterable[_Place]) -> list[Difference]:
         largest = max(group, key=lambda place: place.relative)
         amount = f" (by {largest.relative:.1e} of it)" if largest.relative else ""
         further = f", and {len(group) - 1} more" if len(group) > 1 else ""
-        differences.append(Difference(file, path, _shorten(largest.what) + amount + further, largest.relative, sentences))
+        differences.append(Difference(file, path, _shorten(largest.text) + amount + further, largest.relative, sentences))
     return differences
 
 

@@ -66,7 +66,7 @@ def hidden(folder: Path) -> None:
 def effects(folder: Path) -> None:
     """A geared and a direct drive with all effects that they can have."""
     from effect_values import ENCODERS, VALUES
-    from small_study import rigid_study, small_study
+    from small_study import rigid, small
 
     # of the values' own size a delay takes many samples
     values = VALUES | ENCODERS | {"actuator.delay": {"delay": 2.3e-3}}
@@ -81,8 +81,8 @@ def effects(folder: Path) -> None:
     }
     moved = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
     length = {"run.duration": 1.5, "run.substeps": 4}
-    (folder / "geared.toml").write_text(tomli_w.dumps(small_study(length, effects=tables, initial=moved, **tables_beside)))
-    (folder / "rigid.toml").write_text(tomli_w.dumps(rigid_study(length, effects=on_one_side, **tables_beside)))
+    (folder / "geared.toml").write_text(tomli_w.dumps(small(length, effects=tables, initial=moved, **tables_beside)))
+    (folder / "rigid.toml").write_text(tomli_w.dumps(rigid(length, effects=on_one_side, **tables_beside)))
 
 
 def write_recorded(folder: Path) -> None:

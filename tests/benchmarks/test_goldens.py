@@ -47,14 +47,14 @@ def test_equal_results_do_not_differ(compare):
 )
 def test_a_changed_key_name_or_number_is_reported(compare, change, place, difference_text):
     (difference,) = compare("summary.json", SUMMARY, SUMMARY | change, 1e-9)
-    assert (difference.place, difference.what, difference.is_sentence) == (place, difference_text, False)
+    assert (difference.place, difference.text, difference.is_sentence) == (place, difference_text, False)
 
 
 def test_a_key_that_is_gone_is_reported_once_for_all_elements_of_a_list(compare):
     base = {"findings": [{"effect": "motor.cogging", "z": 3.0}, {"effect": "load.gravity", "z": 4.0}]}
     tree = {"findings": [{"effect": "motor.cogging"}, {"effect": "load.gravity"}]}
     (difference,) = compare("diagnosis.json", base, tree)
-    assert (difference.place, difference.what) == ("findings[].z", "key is gone, and 1 more")
+    assert (difference.place, difference.text) == ("findings[].z", "key is gone, and 1 more")
 
 
 def test_numbers_within_the_tolerance_are_the_same(compare):
@@ -73,11 +73,11 @@ def test_one_bit_of_a_table_is_reported(compare):
     table = pd.DataFrame({"metric": [1.0, 2.0, np.nan]})
     changed_table = pd.DataFrame({"metric": [1.0, np.nextafter(2.0, 3.0), np.nan]})
     (difference,) = compare("part.parquet", table, changed_table)
-    assert difference.place == "metric" and difference.what.startswith("1 of 3 numbers")
+    assert difference.place == "metric" and difference.text.startswith("1 of 3 numbers")
     assert difference.relative == pytest.approx(2.2e-16, rel=0.02)
     assert compare("part.parquet", table, changed_table, 1e-9) == []
     (difference,) = compare("part.parquet", table, table.rename(columns={"metric": "rmse"}).assign(metric=table["metric"]))
-    assert (difference.place, difference.what) == ("rmse", "column is new")
+    assert (difference.place, difference.text) == ("rmse", "column is new")
     (difference,) = compare("part.parquet", table, table.fillna(0.0), 1e-9)
     assert difference.relative == np.inf
 
@@ -85,7 +85,7 @@ def test_one_bit_of_a_table_is_reported(compare):
 def test_code_moves_with_its_first_line_and_comments_are_told_apart(compare):
     code = "/* gain */\nx = 1.5;\ny = 2.0;\n"
     (difference,) = compare("drive.c", code, code.replace("2.0", "2.00"))
-    assert (difference.place, difference.what) == ("", "line 3: 'y = 2.0;' -> 'y = 2.00;'")
+    assert (difference.place, difference.text) == ("", "line 3: 'y = 2.0;' -> 'y = 2.00;'")
     (difference,) = compare("drive.c", code, code.replace("gain", "the gain"))
     assert difference.address == "drive.c: comments"
 
