@@ -589,32 +589,32 @@ static void *make(void)
 
 int main(void)
 {
-    void *one = make(), *two = make(), *state = NULL, *again = NULL;
+    void *instance = make(), *second = make(), *state = NULL, *copy = NULL;
     uint8_t bytes[BYTES];
     uint32_t i, k, first = 1u;
     double value, reached;
     bool event, terminate, early;
-    int bad = 0;
+    int failures = 0;
     for (i = 0u; i <= MODEL_VARIABLES; i++)
         for (k = 0u; k < sizeof(odd) / sizeof(odd[0]); k++)
         {
             const int before = lines;
-            int refused = fmi3SetFloat64(one, &i, 1u, &odd[k], 1u) != 0;
-            refused += fmi3EnterInitializationMode(one, false, 0.0, odd[k], true, 1e9) != 0;
-            refused += fmi3ExitInitializationMode(one) != 0;
-            refused += fmi3SetFloat64(one, &first, 1u, &odd[k], 1u) != 0;
-            refused += fmi3DoStep(one, odd[k], 3.0 * MODEL_PERIOD, true, &event, &terminate, &early, &reached) != 0;
-            refused += fmi3DoStep(one, reached, odd[k], true, &event, &terminate, &early, &reached) != 0;
-            refused += fmi3GetFloat64(one, &i, 1u, &value, 1u) != 0;
-            bad += fmi3GetFMUState(one, &state) + fmi3SerializeFMUState(one, state, bytes, BYTES);
-            bad += fmi3DeserializeFMUState(two, bytes, BYTES, &again) + fmi3SetFMUState(two, again);
-            bad += (lines - before) != refused;
-            bad += fmi3Reset(one);
+            int refused = fmi3SetFloat64(instance, &i, 1u, &odd[k], 1u) != 0;
+            refused += fmi3EnterInitializationMode(instance, false, 0.0, odd[k], true, 1e9) != 0;
+            refused += fmi3ExitInitializationMode(instance) != 0;
+            refused += fmi3SetFloat64(instance, &first, 1u, &odd[k], 1u) != 0;
+            refused += fmi3DoStep(instance, odd[k], 3.0 * MODEL_PERIOD, true, &event, &terminate, &early, &reached) != 0;
+            refused += fmi3DoStep(instance, reached, odd[k], true, &event, &terminate, &early, &reached) != 0;
+            refused += fmi3GetFloat64(instance, &i, 1u, &value, 1u) != 0;
+            failures += fmi3GetFMUState(instance, &state) + fmi3SerializeFMUState(instance, state, bytes, BYTES);
+            failures += fmi3DeserializeFMUState(second, bytes, BYTES, &copy) + fmi3SetFMUState(second, copy);
+            failures += (lines - before) != refused;
+            failures += fmi3Reset(instance);
         }
-    bad += fmi3FreeFMUState(one, &state) + fmi3FreeFMUState(one, &again);
-    fmi3FreeInstance(one);
-    fmi3FreeInstance(two);
-    return bad + (lines == 0);
+    failures += fmi3FreeFMUState(instance, &state) + fmi3FreeFMUState(instance, &copy);
+    fmi3FreeInstance(instance);
+    fmi3FreeInstance(second);
+    return failures + (lines == 0);
 }
 """
 
