@@ -120,10 +120,9 @@ def compute(name: str, side: Side, inputs: Mapping[str, Path], recordings: Path,
     for kind in GOLDENS[name].inputs:
         (draft / "inputs" / kind).symlink_to(inputs[kind])
     run("runner.py", name, str(side.tree), folder=draft, path=[side.tree], cache=cache)
-    # the base's results are kept: a crash of it is no golden
-    printed = draft.rglob("*.printed.json")
-    if side.tree != ROOT and any(path.read_text(encoding="utf-8").startswith('{"failed"') for path in printed):
-        raise RuntimeError("a command of the base crashed")
+    for path in sorted(draft.rglob("*.printed.json")):
+        if path.read_text(encoding="utf-8").startswith('{"failed"'):
+            print(f"{name}: {path.name.partition('.')[0]} crashed in {side.tree}", file=sys.stderr)
     shutil.rmtree(side.results / name, ignore_errors=True)
     draft.replace(side.results / name)
     return time.perf_counter() - started
@@ -197,7 +196,7 @@ def main() -> None:
             where = "tree" if side is tree else f"base, {side.results / name}"
             try:
                 print(f"{name}: {future.result():.0f} s ({where})", file=sys.stderr, flush=True)
-            except (subprocess.CalledProcessError, RuntimeError):
+            except subprocess.CalledProcessError:
                 print(f"{name}: failed ({where}): see {side.results / name}.{os.getpid()}.log", file=sys.stderr, flush=True)
                 failed.append(name)
 

@@ -10,8 +10,8 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395625, 3.82, 4.49, 5.74),
-    "report": (63294, 8.71, 6.12, 16.67),
+    "all": (395604, 3.82, 4.49, 5.74),
+    "report": (63273, 8.71, 6.12, 16.67),
     "diagnosis": (61881, 10.65, 16.54, 14.57),
     "records": (45829, 0.0, 0.0, 0.0),
     "gains": (37240, 0.03, 0.0, 0.0),

@@ -113,8 +113,7 @@ def identify_element(
         InputError: an unfit log or table, or a log that shows no stiffness.
     """
     given = table.model_dump(exclude_unset=True) if isinstance(table, LogTable) else dict(table)
-    read = read_log_table(given | {"kind": "element"})
-    return run_element(read_element_task(log, read, gear_ratio, holdout=holdout))
+    return run_element(read_element_task(log, read_log_table(given | {"kind": "element"}), gear_ratio, holdout=holdout))
 
 
 def run_element(task: ElementTask) -> ElementIdentification:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from jaxbl.config import Config, ConfigSource, read_model, with_values
 from jaxbl.drive.parameters import set_leaves
+from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
@@ -120,6 +121,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     with jax.enable_x64(True), limit_blas_threads():
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
+        if not paths:
+            raise InputError("model: no number to identify; each is exact, or 0 where it has to be positive")
         free = make_free_parameters(nominal, paths, float(np.std(record.torque)))
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
         segments = segments_of(record, sides, rest)

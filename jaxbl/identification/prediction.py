@@ -36,8 +36,7 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
     f = np.array([[1.0, 1.0], [0.0, 1.0]])
     q = smoothness * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
     covariance = solve_discrete_are(f.T, np.array([[1.0], [0.0]]), q, np.eye(1))
-    gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
-    return gain * np.array([1.0, 1.0 / period])
+    return covariance[:, 0] / (covariance[0, 0] + 1.0) * np.array([1.0, 1.0 / period])
 
 
 @jit

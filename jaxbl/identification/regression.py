@@ -237,8 +237,7 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
     """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
     if factor == 1:
         return values
-    taps = jnp.asarray(low_pass_taps(20 * factor + 1, 1.0 / factor), values.dtype)
-    return jnp.convolve(values, taps, "valid")[::factor]
+    return jnp.convolve(values, jnp.asarray(low_pass_taps(20 * factor + 1, 1.0 / factor), values.dtype), "valid")[::factor]
 
 
 def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:

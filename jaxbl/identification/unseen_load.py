@@ -235,8 +235,7 @@ class UnseenLoad:
     @cached_property
     def _settled(self) -> list[EffectStates]:
         """States of effects that each segment begins with."""
-        found = [begun(self.experiment, one.torque[:1], one.before) for one in self.segments]
-        return jax.tree.map(float, found)
+        return jax.tree.map(float, [begun(self.experiment, one.torque[:1], one.before) for one in self.segments])
 
     @cached_property
     def _model(self) -> PlantSimulator:
@@ -531,8 +530,7 @@ def is_known(one: FreeParameter) -> bool:
 
 def widths(free: Sequence[FreeParameter], factor: float) -> np.ndarray:
     """Prior standard deviations of theta: inertias and stiffness are known within a factor, a gap not at all."""
-    each = [_ANY if is_gap(one) else np.log(factor) if is_known(one) else PRIOR_DEVIATION for one in free]
-    return np.array(each)
+    return np.array([_ANY if is_gap(one) else np.log(factor) if is_known(one) else PRIOR_DEVIATION for one in free])
 
 
 _ANY = 100.0

@@ -100,8 +100,7 @@ def verdict_sentence(summary: JsonObject) -> str:
     if not names and gap and complete:
         return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
     if not names and summary["withdrawn"] and not test["failed"]:
-        found = _listed(summary["withdrawn"])
-        return f"Not confirmed: something is missing by the log, perhaps {found}; {_TOO_LITTLE}."
+        return f"Not confirmed: something is missing by the log, perhaps {_listed(summary['withdrawn'])}; {_TOO_LITTLE}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."
     if test["powerless"] and not any(test[reason] for reason in ("failed", "remainder", "far", "contradicting")):
@@ -305,8 +304,9 @@ def _finding_tables(summary: JsonObject) -> list[PageTable]:
             rows.append([one["effect"], probability(one["confidence"]), leaf, number["value"], error, number["unit"]])
         for other in one["alternatives"]:
             rows.append([f"or {other['effect']}", probability(other["confidence"]), "", "", "", ""])
-    columns = ["effect", "confidence", "parameter", "value", "standard error", "unit"]
-    return [PageTable("Missing effects", columns, rows)] if rows else []
+    if not rows:
+        return []
+    return [PageTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)]
 
 
 def _gap_table(gap: JsonObject) -> PageTable:

@@ -61,7 +61,9 @@ class Drawn(NamedTuple):
 @contextlib.contextmanager
 def style() -> Iterator[None]:
     """The settings that figures are made under; also a decorator of what makes them."""
-    with mpl.rc_context(_SETTINGS):
+    with mpl.rc_context(_SETTINGS), warnings.catch_warnings():
+        # a name may have letters that the font lacks, drawn as boxes
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
 
 
@@ -84,9 +86,7 @@ def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
     if not is_remote(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    # a name may have letters that the font lacks, drawn as boxes
-    with warnings.catch_warnings(), open_draft(path) as draft:
-        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+    with open_draft(path) as draft:
         lay_out(figure)
         figure.savefig(draft, format="png")
     return path

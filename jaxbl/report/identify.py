@@ -27,8 +27,9 @@ def write_identification_report(found: Identification, folder: Path, steps: Sequ
         tables.append(_recursive_table(found))
     lead, remarks = _headline(found.summary), _remarks(found.summary)
     title, model = found.config.title or f"Identification from {found.record.path.name}", model_text(found)
-    drawn = draw_identification(found)
-    return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks, steps)
+    return write_results(
+        found, folder, "identification", title, model, lead, draw_identification(found), tables, remarks, steps
+    )
 
 
 def identification_lines(summary: JsonObject) -> Lines:
@@ -105,9 +106,12 @@ def _remarks(summary: JsonObject) -> Lines:
     if summary["torque"]:
         lines.append(f"Torque error of the model, rms: {_shares(summary['torque'])}.")
     for side, one in summary.get("gains", {}).items():
+        error = one["velocity_error"]
         lines.append(
-            f"{side} observer: lambda = {one['lambda_']:.3g}, alpha = {one['alpha']:.3g}, chosen on the log for "
-            f"f⁺ = {one['f_plus']:.3g}; its velocity differs from the smoothed one by {one['velocity_error']:.2g} rms."
+            f"{side} observer: no gains that were tried follow the log; those in model.toml do not, either."
+            if error is None
+            else f"{side} observer: lambda = {one['lambda_']:.3g}, alpha = {one['alpha']:.3g}, chosen on the log for "
+            f"f⁺ = {one['f_plus']:.3g}; its velocity differs from the smoothed one by {error:.2g} rms."
         )
     if "holdout" in summary:
         lines += _on_holdout(summary["holdout"])

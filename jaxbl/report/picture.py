@@ -2,7 +2,6 @@
 
 import base64
 import math
-import warnings
 from collections.abc import Iterator
 from io import BytesIO
 from typing import Any, NamedTuple
@@ -64,9 +63,7 @@ def picture(drawn: Drawn) -> Picture:
                 artist.set_rasterized(True)
     file = BytesIO()
     # names of its parts must not be those of another figure, and are the same each time
-    with mpl.rc_context({"svg.hashsalt": drawn.name, "svg.fonttype": "path"}), warnings.catch_warnings():
-        # a name may have letters that the font lacks, drawn as boxes
-        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+    with mpl.rc_context({"svg.hashsalt": drawn.name, "svg.fonttype": "path"}):
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     value = next((_plain(bar.get_ylabel() or bar.get_xlabel()) for bar in bars), None)

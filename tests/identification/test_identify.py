@@ -260,6 +260,10 @@ BAD = {
         geared_study({"run.sample_period": 1e-6, "run.substeps": 1, "run.duration": 1e-3}),
         r"its samples are 0.002 s apart, more than 1000 plant steps of 1e-06 s \(\[run\]\); where the stamps are not in s",
     ),
+    "nothing to find": (
+        rigid_study({"drive.motor_viscous": 0.0}, effects=[], uncertainty={"exact": ["drive.motor_inertia"]}),
+        "model: no number to identify; each is exact, or 0 where it has to be positive",
+    ),
     "starts": (geared_study(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
 }
 

@@ -225,6 +225,13 @@ def test_observers_that_diverged_leave_figures(tmp_path):
         save(drawing.figure, tmp_path / f"{drawing.name}.png")
 
 
+def test_gains_of_which_none_follows_the_log_are_not_called_chosen(tmp_path):
+    result = make_identification(geared_study(), tmp_path)
+    gains = {"motor": {"lambda_": 70.0, "alpha": 4600.0, "f_plus": 4200.0, "velocity_error": None}}
+    lines = write_identification_report(dataclasses.replace(result, summary=result.summary | {"gains": gains}), tmp_path)
+    assert [line.startswith("motor observer: no gains") for line in lines if "observer: " in line] == [True]
+
+
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
 def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
     result = make_identification(geared_study(), tmp_path)

@@ -44,8 +44,14 @@ def study_source(folder: str | Path) -> Source:
 
     answers = {to.__name__: partial(answer, to) for to in (simulated, nearby)}
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
-    prepare = partial(answer, simulated, {"values": first, "seed": 0})
-    return Source(identity(result.config), _lead(result), write, answers, prepare, one_at_a_time.acquire)
+    return Source(
+        identity(result.config),
+        _lead(result),
+        write,
+        answers,
+        partial(answer, simulated, {"values": first, "seed": 0}),
+        one_at_a_time.acquire,
+    )
 
 
 def _lead(result: StudyResult) -> list[str]:
