@@ -23,7 +23,7 @@ import threading
 import types
 from pathlib import Path
 
-LATE = (
+LATE_MODULES = (
     "jaxbl.__main__",
     "jaxbl.cli",
     "jaxbl.datasheet",
@@ -194,7 +194,7 @@ def _load():
     package = importlib.import_module("jaxbl")
     for name in dir(package):
         getattr(package, name)
-    for name in LATE:
+    for name in LATE_MODULES:
         importlib.import_module(name)
     importlib.import_module("figure_kinds").draw_figures_by_kind()
     assert not importlib.import_module("jax._src.xla_bridge").backends_are_initialized()

@@ -15,7 +15,7 @@ ATLAS = {
     "damping": [0.3],
     "marks": [{"name": "small gains", "lambda": 0.005, "alpha": 1.8}, {"name": "good gains", "lambda": 6.0, "alpha": 9.0}],
 }
-VERIFIED = rigid_study(
+VERIFY_STUDY = rigid_study(
     {
         "observer.discretisation": "explicit",
         "observer.motor.velocity_error": 0.5,
@@ -31,8 +31,8 @@ VERIFIED = rigid_study(
 
 @pytest.fixture(scope="session")
 def verified_study(tmp_path_factory):
-    """The verdict on `VERIFIED`, and its folder."""
+    """The verdict on `VERIFY_STUDY`, and its folder."""
     from jaxbl.gains.verify import verify
 
     folder = tmp_path_factory.mktemp("verified")
-    return verify(VERIFIED, folder), folder
+    return verify(VERIFY_STUDY, folder), folder

@@ -16,7 +16,7 @@ from measured import simulate_log
 from progress_lines import without_progress
 from small_study import ALPHA, listed_axis, rigid_study
 
-HERE = Path(__file__).parent
+TESTS = Path(__file__).parent
 
 # said of the inputs that :mod:`bad_inputs` lists; "" where there is nothing to say
 EXPECTED_LINES = {
@@ -79,7 +79,7 @@ EXPECTED_LINES = {
 
 def read_lines(kind: str, folder: Path, count: int = 0) -> dict[str, str]:
     """Lines about the inputs of a kind, by a process that ends where one takes too much."""
-    result = run_python(HERE / "bad_inputs.py", kind, folder, count, cwd=folder, timeout=1500.0)
+    result = run_python(TESTS / "bad_inputs.py", kind, folder, count, cwd=folder, timeout=1500.0)
     assert result.returncode == 0, result.stderr[-5000:]
     return json.loads((folder / "said.json").read_text())
 

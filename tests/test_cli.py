@@ -127,11 +127,11 @@ def test_interrupt_anywhere_else():
     assert end.value.code == 130
 
 
-NONE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
+NO_SUCH_FILE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
 BAD = {
     "no such file": (
         ["sweep", "none.toml"],
-        f"none.toml: {NONE}",
+        f"none.toml: {NO_SUCH_FILE}",
     ),
     "a name that is near": (["sweep", "studi.toml"], "studi.toml: no such file; did you mean study.toml?"),
     "no such folder": (["sweep", "studies/a.toml"], "studies/a.toml: no such file: there is no folder studies"),
@@ -212,7 +212,7 @@ BAD = {
     ),
     "nothing to include": (
         ["tune", "part.toml"],
-        f"part.toml: include: none.toml: {NONE}",
+        f"part.toml: include: none.toml: {NO_SUCH_FILE}",
     ),
     "no such share": (
         ["sweep", "study.toml", "--share", "3/2"],
@@ -517,7 +517,7 @@ def test_default_folder():
 
 
 # gain_map is run by tests/test_docs.py, as the README says
-SHIPPED = {
+SHIPPED_STUDIES = {
     "load_gains": "sweep",
     "gain_boundary": "sweep",
     "paper_table1": "simulate",
@@ -569,15 +569,15 @@ def shorten_study(study):
 
 def test_shipped_studies_run_without_a_word_on_stderr(tmp_path):
     # in a process of their own, where float64 is on only inside the engine
-    for name in SHIPPED:
+    for name in SHIPPED_STUDIES:
         study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
         shorten_study(study)
         write_study(tmp_path, study, f"{name}.toml")
-    result = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED), cwd=tmp_path, timeout=900.0)
+    result = run_python("-c", RUN_SHIPPED, json.dumps(SHIPPED_STUDIES), cwd=tmp_path, timeout=900.0)
     assert (result.returncode, without_progress(result.stderr)) == (0, "")
     results = json.loads(result.stdout.splitlines()[-1])
     outcomes = {name: (code, without_progress(errors)) for name, (code, errors) in results.items()}
-    assert outcomes == dict.fromkeys(SHIPPED, (0, ""))
+    assert outcomes == dict.fromkeys(SHIPPED_STUDIES, (0, ""))
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
@@ -743,26 +743,26 @@ def axis_log(tmp_path):
     log.to_csv(tmp_path / "an axis.csv", index=False)
 
 
-AGAIN = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
+INTERRUPTED = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
 
 
 def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
     options = ["--holdout", "an axis.csv", "--profile"]
-    assert call(*IDENTIFY, *options) == (130, [], [f"{AGAIN} {shlex.join(options)} --out 'results/an axis'"])
+    assert call(*IDENTIFY, *options) == (130, [], [f"{INTERRUPTED} {shlex.join(options)} --out 'results/an axis'"])
     assert list_files(tmp_path / "results") == []
 
 
 def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log, call, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("jaxbl.report.page.html", interrupt)
-        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
+        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{INTERRUPTED} --out out"])
         assert not (tmp_path / "out").exists()
     assert call(*IDENTIFY, "--out", "out")[0] == 0
     before = {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")}
     write_study(tmp_path, AXIS | {"title": "another"}, "axis.toml")
     monkeypatch.setattr("jaxbl.report.page.html", interrupt)
-    assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
+    assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{INTERRUPTED} --out out"])
     assert {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")} == before
 
 
@@ -784,7 +784,7 @@ def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
 
 
 GAP = {"theta_e": 0.1, "torque_motor": 1.0}
-DIAGNOSED = {
+DIAGNOSIS = {
     "verdict": "explained",
     "findings": [
         {
@@ -818,7 +818,7 @@ DIAGNOSED = {
 
 class _Found:
     def __init__(self, task):
-        self.summary = DIAGNOSED | {"identity": task.identity, "file": str(task.record.path.resolve())}
+        self.summary = DIAGNOSIS | {"identity": task.identity, "file": str(task.record.path.resolve())}
 
 
 @pytest.fixture
@@ -1042,12 +1042,12 @@ def test_after_logs_what_is_open_by_what_was_found():
 
     def diagnose_steps(planned_file=None, **more):
         return list_commands(
-            after_diagnosis(make_task(1000), DIAGNOSED | more, command, folder, LogCall(logs, model, None, planned_file))
+            after_diagnosis(make_task(1000), DIAGNOSIS | more, command, folder, LogCall(logs, model, None, planned_file))
         )
 
     assert diagnose_steps() == [simulate]
     long = {"effect": "transmission.rotational_friction_of_somebody_elses_package", "confidence": 0.5}
-    tied = [DIAGNOSED["findings"][0] | {"alternatives": [long]}]
+    tied = [DIAGNOSIS["findings"][0] | {"alternatives": [long]}]
     experiment = f"{diagnose} --out out --next-experiment out_next.csv"
     assert diagnose_steps(findings=tied, rival=long) == [experiment, simulate]
     assert diagnose_steps(Path("n.csv"), findings=tied, rival=long) == [simulate]

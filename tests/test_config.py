@@ -501,7 +501,7 @@ def test_with_values_names_the_nearest_path_and_takes_whole_numbers():
 
 # ---------------------------------------------------------------- anything else
 
-JUNK = st.one_of(
+ANY_VALUE = st.one_of(
     st.none(),
     st.booleans(),
     st.integers(),
@@ -511,7 +511,7 @@ JUNK = st.one_of(
     st.lists(st.floats(), max_size=3),
     st.dictionaries(st.sampled_from(["kind", "path", "values", "alpha", "x", "y\n"]), st.floats() | st.text(max_size=3)),
 )
-COMPLETE = read_config(tomllib.loads(EXAMPLE)).to_dict()
+COMPLETE_STUDY = read_config(tomllib.loads(EXAMPLE)).to_dict()
 
 
 def list_keys(data, prefix=()):
@@ -525,11 +525,13 @@ def list_keys(data, prefix=()):
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(
-        st.tuples(st.sampled_from(list(list_keys(COMPLETE))), JUNK, st.none() | st.text(max_size=3)), min_size=1, max_size=3
+        st.tuples(st.sampled_from(list(list_keys(COMPLETE_STUDY))), ANY_VALUE, st.none() | st.text(max_size=3)),
+        min_size=1,
+        max_size=3,
     )
 )
 def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
-    data = read_config(COMPLETE).to_dict()
+    data = read_config(COMPLETE_STUDY).to_dict()
     for place, junk, new_key in mutations:
         target = data
         for key in place[:-1]:

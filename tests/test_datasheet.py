@@ -14,7 +14,7 @@ from jaxbl.errors import InputError
 from jaxbl.gains.gain_search import usual_rule
 
 QUESTIONS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
-BY_NAME = QUESTIONS["geared"]
+GEARED_QUESTIONS = QUESTIONS["geared"]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ BY_NAME = QUESTIONS["geared"]
     ],
 )
 def test_numbers_become_si(name, text, value):
-    assert BY_NAME[name].read(text).value == pytest.approx(value, rel=1e-14)
+    assert GEARED_QUESTIONS[name].read(text).value == pytest.approx(value, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_examples_and_defaults_can_be_read():
 )
 def test_what_is_no_such_number_is_said(name, text, message):
     with pytest.raises(InputError) as error:
-        BY_NAME[name].read(text)
+        GEARED_QUESTIONS[name].read(text)
     assert str(error.value) == message
 
 
@@ -135,8 +135,8 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
         return next(answers) or default
 
     monkeypatch.setattr("typer.prompt", answer_prompt)
-    assert setup._ask_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
-    assert setup._ask_number(BY_NAME["sample_period"]).text == "not given"
+    assert setup._ask_number(GEARED_QUESTIONS["motor_inertia"]).value == pytest.approx(5e-5)
+    assert setup._ask_number(GEARED_QUESTIONS["sample_period"]).text == "not given"
     assert questions[0] == questions[1] and questions[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
@@ -158,7 +158,7 @@ DIRECT = {
 LINEAR = {"mass": "8 kg", "motor_friction": "6 N", "force": "200 N", "speed": "2 m/s", "motor_encoder": "100 nm"}
 NO_STUDY = "these numbers make no study; look at their units"
 # so that a run is short
-SHORT = {"frequency": "20 Hz"}
+SHORT_RUN = {"frequency": "20 Hz"}
 
 
 def option_words(kind, numbers):
@@ -174,7 +174,7 @@ def read_answers(kind, numbers):
 
 def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     """Without a gear, its load has the inertia m / N², N in rad/m, and so has the rest of it."""
-    ratio, screw = 200.0 * math.pi, read_answers("screw", SCREW | SHORT)
+    ratio, screw = 200.0 * math.pi, read_answers("screw", SCREW | SHORT_RUN)
     at_motor = {
         "gear_ratio": 1.0, "stiffness": 1.2e8 / ratio**2, "backlash": 2e-5 * ratio, "load_inertia": 60.0 / ratio**2,
         "load_viscous": 200.0 / ratio**2, "load_encoder": 0.0,
@@ -223,7 +223,7 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
     ],
 )
 def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_path):
-    code, output, _ = call("init", "axis.toml", *option_words(kind, numbers | SHORT))
+    code, output, _ = call("init", "axis.toml", *option_words(kind, numbers | SHORT_RUN))
     assert code == 0 and ("m/s² (motor)." in output[0]) == (kind == "linear") and "load" not in output[0]
     text = (tmp_path / "axis.toml").read_text()
     assert all(f"\n{line}\n" in text for line in lines)
@@ -238,7 +238,7 @@ def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_p
 
 
 def test_the_usual_rule_in_a_study_is_that_of_tune():
-    text, _ = write_first_study(KINDS["linear"], read_answers("linear", LINEAR | SHORT), "")
+    text, _ = write_first_study(KINDS["linear"], read_answers("linear", LINEAR | SHORT_RUN), "")
     lambda_, alpha = usual_rule(1.0)
     assert f"usual rule, lambda = {lambda_:g} sqrt(f+) and alpha = {alpha:g} f+;" in text
 
@@ -252,15 +252,15 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
             "--gear-ratio, --mass: --kind direct has no such option; it has: --motor-inertia, --motor-viscous, ",
         ),
         (
-            option_words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}),
+            option_words("direct", DIRECT | SHORT_RUN | {"motor_friction": "20 N m"}),
             f"{NO_STUDY}: the motor does not move: --torque ",
         ),
         (
-            option_words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}),
+            option_words("linear", LINEAR | SHORT_RUN | {"motor_friction": "400 N"}),
             f"{NO_STUDY}: the motor does not move: --force ",
         ),
         (
-            option_words("screw", SCREW | SHORT | {"backlash": "1 m"}),
+            option_words("screw", SCREW | SHORT_RUN | {"backlash": "1 m"}),
             f"{NO_STUDY}: the load does not move: --backlash should be",
         ),
         (

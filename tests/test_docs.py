@@ -171,7 +171,7 @@ def test_architecture_shows_the_floors():
 # pages, run as written
 
 # what a block cannot do in a test, and what stands in for it
-INSTEAD = {
+REPLACED_COMMANDS = {
     "make demo": "jaxbl demo",  # test_demo_is_this_command; the environment is imitated below
     "make test": "",  # this is it
     r"\. \.venv/bin/activate": "",
@@ -186,7 +186,7 @@ INSTEAD = {
 }
 
 
-SMALLER = {
+SMALLER_STUDIES = {
     "gain_map.toml": (
         {"duration = 20.0": "duration = 4.0", "num = 64": "num = 16", "seeds = 4": "seeds = 4\nchunk = 1536"},
         (),
@@ -212,7 +212,7 @@ def import_name(requirement):
     return {"pytest-xdist": "xdist"}.get(package := re.match(r"[\w-]+", requirement)[0], package)
 
 
-HIDING = """import sys
+HIDE_MODULES = """import sys
 class Hiding:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in hidden:
@@ -235,7 +235,7 @@ def make_environment(folder, clone, extra=None):
     site = folder / "site"
     site.mkdir()
     # a module of None would do for most, but SciPy looks whether sphinx is among those that are loaded
-    (site / "sitecustomize.py").write_text(HIDING.format(hidden=hidden))
+    (site / "sitecustomize.py").write_text(HIDE_MODULES.format(hidden=hidden))
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     # as on the command line, compiled programs are kept; here nothing changes the package while it runs
     programs = str(ROOT / ".cache" / "programs")
@@ -248,7 +248,7 @@ def make_environment(folder, clone, extra=None):
 
 def test_demo_is_this_command():
     recipe = re.search(r"^demo:.*\n\t(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)[1]
-    assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
+    assert recipe.replace("$(BIN)/", "") == REPLACED_COMMANDS["make demo"]
 
 
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(read_blocks(page))), ids=page_name)
@@ -262,7 +262,7 @@ def test_page_runs_as_written(page, tmp_path):
     shutil.copytree(ROOT / "docs" / "cluster", clone / "docs" / "cluster")
     # the demo runs the study beside the package
     (clone / "jaxbl").symlink_to(ROOT / "jaxbl")
-    for study, (lines, pages) in SMALLER.items():
+    for study, (lines, pages) in SMALLER_STUDIES.items():
         text = (clone / "sweeps" / study).read_text(encoding="utf-8").split("\n")
         assert lines.keys() <= set(text)
         if page.name not in pages:
@@ -274,7 +274,7 @@ def test_page_runs_as_written(page, tmp_path):
         if file is not None:
             language = file[1]
         elif language == "sh":
-            for command, other in INSTEAD.items():
+            for command, other in REPLACED_COMMANDS.items():
                 text = re.sub(rf"^{command}", other, text, flags=re.M)
         if file or language in ("python", "sh", "output"):
             blocks.append((language, text))

@@ -47,7 +47,7 @@ FLOORS = [
     {"batch", "terminal"},
     {"cli"},
 ]
-BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}
+LOWER_FLOORS = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}
 
 
 def test_public_names_resolve_and_are_documented():
@@ -111,7 +111,9 @@ def test_imports_run_downward():
         part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
         if part not in ("__init__", "__main__"):
             targets = [name.split(".")[1] for name in list_imports(file, ROOT) if name.startswith("jaxbl.")]
-            faults += [f"{file}: {part} imports {name}" for name in targets if name != part and name not in BELOW[part]]
+            faults += [
+                f"{file}: {part} imports {name}" for name in targets if name != part and name not in LOWER_FLOORS[part]
+            ]
     assert not faults, "\n".join(faults)
 
 

@@ -25,7 +25,7 @@ from jaxbl.files import read_json
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
-FIRST, LAST = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)
+FIRST_PART, LAST_PART = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     simulate_multisine_log().write(folder / "axis.csv")
     # parts as long as those that are split off the whole
-    select_samples(simulate_multisine_log(), FIRST).write(folder / "first.csv")
-    select_samples(simulate_multisine_log(), LAST).write(folder / "last.csv")
+    select_samples(simulate_multisine_log(), FIRST_PART).write(folder / "first.csv")
+    select_samples(simulate_multisine_log(), LAST_PART).write(folder / "last.csv")
     simulate_multisine_log(seed=2).write(folder / "other.csv")
     return folder
 
@@ -278,8 +278,8 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
     fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
     log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
-    select_samples(simulate_direct_drive(fast, [friction], 1e-3, 1), FIRST).write(log)
-    select_samples(simulate_direct_drive(0.8 * fast, [friction], 1e-3, 2), LAST).write(holdout)
+    select_samples(simulate_direct_drive(fast, [friction], 1e-3, 1), FIRST_PART).write(log)
+    select_samples(simulate_direct_drive(0.8 * fast, [friction], 1e-3, 2), LAST_PART).write(holdout)
     task = read_diagnosis_task(log, nominal_study(), holdout=holdout)
     diagnosis = run_diagnosis(task)
     pair = tied(diagnosis.summary)

@@ -17,7 +17,7 @@ from jaxbl.drive import make_effect
 NAME = "motor.coulomb_friction"
 LIMITS = {"theta_e": Expected(1e-4, 0.0, 0.0, 1.2e-4), "torque_motor": Expected(0.01, 0.0, 0.0, 0.012)}
 NOISE = {"theta_e": 1e-4, "torque_motor": 0.01}
-BEFORE = {"theta_e": 0.1, "torque_motor": 0.01}
+NOMINAL_ERRORS = {"theta_e": 0.1, "torque_motor": 0.01}
 
 
 def make_fit(log_likelihood, log_evidence, name=NAME):
@@ -33,7 +33,7 @@ def make_search_result(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival
 
 def judge(
     errors=NOISE,
-    before=BEFORE,
+    before=NOMINAL_ERRORS,
     theta=0.0,
     controls=(),
     verdict="explained",
@@ -108,7 +108,9 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, 
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
     explanation = dataclasses.replace(make_search_result(), findings=(finding,), wrong=None)
-    (judged_finding,) = judged(explanation, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
+    (judged_finding,) = judged(
+        explanation, fitted, NOMINAL_ERRORS, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}
+    ).found.findings  # type: ignore[arg-type]
     assert judged_finding == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
@@ -140,7 +142,7 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     # what the log alone said for the other one is no argument any more
     fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
     reverse_control = [Control("wrong", NOISE, 1.8, NAME)]
-    judgement = judged(exchange, fitted, BEFORE, NOISE, LIMITS, reverse_control, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
+    judgement = judged(exchange, fitted, NOMINAL_ERRORS, NOISE, LIMITS, reverse_control, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
     assert judgement.found.findings == (finding,)
     assert (
         exchanged(
@@ -167,7 +169,9 @@ def test_what_a_log_leaves_open_held_out_data_decide():
     def judge_tie(z):
         explanation = dataclasses.replace(make_search_result(fit_gain=0.0), findings=(tie,))
         controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
-        return judged(explanation, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
+        return judged(
+            explanation, fitted, NOMINAL_ERRORS, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}
+        ).found.findings[0]  # type: ignore[arg-type]
 
     assert judge_tie(5.0).confidence > 0.99 and judge_tie(5.0).alternatives == ()
     assert judge_tie(1.0) == tie

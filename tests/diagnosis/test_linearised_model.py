@@ -86,7 +86,7 @@ def test_own_columns_are_derivatives(sides):
 
 
 LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
-SMALL = {
+SMALL_NUMBERS = {
     "motor.coulomb_friction": {"torque": 1e-3},
     "motor.viscous_friction": {"viscous": 1e-4},
     "motor.inertia": {"inertia": 1e-5},
@@ -103,10 +103,10 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", SMALL_NUMBERS)
 def test_a_candidates_torque_does_what_the_effect_does(geared_model, name):
     """The effect in the simulated step, against its torque along the measured motion through the linear recursion."""
-    effect = as_arrays(make_effect(name, **SMALL[name]), float)
+    effect = as_arrays(make_effect(name, **SMALL_NUMBERS[name]), float)
 
     def with_effect(experiment):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
@@ -169,7 +169,7 @@ def test_products_are_those_of_the_errors(sides):
 def test_products_of_candidates_are_those_of_their_errors(geared_model, coloured):
     """Candidates are taken some at a time: those beside one another are the same as all at once."""
     model = geared_model
-    variants = variants_of(model.experiment, list(SMALL), lambda name: LOG)
+    variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
     columns = model.columns(variants, smoothness, noise)

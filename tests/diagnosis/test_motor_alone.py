@@ -46,7 +46,7 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
 
 
 SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
-EXACT = STUDY | {"drive": GEARED, "transmission": SHAFT}
+EXACT_STUDY = STUDY | {"drive": GEARED, "transmission": SHAFT}
 ONE_CYCLE = 5.0 * np.sin(2.0 * np.pi * 0.5 * 2e-3 * np.arange(1000))
 
 
@@ -63,7 +63,7 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     select_samples(log, np.r_[0:50, 60:1060]).write(path)
     select_samples(log, np.r_[1060:1310]).write(other)
     done = []
-    task = read_diagnosis_task(path, EXACT, holdout=other)
+    task = read_diagnosis_task(path, EXACT_STUDY, holdout=other)
     diagnosis = run_diagnosis(task, lambda *counted: done.append(counted))
     assert (diagnosis.summary["verdict"], diagnosis.summary["findings"]) == ("no_discrepancy", [])
     assert diagnosis.summary["explained_share"] is None
@@ -92,7 +92,7 @@ def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
 def test_one_crossing_shows_a_gap(tmp_path):
     path = tmp_path / "motor.csv"
     simulate_motor_log(ONE_CYCLE, GAP, 1e-5).write(path)
-    summary = diagnose(path, EXACT).summary
+    summary = diagnose(path, EXACT_STUDY).summary
     assert summary["backlash"]["crossings"] == 1
     (finding,) = summary["findings"]
     assert finding["parameters"]["half_gap"]["value"] == summary["backlash"]["half_gap"] == pytest.approx(0.08, rel=1e-3)
@@ -103,7 +103,7 @@ def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
     path = tmp_path / "motor.csv"
     simulate_motor_log(ONE_CYCLE, GAP, 1e-5).write(path)
     monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
-    summary = diagnose(path, EXACT).summary
+    summary = diagnose(path, EXACT_STUDY).summary
     assert (summary["verdict"], summary["findings"]) == ("unknown_effect", [])
     lines = diagnosis_lines(summary)
     assert any(

@@ -12,17 +12,17 @@ from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.identification.compilation import jit
 from jaxbl.simulate import plant_trajectory
 
-GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
+NEVER_ADDED = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
     name for name in EFFECTS if name.startswith("encoder.")
 }
 """Effects that a diagnosis does not seek: the first acts as viscous friction does, a table is no name, and what an encoder
 reads beside the position moves no drive."""
-KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
+MODEL_EFFECTS = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
 def prepare_model(sides):
     data = small_study() if sides == 2 else rigid_study()
-    return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
+    return as_arrays(prepare(read_config({**data, "effects": MODEL_EFFECTS})), float)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
@@ -51,7 +51,7 @@ def test_all_effects_are_there_once(sides):
     assert len(set(names)) == len(names)
     assert set(names) == {*lacking, "motor.coulomb_friction"}
     if sides == 2:
-        assert set(names) == set(EFFECTS) - GIVEN_ONLY
+        assert set(names) == set(EFFECTS) - NEVER_ADDED
     # those with a state of their own are there if they act, in the same place as if they had been there from the first
     assert [effect.name for effect in complete(bare).effects] == [name for name in names if name not in stateful]
     assert [effect.name for effect in complete(complete(bare), lacking).effects] == names
@@ -59,7 +59,7 @@ def test_all_effects_are_there_once(sides):
     assert candidates(complete(bare)) == stateful and candidates(complete(bare, lacking)) == []
 
 
-@pytest.mark.parametrize("name", sorted(set(EFFECTS) - GIVEN_ONLY))
+@pytest.mark.parametrize("name", sorted(set(EFFECTS) - NEVER_ADDED))
 def test_every_effect_that_is_sought_has_neutral_numbers(name):
     neutral = EFFECTS[name].neutral()
     assert {field.name for field, _ in parameters(make_effect(name, **neutral))} == set(neutral)

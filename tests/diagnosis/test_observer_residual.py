@@ -23,7 +23,7 @@ GAINS = {
     "geared": {"motor": (15.0, 345.0), "load": (2.85, 12.3)},
 }
 """lambda and alpha, as chosen on these logs."""
-LOW = 0.01
+TIME_CONSTANT = 0.01
 """Time constant of the equivalent control, s."""
 
 
@@ -63,7 +63,7 @@ def rms(values):
 
 def low_pass(torque, period):
     """Filter a torque by the equivalent control's low-pass."""
-    share = -np.expm1(-period / LOW)
+    share = -np.expm1(-period / TIME_CONSTANT)
     return lfilter([share], [1.0, share - 1.0], torque)
 
 
@@ -79,7 +79,7 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
             description["rms"] == pytest.approx(description["smoother_rms"], rel=0.03)
             and description["rms"] > 10.0 * description["noise"]
         )
-        assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
+        assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * TIME_CONSTANT))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
         missing = low_pass(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + witness.skipped : 1500]
         low, _ = narrowed(witness.residual, 10.0)

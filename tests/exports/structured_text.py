@@ -38,7 +38,7 @@ class FunctionBlock:
             if node.type not in places:
                 self._statement(node, 1)
         source = "\n".join(["def step(m, literals):", *self._lines])
-        names = _MEANING | {"types": self.types}
+        names = _NAMES | {"types": self.types}
         exec(compile(source, "structured text", "exec"), names)
         self._step = names["step"]
 
@@ -169,27 +169,27 @@ def _select_branch(condition, no, yes):
 
 
 class _Conversion:
-    def __init__(self, kind, to):
-        self.kind, self.to, self.up = kind, to, False
+    def __init__(self, from_type, to_type):
+        self.from_type, self.to_type, self.rounds_up = from_type, to_type, False
 
     def __call__(self, value):
-        assert type(value) is self.kind
-        if isinstance(value, np.floating) and not issubclass(self.to, np.floating):
+        assert type(value) is self.from_type
+        if isinstance(value, np.floating) and not issubclass(self.to_type, np.floating):
             assert abs(value) < 2**31
-            self.up = not self.up
-            return self.to(math.ceil(value) if self.up else math.floor(value))
-        return self.to(value)
+            self.rounds_up = not self.rounds_up
+            return self.to_type(math.ceil(value) if self.rounds_up else math.floor(value))
+        return self.to_type(value)
 
 
 _LOGIC = {"AND": np.logical_and, "OR": np.logical_or, "XOR": np.logical_xor}
 _ORDER = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "=": np.equal, "<>": np.not_equal}
-_WORK = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _require_alike(np.fmod, np.integer)}
-_MEANING = {
+_ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": _divide, "MOD": _require_alike(np.fmod, np.integer)}
+_NAMES = {
     "of": _require_type,
     **TYPES,
     "negative": _negate,
     "negated": lambda a: ~_require_type(np.bool_, a),
-    "binary": {word: _require_alike(work) for word, work in (_WORK | _ORDER).items()}
+    "binary": {word: _require_alike(work) for word, work in (_ARITHMETIC | _ORDER).items()}
     | {word: _require_alike(work, np.bool_) for word, work in _LOGIC.items()},
     "called": {
         "SQRT": _square_root,

@@ -40,7 +40,7 @@ EFFECT_TABLES = [
 ]
 EXCITATION = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.7}
 GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
-MOVED = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
+INITIAL = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
 
 
 def study(*places, base=small_study, **tables):
@@ -55,8 +55,8 @@ GAP_CHANGES = {"drive.motor_inertia": 0.08, "transmission.half_gap": 0.05, "effe
 STUDIES = {
     "rigid": study("motor.pre", "actuator.back", "encoder.", base=rigid_study),
     "shaft": study(transmission={"law": "linear_shaft", "stiffness": 1.0}),
-    "moved gap": study(transmission=GAP, initial=MOVED),
-    "all effects": study("", initial=MOVED),
+    "moved gap": study(transmission=GAP, initial=INITIAL),
+    "all effects": study("", initial=INITIAL),
     "gap": study(transmission=GAP),
     "gap with effects": study("load.gra", "motor.cou", transmission=GAP),
     "changed gap": study("load.gra", "motor.cou", transmission=GAP | {"half_gap": 0.05}, initial={"motor_velocity": 2.0}),
@@ -128,22 +128,22 @@ class Instance:
     """One instance in either version of FMI, by names of its variables; `said` are the lines of its log."""
 
     def __init__(self, path, token=None):
-        self.folder, self.said = fmpy.extract(path), []
-        self.about = fmpy.read_model_description(path)
-        self.two = self.about.fmiVersion == "2.0"
+        self.folder, self.messages = fmpy.extract(path), []
+        self.description = fmpy.read_model_description(path)
+        self.is_fmi2 = self.description.fmiVersion == "2.0"
         if token is not None:
-            self.about.guid = token
+            self.description.guid = token
         self._references = {
-            model_variable.name: model_variable.valueReference for model_variable in self.about.modelVariables
+            model_variable.name: model_variable.valueReference for model_variable in self.description.modelVariables
         }
-        logger = (lambda *inputs: self.said.append(inputs[-1].decode())) if self.two else self._collect_message
-        self.unit = fmpy.instantiate_fmu(self.folder, self.about, "CoSimulation", logger=logger)
+        logger = (lambda *inputs: self.messages.append(inputs[-1].decode())) if self.is_fmi2 else self._collect_message
+        self.unit = fmpy.instantiate_fmu(self.folder, self.description, "CoSimulation", logger=logger)
 
     def _collect_message(self, environment, status, category, message):
-        self.said.append(message.decode())
+        self.messages.append(message.decode())
 
     def begin(self, start=0.0, stop=None):
-        if self.two:
+        if self.is_fmi2:
             self.unit.setupExperiment(startTime=start, stopTime=stop)
             self.unit.enterInitializationMode()
         else:
@@ -152,21 +152,25 @@ class Instance:
         return self
 
     def set(self, **values):
-        (self.unit.setReal if self.two else self.unit.setFloat64)(
+        (self.unit.setReal if self.is_fmi2 else self.unit.setFloat64)(
             [self._references[name.replace("__", ".")] for name in values], list(values.values())
         )
 
     def get(self, *names):
-        return (self.unit.getReal if self.two else self.unit.getFloat64)([self._references[name] for name in names])
+        return (self.unit.getReal if self.is_fmi2 else self.unit.getFloat64)([self._references[name] for name in names])
 
     def outputs(self):
         return self.get(
-            *(model_variable.name for model_variable in self.about.modelVariables if model_variable.causality == "output")
+            *(
+                model_variable.name
+                for model_variable in self.description.modelVariables
+                if model_variable.causality == "output"
+            )
         )
 
     def time(self):
         last_successful = 2
-        return self.unit.getRealStatus(last_successful) if self.two else self.get("time")[0]
+        return self.unit.getRealStatus(last_successful) if self.is_fmi2 else self.get("time")[0]
 
     def step(self, time, length):
         self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=length)
@@ -180,19 +184,19 @@ class Instance:
         return np.array(rows)
 
     def state(self):
-        return self.unit.getFMUstate() if self.two else self.unit.getFMUState()
+        return self.unit.getFMUstate() if self.is_fmi2 else self.unit.getFMUState()
 
     def restore(self, state):
-        (self.unit.setFMUstate if self.two else self.unit.setFMUState)(state)
+        (self.unit.setFMUstate if self.is_fmi2 else self.unit.setFMUState)(state)
 
     def bytes_of(self, state):
-        return (self.unit.serializeFMUstate if self.two else self.unit.serializeFMUState)(state)
+        return (self.unit.serializeFMUstate if self.is_fmi2 else self.unit.serializeFMUState)(state)
 
     def state_of(self, serialized):
-        return (self.unit.deSerializeFMUstate if self.two else self.unit.deserializeFMUState)(serialized)
+        return (self.unit.deSerializeFMUstate if self.is_fmi2 else self.unit.deserializeFMUState)(serialized)
 
     def release(self, state):
-        (self.unit.freeFMUstate if self.two else self.unit.freeFMUState)(state)
+        (self.unit.freeFMUstate if self.is_fmi2 else self.unit.freeFMUState)(state)
 
     def __enter__(self):
         return self
@@ -288,7 +292,7 @@ def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     input_lines = "\n".join(repr(float(torque)) for torque in torques)
     stdout = run_program("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=input_lines).stdout
     *rows, refusal = stdout.splitlines()
-    assert refusal == instance.said[-1]
+    assert refusal == instance.messages[-1]
     actual = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
     assert (actual.view(np.int64) == to_integers(expected)).all()
 
@@ -346,7 +350,7 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
         for other in (bytes_of[:-1], bytes_of + b"x", b"x" + bytes_of[1:]):
             with pytest.raises(FMICallException):
                 second.state_of(other)
-        assert second.said[-1] == f"these {len(bytes_of)} bytes are no state of this model"
+        assert second.messages[-1] == f"these {len(bytes_of)} bytes are no state of this model"
         instance.release(stored_state), second.release(restored)
 
 
@@ -377,7 +381,7 @@ def test_steps_are_multiples_of_the_sample_period(unit_of, fmi):
         ):
             with pytest.raises(FMICallException, match="status 3"):
                 instance.step(time, length)
-            assert message in instance.said[-1]
+            assert message in instance.messages[-1]
         assert instance.outputs() == before
         instance.step(10.01, 1e-3)
 
@@ -393,7 +397,7 @@ def test_no_step_leads_past_the_stop_time(unit_of, fmi):
         instance.step(0.1, 9e-3)
         with pytest.raises(FMICallException, match="status 3"):
             instance.step(0.109, 2e-3)
-        assert instance.said == ["a step to 0.111 s, past the stop time 0.11 s"]
+        assert instance.messages == ["a step to 0.111 s, past the stop time 0.11 s"]
         instance.step(0.109, 1e-3)
         assert instance.time() == pytest.approx(0.11)
         with pytest.raises(FMICallException, match="status 3"):
@@ -420,7 +424,7 @@ def test_what_a_phase_does_not_allow_is_refused(unit_of, fmi):
     with Instance(path) as instance:
         with pytest.raises(FMICallException):
             instance.unit.terminate()
-        assert instance.said[-1] == "only what has been initialized can be terminated"
+        assert instance.messages[-1] == "only what has been initialized can be terminated"
         with pytest.raises(FMICallException):
             instance.unit.exitInitializationMode()
         instance.begin()
@@ -431,7 +435,7 @@ def test_what_a_phase_does_not_allow_is_refused(unit_of, fmi):
         instance.unit.terminate()
         with pytest.raises(FMICallException):
             instance.set(u=2.0)
-        assert instance.said[-1] == "nothing can be set after termination"
+        assert instance.messages[-1] == "nothing can be set after termination"
         for no_more in (instance.unit.terminate, lambda: instance.step(3e-3, 1e-3)):
             with pytest.raises(FMICallException):
                 no_more()
@@ -455,7 +459,7 @@ def test_missing_arguments_are_refused(unit_of, fmi):
             assert call(name, None) == 3
         for name in (f"Get{state}", f"Set{state}", *values):
             assert call(name, ctypes.c_void_p(instance.unit.component)) == 3
-        assert instance.said[-1] == "1 values for 1 variables, or no place for them"
+        assert instance.messages[-1] == "1 values for 1 variables, or no place for them"
 
 
 @COMPILED
@@ -472,7 +476,7 @@ def test_what_is_refused_has_a_line_in_the_log(unit_of, fmi):
     with Instance(path) as instance:
         with pytest.raises(FMICallException):
             instance.set(drive__motor_inertia=0.0)
-        assert instance.said == ["drive.motor_inertia: 0 is out of range (min 0, exclusive, max inf)"]
+        assert instance.messages == ["drive.motor_inertia: 0 is out of range (min 0, exclusive, max inf)"]
         with pytest.raises(FMICallException):
             instance.set(drive__motor_viscous=0.3, drive__load_viscous=-1.0)
         assert instance.get("drive.motor_viscous") == [0.15]
@@ -480,16 +484,16 @@ def test_what_is_refused_has_a_line_in_the_log(unit_of, fmi):
             instance.set(u=float("nan"))
         with pytest.raises(FMICallException):
             instance.step(0.0, 1e-3)
-        assert instance.said[-1] == "a step needs an initialized instance"
+        assert instance.messages[-1] == "a step needs an initialized instance"
         instance.begin()
-        for name in ("initial__motor_position", "motor__position", *(() if instance.two else ("time",))):
+        for name in ("initial__motor_position", "motor__position", *(() if instance.is_fmi2 else ("time",))):
             with pytest.raises(FMICallException):
                 instance.set(**{name: 1.0})
-            assert instance.said[-1].startswith(f"{name.replace('__', '.')} cannot be set")
+            assert instance.messages[-1].startswith(f"{name.replace('__', '.')} cannot be set")
         instance.set(transmission__stiffness=1e12)
         with pytest.raises(FMICallException):
             instance.run([1.0] * 300)
-        assert "the motion diverged" in instance.said[-1]
+        assert "the motion diverged" in instance.messages[-1]
         instance.unit.reset()
         assert np.isfinite(instance.begin().run([1.0] * 10)).all()
     with pytest.raises(Exception, match="Failed to instantiate"):

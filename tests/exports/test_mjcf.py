@@ -44,7 +44,7 @@ EFFECT_CASES += [
 ]
 
 
-DETERMINED = {"gap, damping, flexible load, delay": 1}
+REGULAR_SEEDS = {"gap, damping, flexible load, delay": 1}
 """Seeds of drives whose motion is not chaotic, where it is not 0, by kinds."""
 
 
@@ -115,7 +115,7 @@ def test_accelerations_are_those_of_the_plant(case):
 @pytest.mark.parametrize("kind", bench.KINDS)
 def test_free_runs_are_those_of_the_study(kind):
     # one drive over 4 s reaches what the exporter has of its kind; benchmarks/mjcf.py has fifty over ten
-    data = bench.draw_study(kind, DETERMINED.get(kind, 0))
+    data = bench.draw_study(kind, REGULAR_SEEDS.get(kind, 0))
     config = read_config(data | {"run": data["run"] | {"duration": 4.0}})
     inputs, expected = bench.simulate(config)
     assert bench.model_difference(kind, config, inputs, expected) < (0.03 if kind == bench.COARSE else 0.01)

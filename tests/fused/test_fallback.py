@@ -59,12 +59,14 @@ def refuse_feature(request, monkeypatch):
 
 
 STUDY = rigid_study({"run.substeps": 2})
-SWEPT = rigid_study({"run.substeps": 2}, axes=[listed_axis(ALPHA, 5.0, 9.0, 20.0)], sweep={"metrics": ["velocity_rmse"]})
+SWEEP_STUDY = rigid_study(
+    {"run.substeps": 2}, axes=[listed_axis(ALPHA, 5.0, 9.0, 20.0)], sweep={"metrics": ["velocity_rmse"]}
+)
 
 
 @pytest.fixture(scope="module")
 def scanned_sweep():
-    return jaxbl.sweep(SWEPT, backend="scan").frame
+    return jaxbl.sweep(SWEEP_STUDY, backend="scan").frame
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +77,14 @@ def looped_run():
 @parametrize_changes(rename_parameters, hide_modules)
 def test_a_sweep_is_scanned(scanned_sweep, refuse_feature, caplog):
     pattern = refuse_feature()
-    result = jaxbl.sweep(SWEPT)
+    result = jaxbl.sweep(SWEEP_STUDY)
     (reason,) = result.fallback_reasons
     np.testing.assert_array_equal(result.frame[NAME], scanned_sweep[NAME])
     assert re.fullmatch(pattern, reason)
     with pytest.raises(
         jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {pattern}; use --backend scan"
     ):
-        jaxbl.sweep(SWEPT, backend="fused")
+        jaxbl.sweep(SWEEP_STUDY, backend="fused")
     assert not caplog.messages
 
 

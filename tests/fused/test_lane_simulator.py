@@ -25,9 +25,11 @@ from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import ALL_METRICS, metrics_reducer
 from jaxbl.throughput.workload import CHAIN_METRICS, RANGES, SEED, Workload
 
-HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
-        "transmission.damping", "actuator.lag", "actuator.saturation"]  # fmt: skip
-OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
+HALF_OF_EFFECTS = [
+    "motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
+    "transmission.damping", "actuator.lag", "actuator.saturation",
+]  # fmt: skip
+OTHER_HALF = [*(name for name in VALUES if name not in HALF_OF_EFFECTS), *ENCODERS]
 
 
 def make_experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=701, precision="float64"):
@@ -74,7 +76,9 @@ class Parts(LaneSimulator):
 @functools.cache
 def make_parts(half, precision):
     """Parts of a short run with half of the effects, and with all metrics or one."""
-    names, law, metric_names = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
+    names, law, metric_names = (
+        (HALF_OF_EFFECTS, DeadZone(60.0, 0.05), None) if half else (OTHER_HALF, LinearShaft(60.0), ("torque_rmse",))
+    )
     full_experiment = make_experiment(names, law, steps=200, precision=precision)
     return Parts(
         full_experiment,
@@ -88,8 +92,8 @@ def make_parts(half, precision):
 @pytest.mark.parametrize(
     ("names", "law", "options"),
     [
-        (HALF, DeadZone(60.0, 0.05), {}),
-        (OTHERS, LinearShaft(60.0), {"observer": "explicit", "substeps": 1}),
+        (HALF_OF_EFFECTS, DeadZone(60.0, 0.05), {}),
+        (OTHER_HALF, LinearShaft(60.0), {"observer": "explicit", "substeps": 1}),
     ],
     ids=["half", "others"],
 )

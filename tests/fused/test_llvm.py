@@ -56,7 +56,7 @@ def test_a_loop_says_what_it_takes(sum_loop):
     np.testing.assert_array_equal(inputs["sample output 0"].reshape(5, 2)[2], [33.0, 36.0])
 
 
-WRONG = {
+BAD_BUFFERS = {
     "shorter": lambda array: array.ravel()[:-1],
     "longer": lambda array: np.append(array, array.ravel()[0]),
     "of another type": lambda array: array.astype(np.float32 if array.dtype == float else np.int64),
@@ -65,10 +65,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", loop_buffers())
-@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("wrong", BAD_BUFFERS)
 def test_what_does_not_fit_is_refused(sum_loop, name, wrong):
     inputs = loop_buffers()
-    inputs[name] = WRONG[wrong](inputs[name])
+    inputs[name] = BAD_BUFFERS[wrong](inputs[name])
     with pytest.raises(ValueError, match=rf"^{name} of a loop needs \d+ contiguous numbers of type"):
         sum_loop(list(inputs.values()), 5, 0, 2)
 

@@ -17,7 +17,7 @@ from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
 from jaxbl.simulate import Experiment, Run, move_plant, plant_trajectory
 
 STEPS = 250
-OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
+OTHER_EFFECTS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
 
 
 def make_experiment(names, rigid=False, substeps=1, extra=()):
@@ -31,8 +31,8 @@ def make_experiment(names, rigid=False, substeps=1, extra=()):
 
 
 MODELS = {
-    "most": lambda: make_experiment([name for name in VALUES if name not in OTHERS], substeps=5),
-    "others": lambda: make_experiment(OTHERS),
+    "most": lambda: make_experiment([name for name in VALUES if name not in OTHER_EFFECTS], substeps=5),
+    "others": lambda: make_experiment(OTHER_EFFECTS),
     "rigid": lambda: make_experiment(
         ["motor.presliding_friction", "motor.cogging", "motor.inertia", "actuator.lag"], rigid=True
     ),

@@ -16,7 +16,7 @@ from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 NAMES = ["motor.stribeck_friction", "load.gravity", "motor.cogging", "actuator.lag"]
-ODD = Reducer(
+ODD_REDUCER = Reducer(
     lambda e: jnp.zeros_like(e.run.sample_period),
     lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),
     lambda e, total, state: {"odd": total, "sum": jax.scipy.special.erf(total)},
@@ -50,7 +50,7 @@ def record_row(state, signals):
 def scan_run():
     """An experiment, and figures and record of it by the scan."""
     full_experiment = make_experiment(Prbs(5.0, 0.05), 523, "float64")
-    return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD), record_row, 1))(
+    return full_experiment, *jax.jit(lambda seed: scan(full_experiment, seed, (ALL_METRICS, ODD_REDUCER), record_row, 1))(
         jnp.asarray(3)
     )
 
@@ -61,7 +61,7 @@ def scan_run():
         (1, (ALL_METRICS,)),
         (7, (ALL_METRICS,)),  # blocks with a rest, none a multiple of what is kept
         (600, (ALL_METRICS,)),
-        (3, (ALL_METRICS, ODD)),  # what no loop can do
+        (3, (ALL_METRICS, ODD_REDUCER)),  # what no loop can do
     ],
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
@@ -69,7 +69,7 @@ def test_figures_and_record_are_those_of_the_scan(scan_run, stride, reducers):
     full, figures, record = scan_run
     result, selected = record_run(full, 3, reducers, record_row, stride)
     assert list(selected) == ["u", "torque", "moving", "t"]
-    assert set(result) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
+    assert set(result) == set(figures) - (set() if ODD_REDUCER in reducers else {"odd", "sum"})
     for name, column in selected.items():
         assert column.dtype == record[name].dtype
         np.testing.assert_allclose(column, record[name][::stride], rtol=1e-8, atol=1e-12, err_msg=name)

@@ -237,7 +237,7 @@ def test_words_and_sampled_axes_in_where():
         accuracy_laws(make_result(data))
 
 
-WRONG = {
+BAD_KEYS = {
     "heatmap with theory": (
         {"kind": "heatmap", "y": NOISE, "theory": 1.0},
         "figures[0]: a heatmap has no theory; use a line",
@@ -253,9 +253,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("case", BAD_KEYS)
 def test_wrong_keys_of_a_figure(case):
-    keys, message = WRONG[case]
+    keys, message = BAD_KEYS[case]
     figure = {key: value for key, value in law_figure().items() if key != "theory"} | keys
     with pytest.raises(InputError) as error:
         read_config(study(figure))

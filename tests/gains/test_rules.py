@@ -12,12 +12,14 @@ EXACT = jax.jit(least_lambda_exact)
 ALPHA, LAMBDA = np.geomspace(1.02, 20.0, 96), np.geomspace(0.02, 25.0, 96)
 
 # as each source has it, in its own letters
-STATED = {
+REGIONS = {
     "davila_fridman": lambda k1, k2, f: k2 > f and k1 > np.sqrt(2.0 / (k2 - f)) * (k2 + f),
     "levant": lambda k1, k2, f: k2 > f and k1**2 > 4.0 * f * (k2 + f) / (k2 - f),
     "seeber_horn": lambda k1, k2, f: k2 > f and k1 > np.sqrt(k2 + f),
     # |2 / (s^2 + k1 s + 2 k2)| f < 1 on the imaginary axis
-    "moreno_osorio": lambda k1, k2, f: k1 > 0.0 and np.abs(2.0 / (2.0 * k2 - W**2 + 1j * k1 * W)).max() * f < 1.0,
+    "moreno_osorio": lambda k1, k2, f: (
+        k1 > 0.0 and np.abs(2.0 / (2.0 * k2 - ROOT_RATES**2 + 1j * k1 * ROOT_RATES)).max() * f < 1.0
+    ),
     "oxictl": lambda k1, k2, w: k1 > 2.0 * np.sqrt(w) and k2 > w + k1**2 / 2.0,
     "root_of_alpha": lambda k1, k2, delta: k2 > delta and k1**2 > 4.0 * k2,
     "transcribed": lambda k1, k2, delta: k1**2 / (2.0 * k2) - k1**4 / 16.0 < delta**2 and 4.0 * k2 > k1**2,
@@ -26,7 +28,7 @@ STATED = {
     "ordered_and_above": lambda k1, k2, d: k1 > 2.0 * np.sqrt(2.0 * d) and k2 > d and k1 > k2,
     "quotient": lambda a, b, big: a > np.sqrt(2.0 * big) and b > a**2 / (2.0 * (a - np.sqrt(2.0 * big))),
 }
-W = np.geomspace(1e-4, 1e4, 20_001)
+ROOT_RATES = np.geomspace(1e-4, 1e4, 20_001)
 SCALE_FREE = {"davila_fridman", "levant", "seeber_horn", "moreno_osorio", "oxictl", "root_of_alpha"}
 SUFFICIENT = SCALE_FREE | {"ordered_and_above", "usual_pair", "small_pair"}
 
@@ -41,11 +43,11 @@ def judged_rules():
 
 def test_all_rules_are_judged(judged_rules):
     assert list(judged_rules) == list(RULES)
-    assert {name for name, judgement in judged_rules.items() if judgement["kind"] == "region"} == set(STATED)
+    assert {name for name, judgement in judged_rules.items() if judgement["kind"] == "region"} == set(REGIONS)
     assert all(judgement["source"] and judgement["states"] for judgement in judged_rules.values())
 
 
-@pytest.mark.parametrize("name", STATED)
+@pytest.mark.parametrize("name", REGIONS)
 def test_region_is_the_one_that_is_stated(name):
     draw = np.random.default_rng(5)
     f_plus = 10.0 ** draw.uniform(-1.5, 1.5, 300)
@@ -56,7 +58,7 @@ def test_region_is_the_one_that_is_stated(name):
         bool(allows_gains(RULES[name], *np.array([[trial_lambda], [trial_alpha]]), f)[0])
         for trial_lambda, trial_alpha, f in zip(lambda_, alpha, f_plus, strict=True)
     ]
-    expected = [bool(STATED[name](*numbers)) for numbers in zip(lambda_, alpha, f_plus, strict=True)]
+    expected = [bool(REGIONS[name](*numbers)) for numbers in zip(lambda_, alpha, f_plus, strict=True)]
     assert 5 < sum(expected) < 295
     assert actual == expected
 
@@ -72,7 +74,7 @@ def test_which_are_sufficient_and_which_depend_on_units(judged_rules):
             assert judgement.get("cells", {}).get("counterexamples", 0) == 0
 
 
-@pytest.mark.parametrize("name", sorted(SUFFICIENT & set(STATED)))
+@pytest.mark.parametrize("name", sorted(SUFFICIENT & set(REGIONS)))
 def test_no_gains_of_a_sufficient_rule_fail(name):
     draw = np.random.default_rng(6)
     f_plus = 10.0 ** draw.uniform(-2.0, 2.0, 30)
@@ -93,7 +95,7 @@ def test_counterexamples_in_the_observers_own_states(name, judged_rules):
     """An adversary who sees the error: its largest push outward, then homeward."""
     counterexample = judged_rules[name]["counterexample"]
     f_plus, alpha, lambda_ = (counterexample[key] for key in ("f_plus", "alpha", "lambda"))
-    assert STATED[name](lambda_, alpha, f_plus)
+    assert REGIONS[name](lambda_, alpha, f_plus)
 
     def derivatives(t, s):
         rate = s[1] - lambda_ * np.sqrt(abs(s[0])) * np.sign(s[0])
@@ -125,7 +127,7 @@ def test_counterexamples_in_the_observers_own_states(name, judged_rules):
     assert counterexample["peak_ratio"] == pytest.approx(counterexample["peak_ratio_simulated"], rel=1e-5)
 
 
-@pytest.mark.parametrize("name", STATED)
+@pytest.mark.parametrize("name", REGIONS)
 def test_coverage_is_the_share_of_cells(name, judged_rules):
     """The share is counted again by points drawn evenly over the logarithmic map."""
     draw = np.random.default_rng(7)

@@ -19,13 +19,13 @@ from jaxbl.sweeps.sweep import sweep
 pytestmark = pytest.mark.usefixtures("compiled_once")
 
 TABLE = {"num": 5, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lambda_ratio": {"start": 0.5, "stop": 20.0}}
-DISTURBED = [{"kind": "motor.constant_torque", "torque": 0.05}]
+DISTURBANCE = [{"kind": "motor.constant_torque", "torque": 0.05}]
 """f_plus = 0.05 / 0.05 = 1 rad/s^2 at all times."""
 
 
 def rigid_tune_study(changes=None, **tables):
     """The rigid drive under a constant torque, its observer starting 0.1 rad/s off."""
-    study = {"effects": DISTURBED, "tune": TABLE, "sweep": {"seeds": 2}} | tables
+    study = {"effects": DISTURBANCE, "tune": TABLE, "sweep": {"seeds": 2}} | tables
     base = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
             "encoders.noise": 1e-5, "run.duration": 0.4}  # fmt: skip
     return rigid_study(base | (changes or {}), **study)
@@ -154,7 +154,7 @@ def test_summary_is_json_and_public_names_resolve(tuned_study):
         assert key in tuned_study.summary
 
 
-BOTH = {"num": 3, "refine": 1, "worst_over_uncertainty": True, "margin_exact": 1.0, "margin_alpha": 1.05}
+UNCERTAINTY_TABLE = {"num": 3, "refine": 1, "worst_over_uncertainty": True, "margin_exact": 1.0, "margin_alpha": 1.05}
 
 
 def test_both_sides_at_once_over_uncertain_drives_and_a_restart(tmp_path, monkeypatch):
@@ -162,8 +162,10 @@ def test_both_sides_at_once_over_uncertain_drives_and_a_restart(tmp_path, monkey
         {"observer.motor.velocity_error": None, "run.velocity_tolerance": 5.0, "run.position_tolerance": 0.1,
          "uncertainty.relative": 0.1, "excitation.amplitude": 0.5},
         effects=[{"kind": "motor.inertia", "inertia": 0.001}],
-        tune=BOTH | {"objective": "torque", "holdout": {"kind": "chirp", "amplitude": 0.5, "start_frequency": 1.0,
-                                                         "stop_frequency": 3.0, "sweep_time": 0.2}},
+        tune=UNCERTAINTY_TABLE | {
+            "objective": "torque",
+            "holdout": {"kind": "chirp", "amplitude": 0.5, "start_frequency": 1.0, "stop_frequency": 3.0, "sweep_time": 0.2},
+        },
     )  # fmt: skip
     calls = []
     first = tune(study, tmp_path / "out", progress=lambda done, total: calls.append((done, total)))
@@ -285,7 +287,7 @@ def test_without_a_table_the_defaults_are_taken():
             tune(study)
 
 
-NONE = {
+INFEASIBLE = {
     "no time": ({"longest_convergence": 1e-3}, {}, "longest_convergence = 0.001: 0 (fastest"),
     "margin out of reach": ({"margin_exact": 1e3}, {}, "margin_exact = 1000: 0 (largest"),
     "tolerance out of reach": (
@@ -296,9 +298,9 @@ NONE = {
 }
 
 
-@pytest.mark.parametrize("case", NONE)
+@pytest.mark.parametrize("case", INFEASIBLE)
 def test_no_feasible_gains_is_no_result_and_names_the_constraint(case):
-    table, changes, message = NONE[case]
+    table, changes, message = INFEASIBLE[case]
     with pytest.raises(NoResult, match=r"motor: none of the 25 gains with alpha / f⁺ in 1\.2 \.\.\. 20 ") as error:
         tune(rigid_tune_study(changes, tune=TABLE | table))
     assert message in str(error.value), error.value
@@ -306,7 +308,7 @@ def test_no_feasible_gains_is_no_result_and_names_the_constraint(case):
 
 
 def test_a_drive_that_diverges_is_no_result():
-    effects = [{"kind": "motor.viscous_friction", "viscous": 1e4}, *DISTURBED]
+    effects = [{"kind": "motor.viscous_friction", "viscous": 1e4}, *DISTURBANCE]
     with pytest.raises(NoResult, match="motor: the drive itself diverges in the pilot run"):
         tune(rigid_tune_study(effects=effects))
 

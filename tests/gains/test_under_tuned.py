@@ -56,12 +56,12 @@ def simulate_peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.
 
 
 TIMES = np.linspace(0.0, 12.0, 6001)
-SLOW = 1.5 * np.sin(TIMES)
+SLOW_SINE = 1.5 * np.sin(TIMES)
 
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.0, 0.0), (0.0, 1.0), (0.01, 0.0), (0.005, 3.0)])
 def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
-    law = peak_law(lambda_, 1.8, TIMES, SLOW, damping=damping, peak=0.02)
+    law = peak_law(lambda_, 1.8, TIMES, SLOW_SINE, damping=damping, peak=0.02)
     times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), least_peak=1.8e-3)
     expected = np.interp(times, TIMES, law)
     is_compared = expected > 2e-3
@@ -72,7 +72,7 @@ def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
 
 
 def test_without_losses_peaks_come_back_with_the_disturbance():
-    law = peak_law(0.0, 1.8, TIMES, SLOW, damping=0.0, peak=0.02)
+    law = peak_law(0.0, 1.8, TIMES, SLOW_SINE, damping=0.0, peak=0.02)
     turn = np.interp(0.5 * np.pi, TIMES, law) / 0.02
     assert turn == pytest.approx((1.0 - 1.5**2 / 1.8**2) ** (1.0 / 3.0), rel=1e-5)
     assert np.interp(2.0 * np.pi, TIMES, law) == pytest.approx(0.02, rel=1e-5)
@@ -96,7 +96,7 @@ def test_the_law_ends_after_a_finite_time():
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.3, 0.0), (0.05, 1.0), (2.5, 0.0)])
 def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
-    simulated = simulate_error(lambda_, 1.8, TIMES, SLOW, damping=damping, velocity_error=0.5)
+    simulated = simulate_error(lambda_, 1.8, TIMES, SLOW_SINE, damping=damping, velocity_error=0.5)
     times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 3.0, damping, (0.0, 0.5), most=12)
     assert simulated.largest == 0.5
     assert simulated.peaks[0] == 0.5
@@ -108,7 +108,7 @@ def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
 
 
 def test_simulated_error_from_a_position_error():
-    simulated = simulate_error(0.3, 1.8, TIMES, SLOW, position_error=-0.2, velocity_error=0.1)
+    simulated = simulate_error(0.3, 1.8, TIMES, SLOW_SINE, position_error=-0.2, velocity_error=0.1)
     times, x2 = simulate_peaks(0.3, 1.8, lambda t: 1.5 * np.sin(t), 3.0, 0.0, (-0.2, 0.1), most=3)
     np.testing.assert_allclose(simulated.peaks[:3], np.abs(x2), rtol=2e-4)
     np.testing.assert_allclose(simulated.times[:3], times, rtol=2e-4)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
-from shared_results import ATLAS, GAINS, INPUTS, VERIFIED
+from shared_results import ATLAS, GAINS, INPUTS, VERIFY_STUDY
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 
 from jaxbl.config import read_config
@@ -27,7 +27,7 @@ KEYS = {
 }
 BOUNDS = {"true": "motor.f_plus", "claimed": "motor.f_plus_acceleration"}
 CAUSES = {"run too short", "period too long", "noise", "quantisation", "explicit discretisation"}
-WHOLE = {"several", "f_plus underestimated", "unexplained"}
+GENERAL_CAUSES = {"several", "f_plus underestimated", "unexplained"}
 
 
 def exact_lambda(ratio):
@@ -185,7 +185,7 @@ def test_every_counterexample_carries_its_point_and_a_cause(verified_study):
         assert part[KEYS[level]].notna().all(axis=None)
     assert counterexamples.loc[counterexamples["level"] == "drive", PERIOD].isna().all()
     for cause in counterexamples["cause"]:
-        assert cause in WHOLE or set(cause.split(" or ")) <= CAUSES, cause
+        assert cause in GENERAL_CAUSES or set(cause.split(" or ")) <= CAUSES, cause
     # what is not there is no cause
     assert not counterexamples["cause"].str.contains("quantisation").any()
     # of one run, one cause at the true bound
@@ -239,7 +239,7 @@ def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeyp
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
     monkeypatch.setattr(module, "normalised_peak_ratios", lambda *_: pytest.fail("the plane is simulated again"))
-    second = verify(VERIFIED, folder)
+    second = verify(VERIFY_STUDY, folder)
     assert second.summary == verdict.summary
     for level, frame in verdict.levels.items():
         pd.testing.assert_frame_equal(second.levels[level], frame)
@@ -290,13 +290,13 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(verified_at_rest, mo
 def test_a_verification_keeps_to_its_backend(verified_study):
     _, folder = verified_study
     with pytest.raises(InputError, match="was begun without --backend; go on without it, or choose another folder"):
-        verify(VERIFIED, folder, backend="scan")
+        verify(VERIFY_STUDY, folder, backend="scan")
 
 
 def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="is not empty and holds no study"):
-        verify(VERIFIED, tmp_path)
+        verify(VERIFY_STUDY, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 

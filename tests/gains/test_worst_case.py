@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from jaxbl.gains.worst_case import HalfCycle, half_cycle, least_lambda_simulated
 from jaxbl.observer import conditions
 
-HALF, LEAST = jax.jit(half_cycle), jax.jit(least_lambda_simulated)
+HALF_CYCLE, LEAST_LAMBDA = jax.jit(half_cycle), jax.jit(least_lambda_simulated)
 RATIO = jax.jit(conditions.peak_ratio)
 LIMITS = {name: jax.jit(limit) for name, (_, limit) in conditions.CONDITIONS.items()}
 
@@ -22,14 +22,14 @@ def half_cycles_of(lambda_, alpha, f_plus=1.0, damping=0.0, speed=1.0, outward=1
     arguments = np.broadcast_arrays(lambda_, alpha, f_plus, damping, speed, outward, homeward, ray)
     shape, size = arguments[0].shape, arguments[0].size
     *gains, damping, speed, outward, homeward, ray = (np.resize(x, LANES if size <= LANES else CELLS) for x in arguments)
-    half_cycles = HALF(*gains, damping=damping, speed=speed, outward=outward, homeward=homeward, ray=ray)
+    half_cycles = HALF_CYCLE(*gains, damping=damping, speed=speed, outward=outward, homeward=homeward, ray=ray)
     return HalfCycle(*(np.asarray(x)[:size].reshape(shape) for x in half_cycles))
 
 
 def find_least_lambda(alpha, f_plus=1.0, damping=0.0, speed=1.0):
     arguments = np.broadcast_arrays(alpha, f_plus, damping, speed)
     *gains, damping, speed = (np.resize(x, LANES) for x in arguments)
-    return np.asarray(LEAST(*gains, damping=damping, speed=speed))[: arguments[0].size].reshape(arguments[0].shape)
+    return np.asarray(LEAST_LAMBDA(*gains, damping=damping, speed=speed))[: arguments[0].size].reshape(arguments[0].shape)
 
 
 def demand_lambda(name, alpha, f_plus):
@@ -312,7 +312,7 @@ def test_least_lambda_with_damping_is_where_scipys_peaks_stop_falling(alpha, f_p
 
 def test_columns_broadcast():
     lambda_, alpha = np.array([0.5, 1.0, 2.0])[:, None], np.array([1.5, 3.0])
-    half_cycles = HALF(lambda_, alpha, 1.0, damping=0.3)
+    half_cycles = HALF_CYCLE(lambda_, alpha, 1.0, damping=0.3)
     assert half_cycles.ratio.shape == half_cycles.time.shape == (3, 2)
     for computed, padded in zip(half_cycles, half_cycles_of(lambda_, alpha, damping=0.3), strict=True):
         np.testing.assert_allclose(computed, padded, rtol=1e-12)

@@ -30,7 +30,7 @@ LIMIT = 1.25 * HALF_GAP
 WINDOW = {"window": 4.0, "interval": 0.5}
 OPTIONS = ("--window", "4", "--every", "0.5")
 SECONDS = 16.0
-GROWN = 1.0 + np.clip((np.arange(0.0, SECONDS, 1e-3) - 5.0) / 4.0, 0.0, 1.0)
+GROWING_GAPS = 1.0 + np.clip((np.arange(0.0, SECONDS, 1e-3) - 5.0) / 4.0, 0.0, 1.0)
 """The half gap over its size at the start: it doubles from 5 s to 9 s."""
 
 
@@ -41,7 +41,7 @@ def logs(tmp_path_factory):
     model = folder / "axis.toml"
     model.write_text(tomli_w.dumps(axis()))
     with jax.enable_x64(True):
-        for name, gaps in (("same", np.ones(10_000)), ("grown", GROWN)):
+        for name, gaps in (("same", np.ones(10_000)), ("grown", GROWING_GAPS)):
             simulate_log(axis(), gaps).to_csv(folder / f"{name}.csv", index=False)
     return folder
 
@@ -85,7 +85,9 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(growing_watch):
         assert (part["half_gap_from"] < part["half_gap"]).all()
         assert (part["half_gap_least"] < part["half_gap_from"]).all()
     # while it grows, a gap that was there within the window
-    first, last = (np.interp(values["t"] - delay, np.arange(0.0, SECONDS, 1e-3), GROWN * HALF_GAP) for delay in (4.0, 0.0))
+    first, last = (
+        np.interp(values["t"] - delay, np.arange(0.0, SECONDS, 1e-3), GROWING_GAPS * HALF_GAP) for delay in (4.0, 0.0)
+    )
     assert (values["half_gap"] > 0.99 * first).all()
     assert (values["half_gap"] < 1.01 * last).all()
     crossing_time, alarm_times = 6.0, values["t"][values["alarm"]]

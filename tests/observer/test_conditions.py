@@ -386,7 +386,7 @@ def switch_at_ray(ray):
     return disturbance
 
 
-HALF = jax.jit(lambda *arguments, ray, homeward: half_cycle(*arguments, ray=ray, homeward=homeward))
+HALF_CYCLE = jax.jit(lambda *arguments, ray, homeward: half_cycle(*arguments, ray=ray, homeward=homeward))
 
 
 def total_time(cycle):
@@ -402,13 +402,13 @@ def test_worst_time_is_that_of_simulated_half_cycles_and_of_no_other_ray():
     at_root = np.isclose(ray, root, rtol=1e-6, atol=0.0)
     assert 50 < at_root.sum() < 250
     assert np.all(ray <= 0.0)
-    slowest_cycle = HALF(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
+    slowest_cycle = HALF_CYCLE(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
     np.testing.assert_allclose(total_time(slowest_cycle), worst, rtol=1e-4)
     # every other ray: as shares of the root's, or of all directions where there is none
-    times = [total_time(HALF(*gains, ray=zeros, homeward=unit))]
+    times = [total_time(HALF_CYCLE(*gains, ray=zeros, homeward=unit))]
     for share in np.linspace(0.0, 1.0, 100, endpoint=False):
         rays = np.where(np.isnan(root), -np.sqrt(gains[1]) * share / (1.0 - share), share * root)
-        times.append(total_time(HALF(*gains, ray=rays, homeward=-unit)))
+        times.append(total_time(HALF_CYCLE(*gains, ray=rays, homeward=-unit)))
     longest = np.nanmax(times, axis=0)
     assert np.all(longest <= worst * (1.0 + 1e-4))
     assert np.all(longest >= worst * (1.0 - 1e-3))

@@ -139,7 +139,7 @@ def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkey
         np.testing.assert_array_equal(file.load_numbers("other"), 2.0 * U)
 
 
-BAD = {
+BAD_FILES = {
     "missing": (None, "no such file"),
     "empty.csv": (b"", "is empty; text .* can be read"),
     "blank.csv": (b" \n\n", "is empty"),
@@ -162,9 +162,9 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("name", BAD_FILES)
 def test_unreadable_files_are_named_in_one_line(name, tmp_path):
-    content, message = BAD[name]
+    content, message = BAD_FILES[name]
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)

@@ -48,19 +48,19 @@ def test_what_simulate_leaves_is_a_log(tmp_path):
     assert record.statistics.channels["theta_s"].resolution == pytest.approx(1e-5)
 
 
-ONE = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "m": 1.0, "mm": 1e-3}
+UNIT_SIZES = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "m": 1.0, "mm": 1e-3}
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
     truth = simulate_log(count=400, period=2e-3)
-    unit = data.draw(st.sampled_from([*ONE, "counts"]))
+    unit = data.draw(st.sampled_from([*UNIT_SIZES, "counts"]))
     sign = data.draw(st.sampled_from([1, -1]))
     factor = data.draw(st.sampled_from([1.0, 0.5, 3.0]))
     counts = data.draw(st.sampled_from([4096.0, 20000.0]))
     log = {"column": "x", "unit": unit, "sign": sign, "factor": factor, "offset": 2.0}
-    unit_size = 2.0 * math.pi / counts if unit == "counts" else ONE[unit]
+    unit_size = 2.0 * math.pi / counts if unit == "counts" else UNIT_SIZES[unit]
     column = (truth["theta_e"].to_numpy() - 2.0) * sign / unit_size / factor
     step = 0.0
     if unit == "counts":

@@ -25,12 +25,12 @@ MOTION = {
     "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
     "observer": {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
 }
-SHORT = {"run.duration": 1.0, "run.sample_period": 2e-3, "run.substeps": 4, "identifier.start": 0.2}
+SHORT_RUN = {"run.duration": 1.0, "run.sample_period": 2e-3, "run.substeps": 4, "identifier.start": 0.2}
 DEAD_ZONE = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 
 
 def geared_study(changes=None, **tables):
-    return small_study(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
+    return small_study(SHORT_RUN | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
 
 
 def draw_by_name(result):
@@ -119,9 +119,12 @@ CASES = {
                                 {"kind": "transmission.eccentricity", "amplitude": 0.01},
                                 {"kind": "motor.inertia", "inertia": 0.01},
                                 {"kind": "actuator.lag", "time_constant": 0.01}]), {}, GEARED),
-    "rigid": (rigid_study(SHORT | {"identifier.start": None}), {}, RIGID),
-    "linear": (rigid_study(SHORT | {"identifier.start": None}, effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}]),
-               {"unit": "m"}, RIGID),
+    "rigid": (rigid_study(SHORT_RUN | {"identifier.start": None}), {}, RIGID),
+    "linear": (
+        rigid_study(SHORT_RUN | {"identifier.start": None}, effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}]),
+        {"unit": "m"},
+        RIGID,
+    ),
 }  # fmt: skip
 
 

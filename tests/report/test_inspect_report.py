@@ -12,17 +12,17 @@ from jaxbl.records import inspect
 from jaxbl.report.figures import save
 from jaxbl.report.inspect import draw_inspection, summary, write_inspection_report
 
-UNEVEN = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
-BOTH = ["channels", "spectra", "torque_over_velocity", "twist"]
+UNEVEN_TIMES = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
+BOTH_ENCODERS = ["channels", "spectra", "torque_over_velocity", "twist"]
 CASES = {
-    "both encoders": (simulate_log(count=6000, gap=0.1, noise=1e-3), {}, BOTH),
-    "uneven, with a gap": (simulate_log(UNEVEN).drop(index=range(1000, 1400)), {}, [*BOTH, "intervals"]),
-    "motor alone": (simulate_log().drop(columns="theta_s"), {}, BOTH[:3]),
-    "load alone, linear": (simulate_log().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH[:3]),
+    "both encoders": (simulate_log(count=6000, gap=0.1, noise=1e-3), {}, BOTH_ENCODERS),
+    "uneven, with a gap": (simulate_log(UNEVEN_TIMES).drop(index=range(1000, 1400)), {}, [*BOTH_ENCODERS, "intervals"]),
+    "motor alone": (simulate_log().drop(columns="theta_s"), {}, BOTH_ENCODERS[:3]),
+    "load alone, linear": (simulate_log().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH_ENCODERS[:3]),
     "free": (simulate_log().assign(u=0.0), {}, ["channels", "spectra", "twist"]),
     "no torque": (simulate_log(), {"absent": ["u"]}, ["channels", "spectra", "twist"]),
-    "sensor": (simulate_log(), {"transmitted": "u"}, BOTH),
-    "noise": (simulate_log().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH),
+    "sensor": (simulate_log(), {"transmitted": "u"}, BOTH_ENCODERS),
+    "noise": (simulate_log().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH_ENCODERS),
 }
 
 
@@ -51,7 +51,7 @@ def test_a_gap_is_not_drawn_over(tmp_path):
 
 
 def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
-    frame = simulate_log(UNEVEN, noise=1e-3).drop(index=range(1000, 1400))
+    frame = simulate_log(UNEVEN_TIMES, noise=1e-3).drop(index=range(1000, 1400))
     limit = 0.5 * frame["u"].max()
     frame["u"] = frame["u"].clip(-limit, limit)
     frame.loc[500, "theta_e"] += 3.0

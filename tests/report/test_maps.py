@@ -141,7 +141,7 @@ def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
     assert alpha[-1] == pytest.approx(50.0)
 
 
-ODD = {
+ODD_FIGURES = {
     "all NaN": (
         small_study(axes=GAINS, figures=[heatmap_figure()]),
         {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan},
@@ -188,9 +188,9 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("case", ODD)
+@pytest.mark.parametrize("case", ODD_FIGURES)
 def test_odd_studies_are_drawn(tmp_path, case):
-    data, columns = ODD[case]
+    data, columns = ODD_FIGURES[case]
     assert panels(draw_only_figure(tmp_path, data, **columns))
 
 

@@ -190,7 +190,7 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
             assert page.get_by_text(name, exact=True).count() >= 3
 
 
-GONE = {
+ALL_DIVERGED = {
     "finite": lambda frame: False,
     "motor__converged": lambda frame: False,
     **{f"motor__{name}": lambda frame: np.nan for name in ("velocity_rmse", "position_rmse", "f_plus")},
@@ -210,7 +210,7 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
     studies = {
         "texts": (few | {"title": title, "notes": [title] * 2}, rising),
         "map": ({"axes": [lambdas, long_axis]}, rising),
-        "gone": (few, GONE),
+        "gone": (few, ALL_DIVERGED),
     }
     for name, (data, columns) in studies.items():
         (tmp_path / name).mkdir()

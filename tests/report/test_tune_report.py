@@ -21,11 +21,11 @@ from jaxbl.report.figures import save
 from jaxbl.report.tune import draw_tuning, tune_headline, write_tune_report
 from jaxbl.sweeps.trial import run
 
-SLOW = {"lambda": 1e-3, "alpha": 0.05}
+SLOW_GAINS = {"lambda": 1e-3, "alpha": 0.05}
 STUDY = small_study(
     {"title": "two <b> sides", "run.velocity_tolerance": 0.2, "run.position_tolerance": 0.1, "excitation.amplitude": 0.5},
     tune={"num": 4, "refine": 1, "alpha_ratio": {"stop": 20.0}, "lambda_ratio": {"stop": 20.0},
-          "compare": [{"name": "slow", "motor": SLOW, "load": SLOW}]},
+          "compare": [{"name": "slow", "motor": SLOW_GAINS, "load": SLOW_GAINS}]},
 )  # fmt: skip
 
 

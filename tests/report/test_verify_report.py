@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tomli_w
 from browser import check_figures, needs_chromium, open_pages
-from shared_results import VERIFIED
+from shared_results import VERIFY_STUDY
 
 from jaxbl.report.verify import draw_verdict, write_verify_report
 from jaxbl.sweeps.engine import Engine
@@ -101,7 +101,7 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     shutil.copytree(verified_study[1], folder)
     for name in ("verdict.json", "counterexamples.parquet"):
         (folder / name).unlink()
-    (tmp_path / "study.toml").write_text(tomli_w.dumps(VERIFIED))
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(VERIFY_STUDY))
     # all runs are there
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished verification simulates"))
     code, lines, _ = call("verify", "study.toml")

@@ -13,7 +13,7 @@ from jaxbl.fused import program_cache
 from jaxbl.sweeps.costs import Cost, Costs, Operations, choose_backend, count_operations, measure_costs
 from jaxbl.sweeps.programs import Layout
 
-KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
+MADE_UP_COSTS = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 
 
 def test_counted_work():
@@ -48,28 +48,28 @@ def test_measured_costs_are_those_of_the_machine(monkeypatch):
         seconds = {}
         for backend, path, lanes in cases:
             operations = count_operations(config, [path])
-            seconds[backend, path, lanes] = KNOWN.sample_seconds(backend, operations, Layout(1, lanes))
+            seconds[backend, path, lanes] = MADE_UP_COSTS.sample_seconds(backend, operations, Layout(1, lanes))
             if backend == "scan" and lanes > 10_000:
                 # the cache is too small
                 seconds[backend, path, lanes] *= 2.0
         equations = count_operations(config, [cases[0][1]]).equations
-        return seconds, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
+        return seconds, {"fused": MADE_UP_COSTS.fused.equation * equations, "scan": MADE_UP_COSTS.scan.equation * equations}
 
     monkeypatch.setattr(under_test, "_time_programs", time_programs)
     costs = measure_costs(jax.devices()[:1])
     for backend in ("fused", "scan"):
-        np.testing.assert_allclose(costs.of(backend), KNOWN.of(backend), rtol=1e-6)
+        np.testing.assert_allclose(costs.of(backend), MADE_UP_COSTS.of(backend), rtol=1e-6)
     assert costs.cache == 4096 * count_operations(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
 
 
 def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
     calls = []
-    monkeypatch.setattr(under_test, "measure_costs", lambda devices: calls.append(devices) or KNOWN)
+    monkeypatch.setattr(under_test, "measure_costs", lambda devices: calls.append(devices) or MADE_UP_COSTS)
     devices = jax.devices()
     assert under_test.load_costs(devices) == under_test._CPU
     assert not calls
     monkeypatch.setenv(program_cache.PROGRAMS_VARIABLE, str(tmp_path))
-    assert [under_test.load_costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
+    assert [under_test.load_costs(devices) for _ in range(2)] == [MADE_UP_COSTS, MADE_UP_COSTS]
     assert calls == [devices]
 
 

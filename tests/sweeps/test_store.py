@@ -122,7 +122,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(study_copy, finished_study,
     pd.testing.assert_frame_equal(result.frame, finished_study[1].frame)
 
 
-OTHER = {
+OTHER_STUDIES = {
     "other number": {"changes": {"drive.motor_inertia": 0.06}},
     "other axis": {"axes": [listed_axis(ALPHA, 5.0, 9.0, 21.0)]},
     "more seeds": {"sweep": {"seeds": 4, "chunk": 2}},
@@ -131,11 +131,11 @@ OTHER = {
 }
 
 
-@pytest.mark.parametrize("case", OTHER)
+@pytest.mark.parametrize("case", OTHER_STUDIES)
 def test_another_study_in_the_folder_stays_as_it_is(study_copy, case):
     before = read_files(study_copy)
     with pytest.raises(InputError, match=r"holds another study \('small'") as error:
-        sweep(study(**OTHER[case]), study_copy)
+        sweep(study(**OTHER_STUDIES[case]), study_copy)
     assert str(study_copy) in str(error.value)
     assert read_files(study_copy) == before
 
@@ -148,10 +148,10 @@ def test_only_title_notes_and_figures_changed_is_the_same_study(study_copy, comp
 
 
 def test_overwriting_is_asked_for(study_copy, computed_chunks):
-    result = sweep(study(OTHER["other number"]["changes"]), study_copy, overwrite=True)
+    result = sweep(study(OTHER_STUDIES["other number"]["changes"]), study_copy, overwrite=True)
     assert computed_chunks == [0, 1, 2]
     assert len(open_study(study_copy).frame) == len(result.frame) == 9
-    sweep(study(OTHER["other number"]["changes"]), study_copy, overwrite=True)
+    sweep(study(OTHER_STUDIES["other number"]["changes"]), study_copy, overwrite=True)
     assert computed_chunks == [0, 1, 2]
 
 

@@ -219,7 +219,7 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
     assert [effect.get("torque", effect.get("harmonic")) for effect in effects_of_point] == [0.02, 0.25, 3]
 
 
-SWEPT = rigid_study(
+SWEEP_STUDY = rigid_study(
     axes=[listed_axis(NOISE, 1e-5, 1e-4), spaced_axis(ALPHA, 5.0, 50.0, 3), spaced_axis(LAMBDA, 1.0, 20.0, 2)],
     sweep={"chunk": 4},
 )
@@ -229,7 +229,7 @@ SWEPT = rigid_study(
 def swept_folder(tmp_path_factory):
     """A sweep of twelve runs, stored."""
     folder = tmp_path_factory.mktemp("swept")
-    sweep(SWEPT, folder)
+    sweep(SWEEP_STUDY, folder)
     return folder
 
 
@@ -273,7 +273,10 @@ def test_points_that_the_study_may_not_have_are_refused(swept_folder, question, 
 
 
 def test_numbers_that_differ_in_the_last_digit_of_their_precision_give_nearly_the_same():
-    config, asked = read_config(SWEPT | {"run": SWEPT["run"] | {"precision": "float32"}}), {"values": VALUES, "seed": 0}
+    config, asked = (
+        read_config(SWEEP_STUDY | {"run": SWEEP_STUDY["run"] | {"precision": "float32"}}),
+        {"values": VALUES, "seed": 0},
+    )
     name = "motor.velocity_rmse"
     metrics, near = simulated(config, asked)["metrics"][name], [metric[name] for metric in nearby(config, asked)["metrics"]]
     assert near == pytest.approx([metrics] * 6, rel=1e-3) and len({metrics, *near}) > 3
@@ -347,7 +350,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
 
 
 def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path):
-    share(SWEPT, tmp_path / "out", (1, 2))
+    share(SWEEP_STUDY, tmp_path / "out", (1, 2))
     with served(study_source(tmp_path / "out")) as server:
 
         def read_version(version):
@@ -357,7 +360,7 @@ def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path)
 
         versions = server.newest(), server.newest()
         assert [read_version(version)["found"] for version in versions] == [8, 8] and read_version(versions[0])["served"]
-        sweep(SWEPT, tmp_path / "out")
+        sweep(SWEEP_STUDY, tmp_path / "out")
         last = server.newest()
         assert read_version(last)["found"] == 12 and server.newest() == last
 
