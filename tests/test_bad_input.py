@@ -94,13 +94,13 @@ def test_every_listed_input_was_tried(lines_by_input):
 
 
 @pytest.mark.parametrize("case", EXPECTED_LINES)
-def test_what_is_said_of_it(lines_by_input, case):
+def test_listed_inputs_get_their_lines(lines_by_input, case):
     assert EXPECTED_LINES[case] in lines_by_input[case]
     assert bool(EXPECTED_LINES[case]) == bool(lines_by_input[case])
 
 
 @pytest.mark.parametrize("kind", ["toml", "logs"])
-def test_generated_ones(kind, tmp_path, repeats):
+def test_generated_inputs_are_read_or_refused(kind, tmp_path, repeats):
     """Read, or refused in one line; the process itself ends at an exception, at ten seconds, and at two gigabytes."""
     count = repeats(70, 1000)
     lines = read_lines(kind, tmp_path, count).values()

@@ -140,7 +140,7 @@ def test_every_name_is_defined():
     assert not faults, "\n".join(sorted(faults))
 
 
-def test_the_check_of_names_sees_them():
+def test_the_check_of_names_sees_undefined_names():
     code = compile("def f():\n    return [missing for _ in range(2)]", "", "exec")
     assert set(globals_of(code)) == {"missing", "range"}
 

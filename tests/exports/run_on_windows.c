@@ -77,8 +77,8 @@ int main(int count, char **arguments)
     }
     else
     {
-        instance = MAKE((const char *, const char *, const char *, bool, bool, bool, bool, const void *, size_t, void *, void *,
-                         void *),
+        instance = MAKE((const char *, const char *, const char *, bool, bool, bool, bool, const void *, size_t, void *,
+                         void *, void *),
                         "fmi3InstantiateCoSimulation", "a", arguments[3], NULL, false, false, false, false, NULL, 0u, NULL,
                         (void *)log_3, NULL);
         failures += CALL((void *, bool, double, double, bool, double), "fmi3EnterInitializationMode",

@@ -48,7 +48,7 @@ def test_runs_below_their_bound_are_counted_and_explained(sweep_frame):
     assert axis_values[ALPHA] == 1.8
 
 
-def test_none_below(sweep_frame):
+def test_no_run_is_below_its_bound(sweep_frame):
     assert summarise_converged_below(STUDY, "motor", sweep_frame[sweep_frame[ALPHA] == 4.0]) is None
 
 

@@ -42,7 +42,7 @@ def test_both_are_found_and_corrected(read_frame, skew, offset, gap):
     assert record.statistics.gearing.lost_motion == pytest.approx(gap + 4e-3, abs=1e-3 + 0.02 * gap)
 
 
-def test_what_log_says_holds(read_frame):
+def test_corrections_of_the_log_table_hold(read_frame):
     log = {"theta_s": {"skew": 0.0}, "theta_e": {"offset": 0.0}}
     record = read_frame(simulate_axis(3.04e-3, 0.379), log)
     assert record.warnings == () and record.corrections == {}

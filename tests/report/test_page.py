@@ -78,7 +78,7 @@ def test_everything_is_escaped_and_in_its_place():
         ([""], None),
     ],
 )
-def test_the_command_is_said_where_it_was_one(words, ending, monkeypatch):
+def test_a_page_names_the_command_that_made_it(words, ending, monkeypatch):
     monkeypatch.setattr("sys.argv", words)
     text = unescape(html("title", [], [], [], [], ""))
     assert "Made by jaxbl" in text and (ending in text if ending else ", with: " not in text)

@@ -11,7 +11,7 @@ from jaxbl.throughput.studies import STUDIES
 
 
 @pytest.mark.parametrize("name", list(STUDIES))
-def test_those_of_the_repository(name):
+def test_studies_of_the_repository(name):
     drawn = {"title": "", "notes": [], "figures": []}
     repository = read_config(f"sweeps/{name}.toml").model_copy(update=drawn)
     assert read_config(STUDIES[name]).model_copy(update=drawn).to_dict() == repository.to_dict()
