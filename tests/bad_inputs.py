@@ -276,8 +276,9 @@ def mutate_tables(draw, data):
         if mutation == "remove":
             del container[last]
         elif mutation == "add" and isinstance(container, dict):
+            value = copy.deepcopy(draw(ODD))
             key = draw(st.one_of(st.sampled_from([text for text in TEXTS if text]), st.text(min_size=1, max_size=9)))
-            container[key] = copy.deepcopy(draw(ODD))
+            container[key] = value
         elif mutation == "number" and isinstance(container[last], str):
             container[last] = draw(st.sampled_from(TEXTS))
         elif mutation == "number" and isinstance(container[last], int | float):
