@@ -125,7 +125,7 @@ def assert_agreement(outputs, trace, tolerance=TOLERANCE):
 
 
 class Instance:
-    """One instance in either version of FMI, by names of its variables; `said` are the lines of its log."""
+    """One instance in either version of FMI, by names of its variables; `messages` are the lines of its log."""
 
     def __init__(self, path, token=None):
         self.folder, self.messages = fmpy.extract(path), []
