@@ -905,7 +905,7 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis_log, qu
     for name in ("a.csv", "b.csv"):
         shutil.copy("an axis.csv", tmp_path / "logs" / name)
     (tmp_path / "logs" / "broken.csv").write_text("t,u\n0,1\n")
-    # in this process: another one knows nothing of `quick`
+    # in this process: another one knows nothing of `quick_tasks`
     command = "diagnose", "--batch", "logs", "--model", "axis.toml", "--jobs", "1", "--out"
     code, lines, _ = call(*command, "out")
     assert code == 0
