@@ -46,19 +46,19 @@ def _name_kind(figure: Figure, format: str) -> str:
 
 def _save_kind(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
     """`Figure.savefig` in tests."""
-    known = Path(os.environ[_FOLDER], _name_kind(figure, format))
-    if not known.exists():
+    picture_file = Path(os.environ[_FOLDER], _name_kind(figure, format))
+    if not picture_file.exists():
         picture = BytesIO()
         _draw(figure, picture, format=format, **options)
         # a constrained layout is found once, not before each drawing
         figure.set_layout_engine("none")
-        draft = known.with_suffix(f".{os.getpid()}")
+        draft = picture_file.with_suffix(f".{os.getpid()}")
         draft.write_bytes(picture.getvalue())
-        draft.replace(known)
+        draft.replace(picture_file)
     if isinstance(file, BytesIO):
-        file.write(known.read_bytes())
+        file.write(picture_file.read_bytes())
     else:
-        shutil.copyfile(known, file)
+        shutil.copyfile(picture_file, file)
 
 
 def _lay_out_kind(engine: TightLayoutEngine, figure: Figure) -> None:
