@@ -48,7 +48,7 @@ def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality, repeat
     assert np.mean([f.lost_motion for f in fits]) == pytest.approx(gap, rel=5e-3)
 
 
-@pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"around": True}])
+@pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"turns_around": True}])
 def test_intervals_by_the_side_of_the_load_cover_the_gap(options, repeats):
     count = repeats(10, 30)
     fits = [fit_frame(simulate_load(seed, **options), 1.0) for seed in range(count)]
