@@ -17,10 +17,10 @@ Lines = list[str]
 
 
 class NextStep(NamedTuple):
-    """A command line that a user may go on with, and the question that it answers, in a sentence."""
+    """A command line that a user may go on with, and the question that it answers: keys of `next` in `--json`."""
 
     command: str
-    question: str
+    answers: str
 
 
 def format_table(rows: Iterable[Sequence[str]], *, numbers: bool = False) -> list[str]:
@@ -82,7 +82,7 @@ def format_steps(steps: Sequence[NextStep]) -> list[str]:
     for step in steps:
         lines += [
             f"  {step.command}",
-            *textwrap.wrap(f"    {step.question}", TERMINAL_WIDTH, subsequent_indent="    "),
+            *textwrap.wrap(f"    {step.answers}", TERMINAL_WIDTH, subsequent_indent="    "),
         ]
     return lines
 

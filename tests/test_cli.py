@@ -938,6 +938,7 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     assert content["summary"] == {"title": "small", "runs": 3, "finished": True}
     assert content["found"][0].startswith("3 runs.") and content["open"] == "out/report.html"
     assert [step["command"].split()[1] for step in content["next"]] == ["explore", "tune", "simulate"]
+    assert {tuple(step) for step in content["next"]} == {("command", "answers")}
     assert set(content["files"]) == {
         f"out/{name}" for name in list_files(tmp_path / "out") if not name.startswith("points/")
     }

@@ -147,7 +147,7 @@ def html(
 
 
 def _step(one: NextStep) -> str:
-    return f"<dt>{escape(one.question)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
+    return f"<dt>{escape(one.answers)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
 
 
 def _figure(name: str, shown: Picture) -> str:
