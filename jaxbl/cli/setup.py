@@ -197,11 +197,11 @@ def bench(
     from jaxbl.report.bench import write_bench_report
     from jaxbl.throughput import bench as run_bench
 
-    # the time of compiling is measured, so that nothing may come from the cache
-    jax.config.update("jax_enable_compilation_cache", False)
     make_folder(out)
     if any(out.iterdir()) and not (out / "bench.json").exists():
         raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
+    # the time of compiling is measured, so that nothing may come from the cache
+    jax.config.update("jax_enable_compilation_cache", False)
     with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit="parts", keeps_results=False) as progress:
         result = run_bench(quick=quick, progress=progress)
     return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)
