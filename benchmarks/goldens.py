@@ -84,7 +84,8 @@ def run(script: str, *arguments: str, folder: Path, path: Sequence[Path], cache:
         "JAX_COMPILATION_CACHE_DIR": str(cache / "jax"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PLATFORMS": "cpu",
-        "JAXBL_PROGRAMS": str(folder / "programs"),
+        # with a store of programs the machine's costs are measured, and decide how studies are cut into chunks
+        "JAXBL_PROGRAMS": "",
         # one device and one thread a process: as many processes as cores
         "XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_multi_thread_eigen=false",
         "COLUMNS": "80",
