@@ -47,7 +47,7 @@ def draw_study(name: str, command: str, figures: list[str], text: str) -> list[P
         drawings = jaxbl.draw(run(tomllib.loads(text)), *figures)
         shutil.rmtree(folder, ignore_errors=True)
         for i, drawn in enumerate(drawings):
-            save(drawn.figure, folder / f"{i}_{drawn.name}.png")
+            save(drawn.figure, folder / f"{i:02}_{drawn.name}.png")
         known.write_text(state, encoding="utf-8")
     return sorted(folder.glob("*.png"))
 
@@ -68,7 +68,7 @@ class Study(SphinxDirective):
         except (jaxbl.InputError, jaxbl.NoResult) as error:
             return [self.state.document.reporter.warning(f"{name}: {error}", line=self.lineno)]
         page = Path(self.env.doc2path(self.env.docname)).parent
-        images = [nodes.image(uri=os.path.relpath(file, page), alt=f"{name}, {file.stem[2:]}") for file in files]
+        images = [nodes.image(uri=os.path.relpath(file, page), alt=f"{name}, {file.stem[3:]}") for file in files]
         return [*images, nodes.literal_block(text, text, language="toml")]
 
 

@@ -122,7 +122,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
         if not paths:
-            raise InputError("model: no number to identify; each is exact, or 0 where it has to be positive")
+            raise InputError("model: no number to identify: all are exact or 0; give one a value to start from")
         free = make_free_parameters(nominal, paths, float(np.std(record.torque)))
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
         segments = segments_of(record, sides, rest)

@@ -262,7 +262,7 @@ BAD = {
     ),
     "nothing to find": (
         rigid_study({"drive.motor_viscous": 0.0}, effects=[], uncertainty={"exact": ["drive.motor_inertia"]}),
-        "model: no number to identify; each is exact, or 0 where it has to be positive",
+        "model: no number to identify: .* give one a value to start from",
     ),
     "starts": (geared_study(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
 }
