@@ -10,12 +10,13 @@ demo: .venv/installed
 # one worker a core: more threads of linear algebra would only wait for one another
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
+# all but what runs or opens the pages of docs, which `make docs` does
 test: .venv/installed-dev
-	$(PYTEST)
+	$(PYTEST) -m "not pages"
 
 # without slow tests (tests/durations.json), and those that call a browser or a compiler
 test-fast: .venv/installed-dev
-	$(PYTEST) -m "not slow and not program"
+	$(PYTEST) -m "not slow and not program and not pages"
 
 # hundreds of kills, damages and random inputs, a million steps
 test-long: .venv/installed-dev
@@ -30,9 +31,10 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-# the site, from the pages, docstrings, and the studies of the gallery
+# the site, from the pages, docstrings, and the studies of the gallery; then every page as written, and in a browser
 docs: .venv/installed-dev
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html
+	$(PYTEST) -m pages
 
 # lines, tokens and words by folder; tests/test_size.py holds ceilings
 size:

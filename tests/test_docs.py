@@ -173,7 +173,7 @@ def test_architecture_shows_the_floors():
 # what a block cannot do in a test, and what stands in for it
 REPLACED_COMMANDS = {
     "make demo": "jaxbl demo",  # test_demo_is_this_command; the environment is imitated below
-    "make test": "",  # this is it
+    "make test": "",
     r"\. \.venv/bin/activate": "",
     # benchmarks/slurm.sh runs these files by a SLURM
     "sbatch --array=1-20 --cpus-per-task=8 docs/cluster/array.sbatch": (
@@ -251,6 +251,7 @@ def test_demo_is_this_command():
     assert recipe.replace("$(BIN)/", "") == REPLACED_COMMANDS["make demo"]
 
 
+@pytest.mark.pages
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(read_blocks(page))), ids=page_name)
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that

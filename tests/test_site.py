@@ -17,6 +17,7 @@ from progress_lines import without_progress
 
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "_build" / "html"
+pytestmark = pytest.mark.pages
 
 
 @pytest.fixture(scope="module")
