@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-fast test-long goldens lint docs size versions clean
+.PHONY: demo test test-fast test-long goldens lint docs site size versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl demo
@@ -31,10 +31,13 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-# the site, from the pages, docstrings, and the studies of the gallery; then every page as written, and in a browser
+# every page as written, then the site, and its pages in a browser
 docs: .venv/installed-dev
+	$(PYTEST) -m pages --dist loadgroup
+
+# from the pages, docstrings, and the studies of the gallery
+site: .venv/installed-dev
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html
-	$(PYTEST) -m pages
 
 # lines, tokens and words by folder; tests/test_size.py holds ceilings
 size:

@@ -1,4 +1,4 @@
-"""How Sphinx makes the site (`make docs`): from the tree's root, of the pages as they are read there."""
+"""How Sphinx makes the site (`make site`): from the tree's root, of the pages as they are read there."""
 
 import hashlib
 import os

@@ -17,12 +17,12 @@ from progress_lines import without_progress
 
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "_build" / "html"
-pytestmark = pytest.mark.pages
+pytestmark = [pytest.mark.pages, pytest.mark.xdist_group("site")]
 
 
 @pytest.fixture(scope="module")
 def pages():
-    """Pages of the site, as `make docs` builds them: only pages that have changed since the last build."""
+    """Pages of the site, as `make site` builds them: only pages that have changed since the last build."""
     words = "-m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html"
     assert words in (ROOT / "Makefile").read_text(encoding="utf-8")
     subprocess.run(
