@@ -146,8 +146,10 @@ class StrictTable(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _reject_unknown_keys(cls, data: Any) -> Any:
+    def _check_keys(cls, data: Any) -> Any:
+        """Refuse unknown keys, and make lists of arrays and Python's numbers of NumPy's."""
         if isinstance(data, Mapping):
+            data = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in data.items()}
             keys = [field.alias or name for name, field in cls.model_fields.items()]
             for key in data:
                 if key not in keys:

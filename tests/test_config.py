@@ -1,9 +1,12 @@
 """The TOML study: what is valid, what the messages about the rest say, and what it builds."""
 
+import math
 import re
 import tomllib
 
 import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,7 +14,8 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, small_study, spaced_axis
 
-from jaxbl.config import numeric_paths, read_config, with_values
+from jaxbl import run, tune, verify
+from jaxbl.config import numeric_paths, precision, prepare, read_config, with_values
 from jaxbl.drive import EFFECTS, EXCITATIONS, TRANSMISSIONS, config_key, get_leaf, leaf_paths, parameters
 from jaxbl.drive.plant import DRIVES
 from jaxbl.errors import InputError
@@ -685,6 +689,56 @@ def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
     assert message.format(tmp_path) in str(error.value)
     assert str(error.value).startswith(str(tmp_path))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda config: setattr(config.observer.motor, "lambda_", -5.0), "observer.motor.lambda: should be greater than or"),
+        (lambda config: setattr(config.run, "duration", math.nan), "run.duration: should be a finite number, not nan"),
+        (lambda config: setattr(config.run, "sample_period", 100.0), "run: sample_period 100.0 s is longer than duration"),
+        (
+            lambda config: setattr(config, "effects", [{"kind": "motor.magic"}]),
+            "effects[0].kind: unknown kind",
+        ),
+        (lambda config: setattr(config, "drive", "rigid"), "drive: should be a table, not 'rigid'"),
+    ],
+)
+def test_attributes_that_are_set_are_checked_before_a_run(change, message):
+    config = read_config(small_study())
+    change(config)
+    for command in (read_config, run, sweep, tune, verify):
+        with pytest.raises(InputError, match=re.escape(f"config: {message}")):
+            command(config)
+
+
+def test_a_copy_with_other_attributes_is_checked():
+    config = read_config(small_study())
+    longer = read_config(config.model_copy(update={"run": config.run.model_copy(update={"duration": 3.0})}))
+    assert longer.run.duration == 3.0
+    with pytest.raises(InputError, match=re.escape("config: run.substeps: should be greater than or equal to 1, not 0")):
+        run(config.model_copy(update={"run": config.run.model_copy(update={"substeps": 0})}))
+
+
+@pytest.mark.parametrize("array", [np.array, jnp.array])
+def test_arrays_and_numbers_of_numpy_are_taken(array):
+    listed = small_study(axes=[listed_axis(LAMBDA, 1.0, 2.0), listed_axis(ALPHA, 3.0)])
+    arrays = small_study(axes=[{"path": LAMBDA, "values": array([1.0, 2.0])}, {"path": ALPHA, "values": array([3.0])}])
+    assert read_config(arrays) == read_config(listed)
+    spaced = {"path": LAMBDA, "start": np.float32(1.0), "stop": np.int64(9), "num": np.int64(3)}
+    assert read_config(small_study(axes=[spaced])).axes[0].grid().tolist() == [1.0, 5.0, 9.0]
+    with pytest.raises(InputError, match=re.escape("axes[0].values[0]: should be a valid number, not [1.0, 1.0]")):
+        read_config(small_study(axes=[{"path": LAMBDA, "values": array([[1.0, 1.0]])}]))
+
+
+def test_an_experiment_has_the_precision_of_its_study():
+    config = read_config(small_study())
+    for other in ("float64", "float32"):
+        study = with_values(config, {}).model_copy(update={"run": config.run.model_copy(update={"precision": other})})
+        with precision(study):
+            assert prepare(study).run.sample_period.dtype == other
+    with jax.enable_x64(False), pytest.raises(InputError, match="is float64, and JAX computes in float32 here"):
+        prepare(config)
 
 
 def test_first_seed_shifts_the_noise():

@@ -40,12 +40,14 @@ Origins = dict[str, Origin]
 
 
 def read_config(source: ConfigSource) -> Config:
-    """Read and validate a study from a TOML file, a mapping, or a config.
+    """Read and validate a study from a TOML file, a mapping, or a config, whose attributes may have been set since.
 
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    return source if isinstance(source, Config) else _validate(*_read_with_includes(source))
+    if isinstance(source, Config):
+        return _validate("config", source.to_dict(), {})
+    return _validate(*_read_with_includes(source))
 
 
 _MISSING_GAINS = {"lambda": 1.0, "alpha": 1.0}
@@ -76,7 +78,7 @@ _ELEMENT = (
 def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     """Read a model as :func:`read_model` does, for any kind of log."""
     if isinstance(source, Config):
-        return source, frozenset()
+        return read_config(source), frozenset()
     name, data, origins = _read_with_includes(source)
     log = data.get("log")
     if isinstance(log, dict) and log.get("kind") == "element" and "drive" not in data:

@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
 from jaxbl.drive.parameters import Parameter, as_arrays, config_key, parameters
+from jaxbl.errors import InputError
 from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
@@ -121,7 +122,12 @@ class Config(Table):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain data with defaults filled in."""
-        return self.model_dump(by_alias=True, exclude_none=True)
+        # what is wrong in a config whose attributes were set is for read_config to say
+        return self.model_dump(by_alias=True, exclude_none=True, warnings=False)
+
+    def with_keys(self, table: str, **keys: Any) -> "Config":
+        """Return a copy with other keys in a table; they are not checked."""
+        return self.model_copy(update={table: getattr(self, table).model_copy(update=keys)})
 
     def remarks(self) -> list[str]:
         """Return sentences on settings that are valid and perhaps not meant."""
@@ -271,5 +277,12 @@ def precision(config: Config) -> Any:
 
 
 def prepare(config: Config) -> Experiment:
-    """The config's experiment with array leaves of its precision; call inside :func:`precision`."""
-    return as_arrays(config.build(), jnp.dtype(config.run.precision))
+    """Build the config's experiment with array leaves of its precision; call inside :func:`precision`.
+
+    Raises:
+        InputError: JAX computes in float32 here, the study in float64.
+    """
+    dtype = jnp.dtype(config.run.precision)
+    if jax.dtypes.canonicalize_dtype(dtype) != dtype:
+        raise InputError("run.precision: is float64, and JAX computes in float32 here; call it inside precision(config)")
+    return as_arrays(config.build(), dtype)

@@ -72,7 +72,7 @@ def read_identification_task(
     config, missing = read_model(model)
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
     given = {key: value for key, value in asked.items() if value is not None}
-    config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
+    config = config.with_keys("identify", **given)
     record, other = read_with_holdout(config, log, holdout)
     if any(remembers_input(one.build()) for one in config.effects):
         rest = config.log.initial_state == "rest"

@@ -131,7 +131,7 @@ def _at_one_period(config: Config, records: Sequence[Record], like: Record | Non
         longest = like.sample_period
     if all(_alike(one, longest) for one in periods):
         return config
-    return config.model_copy(update={"log": config.log.model_copy(update={"resample": longest})})
+    return config.with_keys("log", resample=longest)
 
 
 def read_with_holdout(
@@ -143,7 +143,7 @@ def read_with_holdout(
         return record, None
     other = read_logs(config, holdout, gear_tolerance, like=record)
     if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
-        config = config.model_copy(update={"log": config.log.model_copy(update={"resample": other.sample_period})})
+        config = config.with_keys("log", resample=other.sample_period)
         record = read_logs(config, logs, gear_tolerance)
         other = read_logs(config, holdout, gear_tolerance, like=record)
     check_positions(record, other)
@@ -251,7 +251,7 @@ def on_record(config: Config, record: Record) -> Experiment:
     """The study's experiment at the record's period, with plant steps no longer than the study's, and without excitation:
     the input is the record's."""
     run = run_of(config, record)
-    experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
+    experiment = prepare(config.with_keys("run", precision="float64"))
     return replace(
         experiment,
         # along a log nothing asks for these; programs are compiled for one

@@ -167,11 +167,7 @@ def read_watch_task(
         if not math.isclose(record.sample_period, config.run.sample_period, rel_tol=_TOLERANCE):
             raise period_error(address, record.sample_period, config.run.sample_period)
     with jax.enable_x64(True):
-        if record is None:
-            double = config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})})
-            experiment = prepare(double)
-        else:
-            experiment = on_record(config, record)
+        experiment = prepare(config.with_keys("run", precision="float64")) if record is None else on_record(config, record)
     law, period = experiment.transmission, float(experiment.run.sample_period)
     assert law is not None
     if alarm_gap is not None and "half_gap" not in law.truth():

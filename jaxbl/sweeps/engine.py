@@ -342,8 +342,7 @@ class Engine:
         # so long that the overhead of a call does not count
         predicted = self._predict_seconds(backend, config)
         steps = min(config.run.steps, max(_TIMED_SAMPLES, int(_TIMED_SECONDS / (predicted / config.run.steps))))
-        short_run = config.run.model_copy(update={"duration": steps * config.run.sample_period})
-        short_config = config.model_copy(update={"run": short_run})
+        short_config = config.with_keys("run", duration=steps * config.run.sample_period)
         short_program = self._compile(short_config)
         loop_seconds, gain_metric_seconds = [], []
         with precision(config):

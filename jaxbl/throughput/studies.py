@@ -94,11 +94,10 @@ def prepare_study(name: str, steps: int, lanes: int | None = None, identifier_st
         identifier_start: time at which identifiers begin, s; None for that of the study.
     """
     config = read_config(STUDIES[name])
-    changes = {"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
+    config = config.with_keys("run", duration=steps * config.run.sample_period)
     if identifier_start is not None:
         assert config.identifier is not None
-        changes["identifier"] = config.identifier.model_copy(update={"start": identifier_start})
-    config = config.model_copy(update=changes)
+        config = config.with_keys("identifier", start=identifier_start)
     points = Points(config)
     with precision(config):
         indices = (
