@@ -147,7 +147,7 @@ class StrictTable(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _check_keys(cls, data: Any) -> Any:
-        """Refuse unknown keys, and make lists of arrays and Python's numbers of NumPy's."""
+        """Refuse unknown keys. Turn arrays into lists, and NumPy's numbers into Python's."""
         if isinstance(data, Mapping):
             data = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in data.items()}
             keys = [field.alias or name for name, field in cls.model_fields.items()]

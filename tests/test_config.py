@@ -697,10 +697,7 @@ def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
         (lambda config: setattr(config.observer.motor, "lambda_", -5.0), "observer.motor.lambda: should be greater than or"),
         (lambda config: setattr(config.run, "duration", math.nan), "run.duration: should be a finite number, not nan"),
         (lambda config: setattr(config.run, "sample_period", 100.0), "run: sample_period 100.0 s is longer than duration"),
-        (
-            lambda config: setattr(config, "effects", [{"kind": "motor.magic"}]),
-            "effects[0].kind: unknown kind",
-        ),
+        (lambda config: setattr(config, "effects", [{"kind": "motor.magic"}]), "effects[0].kind: unknown kind"),
         (lambda config: setattr(config, "drive", "rigid"), "drive: should be a table, not 'rigid'"),
     ],
 )
@@ -734,7 +731,7 @@ def test_arrays_and_numbers_of_numpy_are_taken(array):
 def test_an_experiment_has_the_precision_of_its_study():
     config = read_config(small_study())
     for other in ("float64", "float32"):
-        study = with_values(config, {}).model_copy(update={"run": config.run.model_copy(update={"precision": other})})
+        study = config.with_keys("run", precision=other)
         with precision(study):
             assert prepare(study).run.sample_period.dtype == other
     with jax.enable_x64(False), pytest.raises(InputError, match="is float64, and JAX computes in float32 here"):

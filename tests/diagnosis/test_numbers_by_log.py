@@ -66,7 +66,7 @@ def compare_logs(
     )
     config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
     with jax.enable_x64(True):
-        experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
+        experiment = prepare(config.with_keys("run", precision="float64"))
         free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
         log = Torques(segments[: 1 if separate else 2], (first, second), motion_scale, noise, noise_scale)
