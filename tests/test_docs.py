@@ -240,6 +240,7 @@ def make_environment(folder, clone, extra=None):
     # as on the command line, compiled programs are kept; here nothing changes the package while it runs
     programs = str(ROOT / ".cache" / "programs")
     pip = {"TARGET": str(site), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1", "DISABLE_PIP_VERSION_CHECK": "1"}
+    pip["COMPILE"] = "0"  # packages of one module each would share a folder of bytecode, of which pip warns
     return {
         "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(clone)]), "JAXBL_PROGRAMS": programs,
         **{f"PIP_{key}": value for key, value in pip.items()},
