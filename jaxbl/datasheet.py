@@ -505,6 +505,10 @@ def _write_observers(
 
     `usual`: the usual rule's gains where f+ is 1.
     """
+    import tomli_w
+
+    from .gains.machine_study import propose_map
+
     velocity, position = _choose_tolerances(answers, pilot_metrics)
     bound = {side: float(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
     frequency, angle = answers["frequency"].value, kind.unit("motor", "rad")
@@ -543,25 +547,5 @@ def _write_observers(
         "",
         "# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.",
     ]
-    for gain, scale, (least, largest) in (
-        ("lambda", math.sqrt(bound["motor"]), (0.3, 50.0)),
-        ("alpha", bound["motor"], (0.5, 100.0)),
-    ):
-        lines += [
-            "[[axes]]",
-            f'path = "observer.motor.{gain}"',
-            f"start = {_format_number(least * scale, 3)}",
-            f"stop = {_format_number(largest * scale, 3)}",
-            "num = 32",
-            'scale = "log"',
-            "",
-        ]
-    lines += [
-        "[[figures]]",
-        'kind = "heatmap"',
-        'x = "observer.motor.alpha"',
-        'y = "observer.motor.lambda"',
-        'value = "motor.velocity_rmse"',
-        'overlays = ["davila_fridman", "seeber_horn", "exact"] # gain conditions drawn over the map',
-    ]
-    return "\n".join(lines) + "\n"
+    tables = propose_map(bound["motor"]).items()
+    return "\n".join([*lines, *(f"[[{name}]]\n{tomli_w.dumps(table)}" for name, rows in tables for table in rows)])

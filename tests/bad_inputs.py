@@ -44,7 +44,7 @@ def check_study(path: Path) -> str:
         check_figures(config, config.figures, metric_columns(config.build()))
         len(Points(config))
         config.to_toml()
-        return "; ".join(config.remarks())
+        return ""
     except InputError as error:
         return str(error)
 

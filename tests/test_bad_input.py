@@ -42,7 +42,7 @@ EXPECTED_LINES = {
     "study fewer values": "holds more than 300000 values; give axes by start, stop and num, inputs as a recorded file",
     "study sine at the rate": "excitation: frequency 1000 Hz has to be below half the sampling rate, 500 Hz",
     "study short steps": "excitation: hold 1e-12 s has to be at least run.sample_period, 0.001 s",
-    "study short record": "short.csv ends after 0.05 s, the run after 0.2 s; its last value is held for the rest.",
+    "study short record": "short.csv: ends after 0.05 s, and the run only after 0.2 s; run.duration should be at most 0.05",
     "study gear ratio": "drive.gear_ratio: should be greater than or equal to 0.0000001, not 1e-12",
     "study escape": r"title: should have no control characters such as '\x1b'",
     "log number": "should hold an array of objects, one a row, or of rows of equally many numbers",
@@ -133,7 +133,7 @@ def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     result = run_command("sweep", "study.toml", cwd=tmp_path)
     assert (result.returncode, without_progress(result.stderr)) == (0, "")
     # and where the results may only be read, that is said before the figures are drawn
-    folder = tmp_path / "results" / "study"
+    folder = tmp_path / "results" / "study_map"
     folder.chmod(0o555)
     # the superuser may write anywhere, unless that right is given up
     before = () if os.geteuid() else ("setpriv", "--bounding-set=-dac_override")

@@ -88,14 +88,14 @@ def test_a_sweep_and_its_second_call(tmp_path):
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
-    folder = tmp_path / "results" / "study"
+    folder = tmp_path / "results" / "study_map"
     assert list_files(folder) == [
         "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("6 runs. The observers converged in ")
     assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[lines.index("Next:") - 1])
-    assert lines[-1] == "results/study/report.html"
+    assert lines[-1] == "results/study_map/report.html"
     second = run_command("sweep", "study.toml", cwd=tmp_path, **cache)
     assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
 
@@ -368,9 +368,9 @@ def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeyp
 def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
     write_study(tmp_path, rigid_study(axes=AXES))
     code, lines, _ = call("simulate", "study.toml", "--every", 10, "--seed", 3)
-    folder = tmp_path / "results" / "study"
+    folder = tmp_path / "results" / "study_run"
     assert code == 0
-    assert lines[-1] == "results/study/report.html"
+    assert lines[-1] == "results/study_run/report.html"
     assert {"trace.parquet", "summary.json", "report.html", "figures/torque.png"} <= set(list_files(folder))
     assert len(pd.read_parquet(folder / "trace.parquet")) == 20
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
@@ -398,26 +398,26 @@ def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_pat
     write_study(tmp_path, small_study(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
     assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
-    assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
-    with lock_folder(tmp_path / "results" / "study", shared=True):
+    assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study_map' writes the report."
+    with lock_folder(tmp_path / "results" / "study_map", shared=True):
         # another one is still at work: it is the last
         code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
         assert code == 0 and "2 of 2 parts (100 %)" in lines[0] and "all parts are there" in lines[1]
-        assert not (tmp_path / "results" / "study" / "report.html").exists()
+        assert not (tmp_path / "results" / "study_map" / "report.html").exists()
     code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
-    assert code == 0 and lines[-1] == "results/study/report.html"
+    assert code == 0 and lines[-1] == "results/study_map/report.html"
 
 
 def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatch):
     write_study(tmp_path, tunable_study())
     code, lines, _ = call("tune", "study.toml")
-    folder = tmp_path / "results" / "study"
+    folder = tmp_path / "results" / "study_gains"
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
     assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(list_files(folder))
-    assert lines[0].startswith("motor: lambda = ")
-    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 24 lanes in [\d.]+ s\.", lines[-2])
-    assert lines[-1] == "results/study/report.html"
+    assert lines[0].startswith("motor: gains ") and lines[1].startswith("motor: lambda = ")
+    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", lines[-2])
+    assert lines[-1] == "results/study_gains/report.html"
     # the second call computes nothing and says the same
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished search simulates"))
     assert call("tune", "study.toml")[:2] == (0, [*lines[:-2], lines[-1]])
@@ -457,7 +457,7 @@ def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
     code, lines, _ = call("simulate", "study.toml")
     assert code == 1
     assert any(line.startswith("The run diverged") for line in lines)
-    assert (tmp_path / "results" / "study" / "summary.json").exists()
+    assert (tmp_path / "results" / "study_run" / "summary.json").exists()
 
 
 def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_path):
@@ -513,7 +513,7 @@ def test_durations(seconds, text):
 
 
 def test_default_folder():
-    assert folder_of(Path("a/b.toml"), None) == Path("results/b")
+    assert folder_of(Path("a/b.toml"), "map", None) == Path("results/b_map")
 
 
 # gain_map is run by tests/test_docs.py, as the README says
@@ -595,12 +595,12 @@ def test_inspect_writes_a_first_model(call, tmp_path):
 def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(call, tmp_path):
     simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv")
-    folder = tmp_path / "results" / "axis"
+    folder = tmp_path / "results" / "axis_inspected"
     assert code == 0
     assert lines[0] == "axis.csv: 6000 samples, 6 s every 1 ms, even stamps, one segment"
     assert lines[1].startswith("As read: motor up to ") and "u up to " in lines[1]
     assert [line.split()[0] for line in lines[4:7]] == ["theta_e", "theta_s", "u"]
-    assert lines[-1] == "results/axis/report.html" and len(lines) <= 26
+    assert lines[-1] == "results/axis_inspected/report.html" and len(lines) <= 26
     figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
     assert {"inspection.json", "report.html"} | figures <= set(list_files(folder))
     assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
@@ -623,7 +623,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
         call("inspect", "axis.parquet", "--model", "wrong.toml")
     simulate_log(count=1000).to_csv("axis.csv", index=False)
-    with pytest.raises(InputError, match=r"results/axis: holds results of another log \(.*axis.parquet\)"):
+    with pytest.raises(InputError, match=r"results/axis_inspected: holds results of another log \(.*axis.parquet\)"):
         call("inspect", "axis.csv")
     assert call("inspect", "axis.csv", "--overwrite")[0] == 0
     (tmp_path / "full").mkdir()
@@ -632,7 +632,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
         call("inspect", "axis.csv", "--out", "full")
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
         call("inspect", "none.csv")
-    assert not (tmp_path / "results" / "none").exists()
+    assert not (tmp_path / "results" / "none_inspected").exists()
 
 
 def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path):
@@ -692,7 +692,7 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
     _, second, _ = call("sweep", "study.toml")
     assert second == [line for line in first if not line.startswith("Compiled")]
-    _, plot_lines, _ = call("plot", "results/study")
+    _, plot_lines, _ = call("plot", "results/study_map")
     assert plot_lines == second
 
 
@@ -711,14 +711,14 @@ def test_a_log_is_identified(call, tmp_path):
     code, lines, _ = call("identify", "axis.csv", "--model", "axis.toml")
     assert code == 0
     assert lines[0].startswith("drive.motor_inertia = 0.0")
-    assert lines[-1] == "results/axis/report.html"
-    content = json.loads((tmp_path / "results/axis/identification.json").read_text())
+    assert lines[-1] == "results/axis_identified/report.html"
+    content = json.loads((tmp_path / "results/axis_identified/identification.json").read_text())
     names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     assert list(content["parameters"]) == names
-    finished = (tmp_path / "results/axis/identification.json").stat().st_mtime_ns
+    finished = (tmp_path / "results/axis_identified/identification.json").stat().st_mtime_ns
     assert call("identify", "axis.csv", "--model", "axis.toml") == (code, lines, [])
-    assert (tmp_path / "results/axis/identification.json").stat().st_mtime_ns == finished
-    assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
+    assert (tmp_path / "results/axis_identified/identification.json").stat().st_mtime_ns == finished
+    assert call("simulate", "results/axis_identified/model.toml", "--out", "again")[0] == 0
     write_study(tmp_path, AXIS | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
     with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
         call("identify", "axis.csv", "--model", "wrong.toml", "--out", "new")
@@ -726,7 +726,7 @@ def test_a_log_is_identified(call, tmp_path):
         call("identify", "none.csv", "--model", "axis.toml", "--out", "new")
     assert not (tmp_path / "new").exists()
     with pytest.raises(InputError, match="results of another log"):
-        call("identify", "made/trace.parquet", "--model", "axis.toml", "--out", "results/axis")
+        call("identify", "made/trace.parquet", "--model", "axis.toml", "--out", "results/axis_identified")
 
 
 IDENTIFY = ["identify", "an axis.csv", "--model", "axis.toml"]
@@ -749,7 +749,11 @@ INTERRUPTED = "interrupted; nothing was written. Start again with: jaxbl identif
 def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
     options = ["--holdout", "an axis.csv", "--profile"]
-    assert call(*IDENTIFY, *options) == (130, [], [f"{INTERRUPTED} {shlex.join(options)} --out 'results/an axis'"])
+    assert call(*IDENTIFY, *options) == (
+        130,
+        [],
+        [f"{INTERRUPTED} {shlex.join(options)} --out 'results/an axis_identified'"],
+    )
     assert list_files(tmp_path / "results") == []
 
 
@@ -768,7 +772,7 @@ def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log,
 
 def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
     """SIGINT from outside, as soon as the folder is there."""
-    folder = tmp_path / "results" / "an axis"
+    folder = tmp_path / "results" / "an axis_identified"
     with start_command(*IDENTIFY, cwd=tmp_path) as process:
         for _ in range(3600):
             if folder.exists() or process.poll() is not None:
@@ -778,7 +782,7 @@ def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
-    command = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
+    command = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis_identified'"
     assert without_progress(errors) == f"interrupted; nothing was written. Start again with: {command}\n"
     assert not folder.exists()
 
@@ -859,14 +863,14 @@ def test_a_log_is_diagnosed_once(axis_log, quick_tasks, call, tmp_path):
     )
     index = lines.index("Next:")
     assert lines[index - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
-    run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
-    assert [command for command, _ in read_steps(lines)] == [run, "jaxbl explore 'results/an axis'"]
-    assert lines[-1] == "results/an axis/report.html"
+    run = "jaxbl simulate 'results/an axis_diagnosed/model.toml' --out 'results/an axis_diagnosed_run'"
+    assert [command for command, _ in read_steps(lines)] == [run, "jaxbl explore 'results/an axis_diagnosed'"]
+    assert lines[-1] == "results/an axis_diagnosed/report.html"
     assert call(*DIAGNOSE) == (0, [*lines[: index - 1], *lines[index:]], [])
     assert len(quick_tasks) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
-        call("diagnose", "other.csv", "--model", "axis.toml", "--out", "results/an axis")
+        call("diagnose", "other.csv", "--model", "axis.toml", "--out", "results/an axis_diagnosed")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,6 +15,9 @@ import pytest
 from browser import assert_accessible, assert_readable, needs_chromium, open_pages
 from markdown_blocks import read_blocks, zero_numbers
 from progress_lines import without_progress
+from small_study import spaced_axis
+
+import jaxbl
 
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "_build" / "html"
@@ -73,6 +77,25 @@ def test_tutorials_print_what_their_texts_say(pages, name):
     errors = [output.text for cell in cells for output in cell.outputs if output.get("name") == "stderr"]
     assert without_progress("".join(errors)) == ""
     assert "<figure>" in page
+
+
+def test_what_the_log_tutorial_announces_is_what_its_machine_does(pages):
+    """The numbers that were found, and the error of the tuned gains, on the machine that made the log."""
+    notebook = nbformat.read(SITE.parent / "jupyter_execute" / "docs" / "log_tutorial.ipynb", as_version=4)
+    outputs = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
+    for name, truth in (("motor_inertia", 0.05), ("motor_viscous", 0.15), ("coulomb_friction.torque", 0.2)):
+        low, high = map(float, re.search(rf"{name} = .*95 %: ([\d.]+) to ([\d.]+)\.", outputs).groups())
+        assert low <= truth <= high, name
+    assert re.search(r"motor\.cogging .*: amplitude = 0\.1 ± \S+ N m, harmonic = 7 ", outputs)
+    announced, achieved = map(float, re.search(r"announced ([\d.]+) rad/s, achieved ([\d.]+) rad/s", outputs).groups())
+    assert 1 / 1.3 <= announced / achieved <= 1.3
+    # a search on the machine itself, under the same constraints
+    blocks = read_blocks(ROOT / "docs" / "log_tutorial.md")
+    machine = tomllib.loads(next(block.text for block in blocks if block.text.startswith("# machine.toml")))
+    axes = [spaced_axis("observer.motor.lambda", 0.3, 100.0, 24), spaced_axis("observer.motor.alpha", 2.0, 500.0, 24)]
+    frame = jaxbl.sweep(machine | {"axes": axes}).frame
+    allowed = (frame["motor.margin_alpha"] >= 1.1) & (frame["motor.margin_exact"] >= 1.1)
+    assert achieved <= 1.1 * frame["motor.velocity_rmse"][allowed].min()
 
 
 @needs_chromium

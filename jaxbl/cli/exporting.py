@@ -45,7 +45,7 @@ def export(
     workers.start_jax()
     from jaxbl.exports import export as run_export
 
-    folder = folder_of(config.with_name(f"{config.stem}_{target}.toml"), out)
+    folder = folder_of(config, target, out)
     with show_task(context, "exporting"):
         result = run_export(config, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
     return Outcome(result.lines, result.folder, "", "export.json")

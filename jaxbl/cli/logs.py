@@ -67,7 +67,7 @@ def inspect(
 
         log_keys = None if table is None else table.model_dump(exclude_unset=True)
         study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
-    folder = folder_of(log, out)
+    folder = folder_of(log, "inspected", out)
     claim_log_folder(folder, log, overwrite=overwrite)
     lines = write_inspection_report(inspection, folder, steps)
     if write is not None:
@@ -118,7 +118,7 @@ def identify(
             )
         if next_experiment is not None:
             raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
-        return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
+        return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], "identified", out), overwrite)
     from jaxbl.files import run_or_read
     from jaxbl.identification.identify import read_identification_task, run_identification
     from jaxbl.report.identify import identification_lines, write_identification_report
@@ -128,7 +128,7 @@ def identify(
         from jaxbl.diagnosis.next_experiment import check_gap_sought
 
         check_gap_sought(task)
-    folder = folder_of(log[0], out)
+    folder = folder_of(log[0], "identified", out)
     log_call = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: JsonObject) -> list[NextStep]:
@@ -195,7 +195,7 @@ def diagnose(
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
         workers.start_jax()
-        folder = out if out is not None else Path("results") / batch.name
+        folder = out if out is not None else Path("results") / f"{batch.name}_diagnosed"
         return _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
     if jobs is not None or scheduler is not None:
         option = "--scheduler" if jobs is None else "--jobs"
@@ -210,7 +210,7 @@ def diagnose(
     from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
-    folder = folder_of(log[0], out)
+    folder = folder_of(log[0], "diagnosed", out)
     log_call = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: JsonObject) -> list[NextStep]:
@@ -280,7 +280,7 @@ def watch(
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>; of a socket: none]"),
+        typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>_watched; of a socket: none]"),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="write into a folder that holds other results of a log or stream")
@@ -293,7 +293,7 @@ def watch(
     from jaxbl.report.watch import watch_lines, write_watch_report
 
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
-    folder = out if "://" in source or out is not None else folder_of(Path(source), None)
+    folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
     if folder is None:
         result = _watch_and_print(context, task, None)
         code = ALARM if result.summary["alarm"] else 0

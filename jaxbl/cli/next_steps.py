@@ -16,13 +16,10 @@ if TYPE_CHECKING:
 
 def after_init(file: Path) -> list[NextStep]:
     """Propose commands for a first study from a data sheet."""
-    name = Path("results") / file.stem
     return [
         NextStep(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
-        NextStep(command_line("sweep", file, "--out", f"{name}_map"), "Which gains of the motor observer work? A map."),
-        NextStep(
-            command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and how large is it?"
-        ),
+        NextStep(command_line("sweep", file), "Which gains of the motor observer work? A map."),
+        NextStep(command_line("tune", file), "Which gains have the least error, and how large is it?"),
     ]
 
 

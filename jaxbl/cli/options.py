@@ -11,7 +11,9 @@ from jaxbl.files import to_path
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
     str | None,
-    typer.Option(metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"),
+    typer.Option(
+        metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>_<what it holds>]"
+    ),
 ]
 FolderArgument = Annotated[str, typer.Argument(metavar="DIR", help="folder of a sweep, verify or tune", show_default=False)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
@@ -31,7 +33,7 @@ ResultsArgument = Annotated[
 ]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=FORMATS, show_default=False)]
 LogOutOption = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>]")
+    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>_<what it holds>]")
 ]
 MaxTorqueOption = Annotated[
     float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
@@ -44,9 +46,9 @@ LogOverwriteOption = Annotated[
 ]
 
 
-def folder_of(config: Path, out: str | Path | None) -> Path:
-    """The folder for the results of a study or a log."""
-    return to_path(out) if out is not None else Path("results") / config.stem
+def folder_of(source: Path, result: str, out: str | Path | None) -> Path:
+    """Return the folder for one kind of result of a study or a log: no two commands share one unless `out` says so."""
+    return to_path(out) if out is not None else Path("results") / f"{source.stem}_{result}"
 
 
 def check_new(file: Path, option: str) -> None:

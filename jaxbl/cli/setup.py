@@ -169,7 +169,7 @@ def demo(
     study, chosen = read_study(config, backend)
     from jaxbl.sweeps.sweep import sweep
 
-    return compute(context, config, study, out, False, chosen, sweep, "sweep", after_demo)
+    return compute(context, config, study, out or "results/gain_map", False, chosen, sweep, "sweep", after_demo)
 
 
 def _find_shipped_study(name: str) -> Path:

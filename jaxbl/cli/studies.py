@@ -55,13 +55,14 @@ def simulate(
 ) -> Outcome:
     """Simulate a study once: trace, figures, summary."""
     workers.start_jax()
+    from jaxbl.config import read_config
     from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.report.simulate import write_trial_report
     from jaxbl.sweeps.store import claim_folder
     from jaxbl.sweeps.trial import run
 
-    study = _read(config)
-    folder = folder_of(config, out)
+    study = read_config(config)
+    folder = folder_of(config, "run", out)
     with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
         claim_folder(folder, study, "simulate", overwrite=overwrite)
         trial = run(study, seed=seed, every=every)
@@ -110,7 +111,7 @@ def sweep(
     if detach or share_numbers is not None:
         from jaxbl.sweeps.sweep import share as run_share, submit
 
-        folder = folder_of(config, out)
+        folder = folder_of(config, "map", out)
         with run_with_progress(context, config, folder) as progress:
             if share_numbers is None:
                 status_now = submit(study, folder, scheduler, backend=chosen)
@@ -231,21 +232,15 @@ def verify(
 def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
     """Read a study and the backend option."""
     workers.start_jax()
+    from jaxbl.config import read_config
     from jaxbl.sweeps.programs import check_backend
 
     chosen = check_backend(backend, "--backend")
-    return _read(config), chosen
+    return read_config(config), chosen
 
 
-def _read(config: Path) -> "Config":
-    """Read a study; print remarks on settings that are valid and perhaps not meant."""
-    from jaxbl.config import read_config
-
-    study = read_config(config)
-    for remark in study.remarks():
-        typer.echo(escape_unprintable(f"jaxbl: {config}: {remark}"), err=True)
-    return study
-
+_FOLDERS = {"sweep": "map", "tune": "gains", "verify": "verdict"}
+"""What the folder of a command holds, by its name."""
 
 _SUMMARIES = {"tune": "tuning.json", "verify": "verdict.json"}
 """Files with the result of a command."""
@@ -271,7 +266,7 @@ def compute(
 
     `steps` says what to try next, of the result and the folder.
     """
-    folder = folder_of(config, out)
+    folder = folder_of(config, _FOLDERS[command], out)
     with run_with_progress(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
     from jaxbl.fused import SCAN_MESSAGE

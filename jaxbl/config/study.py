@@ -90,7 +90,18 @@ class Config(Table):
         return self
 
     def build(self) -> Experiment:
-        """Build the experiment that the config describes, with Python numbers as leaves."""
+        """Build the experiment that the config describes, with Python numbers as leaves.
+
+        Raises:
+            InputError: a recorded input cannot be read, or ends before the run.
+        """
+        table, run = self.excitation, self.run
+        # half a sample for the rounding of times, one for the last value's own hold
+        if table.kind == "recorded" and table.length < run.duration - 2.0 * run.sample_period:
+            raise InputError(
+                f"{table.file}: ends after {table.length:g} s, and the run only after {run.duration:g} s; "
+                f"run.duration should be at most {table.length:g}"
+            )
         rigid = self.drive.kind == "rigid"
         return Experiment(
             drive=self.drive.build(),
@@ -128,16 +139,6 @@ class Config(Table):
     def with_keys(self, table: str, **keys: Any) -> "Config":
         """Return a copy with other keys in a table; they are not checked."""
         return self.model_copy(update={table: getattr(self, table).model_copy(update=keys)})
-
-    def remarks(self) -> list[str]:
-        """Return sentences on settings that are valid and perhaps not meant."""
-        remarks, run = [], self.run
-        for key, table in (("excitation", self.excitation), ("tune.holdout", self.tune and self.tune.holdout)):
-            # half a sample for the rounding of times, one for the last value's own hold
-            if table is not None and table.kind == "recorded" and table.length < run.duration - 2.0 * run.sample_period:
-                ends = f"{table.file} ends after {table.length:g} s, the run after {run.duration:g} s"
-                remarks.append(f"{key}: {ends}; its last value is held for the rest.")
-        return remarks
 
     def to_toml(self) -> str:
         """The whole config as TOML that :func:`.reading.read_config` takes."""

@@ -231,7 +231,7 @@ def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumpti
     encoders = config.build().encoders
     rms = float(encoders.noise_of(side, config.drive.gear_ratio if side == "load" else 1.0))
     count = encoders.motor_resolution if side == "motor" else encoders.load_resolution
-    f_plus = max(search.f_plus[side], f_plus) if side_table.f_plus is None else side_table.f_plus
+    f_plus = max(search.f_plus[side], f_plus, pilot["start"]) if side_table.f_plus is None else side_table.f_plus
     noise = 0.5 * float(count) + _NOISE_RMS_FACTOR * rms if side_table.noise is None else side_table.noise
     velocity, position = abs(pilot["velocity_error"]), max(abs(pilot["position_error"]), noise)
     acceleration = pilot["largest_acceleration"] + f_plus if side_table.acceleration is None else side_table.acceleration

@@ -1,7 +1,7 @@
 """The search for lambda and alpha behind `jaxbl tune`: a coarse map of both gains, then zooms around the best point."""
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
 from typing import Any
@@ -12,9 +12,12 @@ import pandas as pd
 from jaxbl.config import TUNE_NAMES, TuneTable
 from jaxbl.errors import NoResult
 from jaxbl.files import to_jsonable
-from jaxbl.observer.conditions import judge_gains
+from jaxbl.observer.conditions import CONDITIONS, judge_gains
+from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import no_disturbance_error
 
+from .best_gains import BestGains, find_best_gains
+from .expected_error import list_causes
 from .pilot import Scenarios
 from .stages import Stages, stage_tables
 
@@ -38,8 +41,11 @@ GAIN_METRICS = (
 )
 """Metrics of a side by which gains are judged."""
 
-_LEAST_STEP = 1e-6
-"""Relative step of a gain below which another zoom is not worth its runs."""
+_LEAST_STEP = 0.02
+"""Relative step of a gain below which another zoom is not worth its runs: gains are tried, and given, with three digits."""
+
+_WIDEST = {"alpha": (1.1, 1e4), "lambda": (0.03, 500.0)}
+"""Bounds of the ratios up to which a range is widened that the study leaves at its default."""
 
 
 def usual_rule(f_plus: float) -> tuple[float, float]:
@@ -75,25 +81,71 @@ class GainSearch:
         for side, bound in self.f_plus.items():
             if not bound > 0.0:
                 raise no_disturbance_error(side)
-        self.limits: Window = {
-            gain: (span.start, span.stop) for gain, span in (("alpha", table.alpha_ratio), ("lambda", table.lambda_ratio))
-        }
+        self.limits = self._read_limits(table)
         self.windows = [dict.fromkeys(self.sides, self.limits)]
         self.candidates: dict[str, pd.DataFrame] = {}
         seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
-        stages.total_lanes = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.list_named_gains({})))
+        causes = 1 + len(list_causes(scenarios.config).names)
+        stages.total_lanes = (
+            seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.list_named_gains({})) + causes)
+        )
 
     def run(self) -> None:
-        """Run the coarse map and the zooms. Raises `NoResult` if no candidate meets all constraints."""
-        for stage in range(self.table.refine + 1):
-            if stage:
-                if all(ratio - 1.0 < _LEAST_STEP for side in self.sides for ratio in self.cell_ratios(side).values()):
-                    break
-                self.windows.append({side: self._zoom_in(side) for side in self.sides})
-            self._run_map(stage)
+        """Run the coarse map, a wider one where the best gains lie at its end, and the zooms.
+
+        Raises:
+            NoResult: no candidate meets all constraints.
+        """
+        self._run_map(0, "coarse")
+        if self._widen_limits():
+            self._run_map(0, "wide")
+        for stage in range(1, self.table.refine + 1):
+            windows = {side: self._zoom_in(side) for side in self.sides}
+            steps = [_grid_ratio(ends, self.table.num) - 1.0 for window in windows.values() for ends in window.values()]
+            if min(steps) < _LEAST_STEP:
+                break
+            self.windows.append(windows)
+            self._run_map(stage, f"refine-{stage}")
+
+    @staticmethod
+    def _read_limits(table: TuneTable) -> Window:
+        return {"alpha": (table.alpha_ratio.start, table.alpha_ratio.stop),
+                "lambda": (table.lambda_ratio.start, table.lambda_ratio.stop)}  # fmt: skip
+
+    def _widen_limits(self) -> bool:
+        """Widen ranges at whose end the best gains lie, unless the study gives them. Returns whether there are such."""
+        defaults, limits = self._read_limits(TuneTable()), dict(self.limits)
+        for side in self.sides:
+            for gain, way in self.find_best(side).ends.items():
+                if self.limits[gain] == defaults[gain]:
+                    limits[gain] = (
+                        (_WIDEST[gain][0], limits[gain][1]) if way == "smaller" else (limits[gain][0], _WIDEST[gain][1])
+                    )
+        if limits == self.limits:
+            return False
+        self.limits, self.windows = limits, [dict.fromkeys(self.sides, limits)]
+        return True
+
+    def find_best(self, side: str) -> BestGains:
+        """Find the best gains of a side among its candidates."""
+        frame = self.candidates[side]
+        best = find_best_gains(
+            frame[["lambda", "alpha"]],
+            frame["error"].to_numpy(),
+            frame["converged"].to_numpy(bool),
+            allowed=frame["feasible"].to_numpy(bool),
+            alpha_ratio=frame["margin_alpha"].to_numpy(),
+            scatter=frame["scatter"].to_numpy(),
+        )
+        assert best is not None
+        return best
 
     def best_candidate(self, side: str) -> dict[str, Any]:
-        """The feasible candidate with the least error. Among equal errors the one that converges first is chosen."""
+        """Return the best feasible candidate of a side."""
+        return self.candidates[side].iloc[self.find_best(side).index].to_dict()
+
+    def least_candidate(self, side: str) -> dict[str, Any]:
+        """Return the feasible candidate of a side with the least error; of equal ones that which converges first."""
         frame = self.candidates[side]
         return frame[frame["feasible"]].sort_values(["error", "convergence_time"], kind="stable").iloc[0].to_dict()
 
@@ -106,26 +158,30 @@ class GainSearch:
         return _grid_ratio(self.limits[gain], self.table.num)
 
     def _zoom_in(self, side: str) -> Window:
-        """The next window: one cell to each side of the best candidate, inside of the limits."""
-        best, window = self.best_candidate(side), {}
+        """The next window: one cell to each side of the candidate with the least error, inside of the limits."""
+        least, window = self.least_candidate(side), {}
         for gain, cell in self.cell_ratios(side).items():
-            centre, (least, largest) = best[f"{gain}_ratio"], self.limits[gain]
-            window[gain] = (max(centre / cell, least), min(centre * cell, largest))
+            centre, (low, high) = least[f"{gain}_ratio"], self.limits[gain]
+            window[gain] = (max(centre / cell, low), min(centre * cell, high))
         return window
 
-    def _run_map(self, stage: int) -> None:
-        """Run a stage's map of gains, and append its candidates."""
+    def _run_map(self, stage: int, name: str) -> None:
+        """Run a stage's map of gains, and append its candidates; those of stage 0 take the place of earlier ones."""
         axes: dict[str, dict[str, list[float]]] = {"alpha": {}, "lambda": {}}
         for side, window in self.windows[stage].items():
-            bound = self.f_plus[side]
+            bound, tried = self.f_plus[side], {}
             for gain, scale in (("alpha", bound), ("lambda", math.sqrt(bound))):
                 values = scale * np.geomspace(*window[gain], self.table.num)
-                axes[gain][f"observer.{side}.{gain}"] = values.tolist()
-        frame = self._run_study("coarse" if stage == 0 else f"refine-{stage}", axes)
+                # a map that is finer than three digits keeps more
+                digits = 3 if _grid_ratio(window[gain], self.table.num) - 1.0 >= _LEAST_STEP else 16
+                axes[gain][f"observer.{side}.{gain}"] = values = [float(f"{value:.{digits}g}") for value in values]
+                tried[gain] = values[0] / scale, values[-1] / scale
+            self.windows[stage][side] = tried
+        frame = self._run_study(name, axes)
         for side in self.sides:
-            new = self._mark_feasible(side, _reduce_to_worst(frame, side, self.table.objective)).assign(stage=stage)
-            old = self.candidates.get(side)
-            self.candidates[side] = new if old is None else pd.concat([old, new], ignore_index=True)
+            worst = _reduce_to_worst(frame, side, self.table.objective, list(self.scenarios.columns))
+            new = self._mark_feasible(side, worst).assign(stage=stage)
+            self.candidates[side] = pd.concat([self.candidates[side], new], ignore_index=True) if stage else new
             if not self.candidates[side]["feasible"].any():
                 raise NoResult(self._explain_failure(side))
 
@@ -208,6 +264,14 @@ class GainSearch:
                 rows.append(summarise_runs(name, side, runs, (lambda_, alpha)))
         return rows
 
+    def split_error(self) -> dict[str, dict[str, float]]:
+        """Split the mean square error of the best gains by its causes (:class:`.expected_error.Causes`), by side."""
+        causes = list_causes(self.scenarios.config)
+        best = {side: self.best_candidate(side) for side in self.sides}
+        gains = {f"observer.{side}.{gain}": [row[gain]] for side, row in best.items() for gain in ("lambda", "alpha")}
+        frame = self._run_study("causes", {"gains": gains} | ({"causes": causes.columns} if causes.names else {}))
+        return {side: causes.split(frame, f"{side}.{self.table.objective}_rmse")[1] for side in self.sides}
+
     def _run_study(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
         """Run one stage. Its axes are the scenarios' columns and `axes`: columns by label, which advance together."""
         config = self.scenarios.config
@@ -224,7 +288,18 @@ class GainSearch:
         ]
         result = self.stages.run(data, name)
         names = [f"{side}.{metric}" for side in self.sides for metric in GAIN_METRICS]
-        return result.read([*(axis["path"] for axis in data["axes"]), "seed", "finite", *names])
+        frame = result.read([*(axis["path"] for axis in data["axes"]), "seed", "finite", *names])
+        for side, pilot in self.pilot.items():
+            if pilot["starting_error_assumed"]:
+                # along the run f⁺ has the friction of the assumed error
+                alpha, lambda_ = (frame[f"observer.{side}.{gain}"].to_numpy(float) for gain in ("alpha", "lambda"))
+                bound = np.full(len(frame), pilot["holdout_f_plus" if held_out else "f_plus"])
+                least = apply_elementwise(CONDITIONS["exact"].least_lambda, [alpha, bound])
+                new = {"f_plus": bound, "margin_alpha": alpha / bound, "margin_exact": lambda_ / least}
+                frame = frame.assign(
+                    **{f"{side}.{name}": np.where(frame["finite"], values, np.nan) for name, values in new.items()}
+                )
+        return frame
 
 
 _WORST_BY_METRIC = {
@@ -234,17 +309,20 @@ _WORST_BY_METRIC = {
 """Reduction of each metric to its worst over several runs."""
 
 
-def _reduce_to_worst(frame: pd.DataFrame, side: str, objective: str) -> pd.DataFrame:
+def _reduce_to_worst(frame: pd.DataFrame, side: str, objective: str, scenario_columns: list[str]) -> pd.DataFrame:
     """Reduce runs to one row for each pair of gains: the worst over scenarios and seeds.
 
     Metrics are NaN if a run diverged, and the convergence time if one did not converge. `chatter` is that of the run with
-    the largest error.
+    the largest error, `scatter` the relative standard error of its mean over the seeds.
     """
     keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
     runs = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in GAIN_METRICS})
     worst = runs.groupby(keys, sort=True).agg(_WORST_BY_METRIC).astype({"converged": bool, "finite": bool})
     # chatter is a part of the error: it belongs to the run with the largest one
     worst["chatter"] = runs.sort_values(f"{objective}_rmse", kind="stable").groupby(keys, sort=True)["chatter"].last()
+    seeds = frame.groupby([*keys, *scenario_columns])[f"{side}.{objective}_rmse"].agg(["mean", "sem"])
+    # one seed has none
+    worst["scatter"] = (seeds["sem"] / seeds["mean"]).groupby(level=[0, 1]).max().fillna(0.0)
     # a maximum that leaves out failed runs is not the worst
     worst.loc[~worst["converged"], "convergence_time"] = np.nan
     worst.loc[~worst["finite"], [*(name for name in _WORST_BY_METRIC if name not in ("converged", "finite")), "chatter"]] = (

@@ -1,4 +1,4 @@
-"""What limits the tuned gains: why smaller or larger ones are not better, from the runs of the search."""
+"""What limits the error: why gains smaller or larger than those of the least one are not better, from the search's runs."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
@@ -38,7 +38,7 @@ def find_limits(search: GainSearch, side: str) -> dict[str, Any]:
     - `binding`: the constraints that forbid a smaller error beside the optimum;
     - `range_ends`: gains whose searched range ends at the optimum.
     """
-    best = search.best_candidate(side)
+    best = search.least_candidate(side)
     profiles = {gain: _error_profile(search, side, gain, best) for gain in GAINS}
     signs = {"smaller": -1, "larger": 1}
     towards = {

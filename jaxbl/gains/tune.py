@@ -40,7 +40,8 @@ class Tuning:
         candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
             `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
-            `margin_exact`, `error` (the objective), `chatter` of the run that has it, and `feasible`.
+            `margin_exact`, `error` (the objective), `chatter` of the run that has it, its `scatter` (relative standard
+            error of the mean over noise seeds), and `feasible`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
         fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
@@ -102,7 +103,8 @@ def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages
         stages.write_manifest(pilot=search.pilot)
     search.run()
     passed_over = {} if table.certificate is None else choose_certified_gains(search)
-    summary = Summary(search, search.compare_gains(held_out=False), search.compare_gains(held_out=True)).to_dict()
+    named_rows, held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
+    summary = Summary(search, named_rows, held_out_rows, search.split_error()).to_dict()
     if table.certificate is not None:
         summary["certificates"] = certify_best_gains(search, stages.path_of("certificate.json"))
         summary["passed_over"] = passed_over

@@ -13,10 +13,9 @@ from jaxbl.files import to_jsonable
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
+from .best_gains import NEARLY_AS_GOOD
 from .gain_search import GAIN_METRICS, GainSearch, Window
 from .limits import LEAST_DIFFERENCE, find_limits
-
-_FLAT_SHARE = 0.05  # relative differences of the error below this do not matter in practice
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -32,16 +31,23 @@ class Summary:
         search: the finished search.
         named_rows: the named gains on the study's own runs: rows of :func:`.gain_search.summarise_runs`.
         held_out_rows: the same on the held-out runs.
+        causes: shares of the mean square error (:meth:`.gain_search.GainSearch.split_error`).
     """
 
-    def __init__(self, search: GainSearch, named_rows: list[dict[str, Any]], held_out_rows: list[dict[str, Any]]):
+    def __init__(
+        self,
+        search: GainSearch,
+        named_rows: list[dict[str, Any]],
+        held_out_rows: list[dict[str, Any]],
+        causes: dict[str, dict[str, float]],
+    ):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best_candidates = {side: search.best_candidate(side) for side in search.sides}
         self.conditions = {
             side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best_candidates.items()
         }
         self.limits = {side: find_limits(search, side) for side in search.sides}
-        self.named_rows, self.held_out_rows = named_rows, held_out_rows
+        self.named_rows, self.held_out_rows, self.causes = named_rows, held_out_rows, causes
         self.held_out = {side: {row["name"]: row for row in held_out_rows if row["side"] == side} for side in search.sides}
         self.factors = {side: self._compare_with_tuned(side) for side in search.sides}
 
@@ -60,6 +66,7 @@ class Summary:
             "f_plus": search.f_plus,
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
+            "verdict": {side: self._judge_side(side) for side in sides},
             "gains": {side: {key: float(self.best_candidates[side][key]) for key in keys} for side in sides},
             "achieved": {side: self._achieved_metrics(side) for side in sides},
             "limits": self.limits,
@@ -79,6 +86,23 @@ class Summary:
             "pareto": {side: self._front(side) for side in sides},
             "remarks": [*self.config.notes, *self._remarks()],
         }
+
+    def _judge_side(self, side: str) -> dict[str, Any]:
+        """Judge whether a side's gains matter, what limits the error, and how large the margin is.
+
+        Gains do not matter if all of the coarse map that meet the constraints have nearly the least error.
+        """
+        search, best = self.search, self.search.find_best(side)
+        candidates = search.candidates[side]
+        feasible = candidates.query("stage == 0 and feasible")
+        factor = float(feasible["error"].max()) / best.least_error
+        tolerance = max(NEARLY_AS_GOOD, float(candidates["scatter"].iloc[best.index]))
+        word = "range" if best.ends else "yes" if factor > 1.0 + tolerance else "no"
+        return to_jsonable(
+            {"gains_matter": word, "worst_over_least": factor, "least_error": best.least_error}
+            | {"margin": best.margin, "margins": best.margins, "causes": self.causes[side]}
+            | {"nearly_as_good": best.nearly_as_good, "tried": len(candidates)}
+        )
 
     def _achieved_metrics(self, side: str) -> dict[str, Any]:
         names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
@@ -121,13 +145,15 @@ class Summary:
             if pilot["starting_error_assumed"]:
                 lines.append(
                     f"{side}: the study gives the observer no starting error, which a convergence time needs: it starts "
-                    f"with a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run."
+                    f"with a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run, "
+                    f"but f⁺ = {search.f_plus[side]:.4g} rad/s² is the largest |acceleration - f(velocity)| of that run."
                 )
-            lines.append(
-                f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s², the larger of two numbers of the pilot run: the largest "
-                f"|acceleration - f(velocity)| along it, {pilot['disturbance']:.4g}, and that at the start with viscous "
-                f"friction times the starting error, {pilot['start']:.4g}."
-            )
+            else:
+                lines.append(
+                    f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s², the larger of two numbers of the pilot run: the "
+                    f"largest |acceleration - f(velocity)| along it, {pilot['disturbance']:.4g}, and that at the start "
+                    f"with viscous friction times the starting error, {pilot['start']:.4g}."
+                )
             lines += self._optimum_remarks(side)
         if table.holdout is None:
             lines.append(
@@ -139,7 +165,7 @@ class Summary:
         return lines
 
     def _optimum_remarks(self, side: str) -> list[str]:
-        search, row, lines = self.search, self.best_candidates[side], []
+        search, row, lines = self.search, self.search.least_candidate(side), []
         labels = {"alpha": "alpha / f⁺", "lambda": "lambda / √f⁺"}
         for direction, gain in map(str.split, self.limits[side]["range_ends"]):
             end = search.limits[gain][direction == "larger"]
@@ -162,12 +188,6 @@ class Summary:
                     f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "
                     f"{least['error']:.3g} instead of {row['error']:.3g}."
                 )
-        coarse = candidates.query("stage == 0 and feasible")
-        near = coarse[coarse["error"] <= (1.0 + _FLAT_SHARE) * row["error"]]
-        if len(near) > 1:
-            ends = ", ".join(f"{gain} from {near[gain].min():.3g} to {near[gain].max():.3g}" for gain in ("alpha", "lambda"))
-            share = f"{len(near)} points of the coarse map are within {100 * _FLAT_SHARE:.0f} % of it"
-            lines.append(f"{side}: the optimum is flat: {share}, {ends}.")
         return lines
 
     def _holdout_remarks(self, side: str) -> list[str]:

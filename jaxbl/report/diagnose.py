@@ -13,7 +13,7 @@ from jaxbl.lines import Lines, NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone
-from .page import PageTable, model_text, write_results
+from .page import PageTable, write_results
 from .residuals import draw_residuals, missing_quantity, plot_torque
 
 _BEFORE, _AFTER, _FLOOR, _HELD = COLOURS[1], COLOURS[0], COLOURS[6], COLOURS[4]
@@ -31,8 +31,8 @@ def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextS
     """
     tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    title, model = found.config.title or f"Diagnosis of {found.record.path.name}", model_text(found)
-    return write_results(found, folder, "diagnosis", title, model, lead, draw_diagnosis(found), tables, remarks, steps)
+    title = found.config.title or f"Diagnosis of {found.record.path.name}"
+    return write_results(found, folder, "diagnosis", title, lead, draw_diagnosis(found), tables, remarks, steps)
 
 
 def diagnosis_lines(summary: JsonObject) -> Lines:

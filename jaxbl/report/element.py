@@ -28,7 +28,7 @@ def write_element_report(found: ElementIdentification, folder: Path) -> Lines:
     tables = [PageTable("Numbers", ["path", "value", "standard error", "95 % from", "to", "unit"], rows)]
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(found.tables)
     title, drawn = found.summary["title"], draw_element(found)
-    return write_results(found, folder, "identification", title, model, lead, drawn, tables, remarks)
+    return write_results(found, folder, "identification", title, lead, drawn, tables, remarks, model=model)
 
 
 def element_lines(summary: JsonObject) -> Lines:

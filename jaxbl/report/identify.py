@@ -11,7 +11,7 @@ from jaxbl.lines import Lines, NextStep
 
 from .figures import SIDES
 from .identify_figures import draw_identification
-from .page import PageTable, model_text, write_results
+from .page import PageTable, write_results
 
 
 def write_identification_report(found: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
@@ -26,10 +26,8 @@ def write_identification_report(found: Identification, folder: Path, steps: Sequ
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    title, model = found.config.title or f"Identification from {found.record.path.name}", model_text(found)
-    return write_results(
-        found, folder, "identification", title, model, lead, draw_identification(found), tables, remarks, steps
-    )
+    title = found.config.title or f"Identification from {found.record.path.name}"
+    return write_results(found, folder, "identification", title, lead, draw_identification(found), tables, remarks, steps)
 
 
 def identification_lines(summary: JsonObject) -> Lines:

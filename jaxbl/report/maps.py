@@ -23,6 +23,7 @@ from matplotlib.patches import Patch
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.config.figures import filter_rows, resolve_where
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws
+from jaxbl.gains.best_gains import AS_GOOD, BestGains, find_best_gains
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import find_metric, is_magnitude
@@ -108,7 +109,11 @@ def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:
 def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Rows:
     """The rows that a figure shows, with the columns that it needs."""
     config = result.config
-    wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
+    wanted = {
+        figure.value,
+        "finite",
+        *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus", "margin_alpha")),
+    }
     columns = [*(axis.path for axis in config.axes), *(name for name in result.columns if name in wanted)]
     keys = [figure.x, figure.y or figure.x]
     dots = _dots(result, figure)
@@ -181,13 +186,21 @@ def _sampled(config: Config) -> list[str]:
     return [axis.path for axis in config.axes if axis.values is None and axis.num is None]
 
 
+def flat_remark(values: np.ndarray) -> str:
+    """What a map says whose values differ by too little to count; "" for others."""
+    finite = values[np.isfinite(values)]
+    is_flat = finite.size > 1 and np.ptp(finite) <= AS_GOOD * np.abs(finite).max()
+    return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""
+
+
 def color_norm(values: np.ndarray, scale: str) -> Normalize:
-    """Colour scale: logarithmic where values are positive and span more than a factor of 30."""
+    """Colour scale: logarithmic where values are positive and span more than a factor of 30, one colour where they are
+    flat."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return Normalize(0.0, 1.0)
     low, high = float(finite.min()), float(finite.max())
-    if low == high:
+    if low == high or flat_remark(values):
         return Normalize(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12)
     if scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0):
         positive = finite[finite > 0.0]
@@ -218,12 +231,14 @@ def is_log(config: Config, path: str, values: np.ndarray) -> bool:
 
 class _Panel(NamedTuple):
     """A panel of a map: its title, values over (y, x), shares of runs that stayed finite and that converged (None where the
-    study does not say), the f_plus that conditions are drawn for, and its rows where each is a dot."""
+    study does not say), the place (y, x) of the best gains on a map of errors over gains, the f_plus that conditions are
+    drawn for, and its rows where each is a dot."""
 
     title: str
     table: pd.Series
     finite: pd.Series
     converged: pd.Series | None
+    best: tuple[float, float] | None
     bound: float | None
     dots: pd.DataFrame | None
 
@@ -254,7 +269,16 @@ def _map_panels(
         tables = tables.where(shares["finite"] == 1.0)
     shares = shares.assign(table=tables)
     bounds = _bounds(used, spec, points) if spec.overlays else None
-    gridded = config.sweep.design == "grid"
+    gridded, errors = config.sweep.design == "grid", None
+    if (
+        gridded
+        and f"{side}.converged" in columns
+        and re.search(r"rmse|chatter|convergence_time$", spec.value)
+        and all(path.startswith(f"observer.{side}.") for path in keys)
+    ):
+        # of a refined study those that were simulated
+        simulated = groups if points is None else Groups([rows.frame], [*facets, *keys], paths)
+        errors = worst_runs(simulated, spec.value, f"{side}.margin_alpha" in next(iter(used)))
     found = []
     for i, value in enumerate(groups.index.unique(level=0) if facets else [None]):
         of = shares.xs(value, level=0) if facets else shares
@@ -267,6 +291,7 @@ def _map_panels(
                 table=of["table"],
                 finite=of["finite"],
                 converged=of[columns[1]] if len(columns) > 1 else None,
+                best=None if errors is None else _place_of_best(errors.xs(value, level=0) if facets else errors),
                 bound=None if bounds is None else float(bounds.iloc[i]),
                 dots=dots,
             )
@@ -340,10 +365,10 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
         hatches = hatches or hatch
         missing += int(panel.table.isna().sum())
         diverged += int((panel.finite[panel.table.isna()] < 1.0).sum())
-        under = []
-        if gridded and (best := _best(panel, spec)) is not None:
-            ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
-            under.append(f"best ★ {best[2]:.2g} {find_metric(spec.value).unit}".rstrip())
+        under = [flat] if (flat := flat_remark(panel.table.to_numpy(float))) else []
+        if panel.best is not None:
+            ax.plot(*panel.best[::-1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
+            under.append(f"best ★ {panel.table[panel.best]:.2g} {find_metric(spec.value).unit}".rstrip())
         if panel.bound is not None:
             alpha_is_x = spec.x.endswith(".alpha")
             alphas = xs if alpha_is_x else ys
@@ -459,16 +484,42 @@ def _shown_column(value: str) -> Column:
     return Column([value, "finite"], lambda frame: drawn_values(frame, value))
 
 
-def _best(panel: _Panel, spec: FigureTable) -> tuple[float, float, float] | None:
-    """Place and value of the smallest figure, for errors and times, among the points that converged if any did."""
-    if panel.converged is None or not re.search(r"rmse|chatter|convergence_time$", spec.value):
-        return None
-    kept = panel.table[panel.converged >= 0.5].dropna()
-    kept = kept if len(kept) else panel.table.dropna()
-    if not len(kept):
-        return None
-    y, x = kept.idxmin()
-    return float(x), float(y), float(kept[(y, x)])
+def worst_runs(groups: Groups, value: str, has_margin: bool) -> pd.DataFrame:
+    """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
+    `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
+    side = value.partition(".")[0]
+    shown = _shown_column(value)
+    converged, margin = (f"{side}.{name}" for name in ("converged", "margin_alpha"))
+    means = groups.means(
+        {
+            "converged": Column([converged], lambda frame: frame[converged].astype(float)),
+            "mean": shown,
+            "square": shown._replace(of=lambda frame: shown.of(frame) ** 2),
+        }
+    )
+    scatter = 0.0
+    if not groups.varied - set(groups.index.names):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
+        scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
+    least_margin = {"margin_alpha": groups.spread(Column([margin], lambda frame: frame[margin])).least} if has_margin else {}
+    return means.assign(error=groups.spread(shown).largest, scatter=scatter, **least_margin)
+
+
+def _place_of_best(runs: pd.DataFrame) -> tuple[float, float] | None:
+    best = best_gains(runs)
+    return None if best is None else runs.index[best.index]
+
+
+def best_gains(runs: pd.DataFrame) -> BestGains | None:
+    """The best gains (:func:`jaxbl.gains.best_gains.find_best_gains`) of :func:`worst_runs` over them."""
+    return find_best_gains(
+        pd.DataFrame({path.rpartition(".")[2]: runs.index.get_level_values(path) for path in runs.index.names}),
+        runs["error"].to_numpy(),
+        (runs["converged"] == 1.0).to_numpy(),
+        alpha_ratio=runs["margin_alpha"].to_numpy() if "margin_alpha" in runs else None,
+        scatter=runs["scatter"].to_numpy(),
+    )
 
 
 def condition_curves(

@@ -72,21 +72,25 @@ def write_results(
     folder: Path,
     name: str,
     title: str,
-    model: str,
     lead: Sequence[str],
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
     remarks: Sequence[str],
     steps: Sequence[NextStep] = (),
+    model: str = "",
 ) -> Lines:
     """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
     for the terminal.
     """
+    from jaxbl.identification.element import ElementIdentification
+
     with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
         found.trace.to_parquet(draft / "trace.parquet", index=False)
+        if not isinstance(found, ElementIdentification):
+            model = format_model(found, draft / "trace.parquet")
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
         write_atomic(draft / f"{name}.json", json_with_checksum(found.summary))
@@ -98,14 +102,18 @@ def write_results(
     return lines
 
 
-def model_text(found: "Identification | Diagnosis") -> str:
-    """The fitted study as TOML; for want of an excitation with the torque of `trace.parquet` beside it, at its period."""
+def format_model(found: "Identification | Diagnosis", trace: Path) -> str:
+    """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
+    from jaxbl.gains.machine_study import complete_study
     from jaxbl.identification.logs import run_of
 
-    data = found.model.to_dict()
+    data, record = found.model.to_dict(), found.record
     if found.replays:
-        data["run"] |= run_of(found.model, found.record)
-        data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
+        data["run"] |= run_of(found.model, record) | {"duration": float(f"{record.time[-1] + record.sample_period:.9g}")}
+        data["excitation"] = {"kind": "recorded", "file": str(trace.resolve()), "time_column": "t", "torque_column": "u"}
+    data = complete_study(data, record, found.config)
+    if found.replays:
+        data["excitation"]["file"] = trace.name
     return tomli_w.dumps(data)
 
 

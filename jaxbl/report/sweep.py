@@ -14,14 +14,15 @@ import pandas as pd
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains, describe_margins
 from jaxbl.lines import Lines, NextStep
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .aggregates import Distinct, Rows, spread
+from .aggregates import Distinct, Groups, Rows, spread
 from .figures import SIDES
-from .maps import draw
+from .maps import best_gains, draw, worst_runs
 from .page import PageTable, write_report
 
 
@@ -76,21 +77,20 @@ class _Survey:
     Attributes:
         runs: their number; `even` those on points that are always simulated; `diverged`.
         converged: how many of the even ones converged, by side; none where the study does not say.
-        best: the converged run of the least velocity error, by side: that error, and the values of the axes; none where the
-            study does not say.
+        best: the best gains, by side, and the worst runs with each pair of gains; none where the study does not say.
         values: all values of each axis.
     """
 
     def __init__(self, result: StudyResult):
         paths = [axis.path for axis in result.config.axes]
-        wanted = {side: [f"{side}.{name}" for name in ("converged", "velocity_rmse")] for side in SIDES}
+        wanted = {side: [f"{side}.{name}" for name in ("converged", "velocity_rmse", "margin_alpha")] for side in SIDES}
         figures = [name for names in wanted.values() for name in names if name in result.columns]
         self.sides = [side for side in SIDES if f"{side}.converged" in figures]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(result.config) if result.config.sweep.refine is not None else None
         self.runs = self.even = self.diverged = 0
         self.converged = dict.fromkeys(self.sides, 0)
-        self.best: dict[str, pd.Series] = {}
+        self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
         distinct = {path: Distinct() for path in paths}
         for frame in result.batches([*paths, "seed", "finite", *figures]):
             even = frame if points is None else frame[points.on_coarse_grid(frame)]
@@ -100,14 +100,15 @@ class _Survey:
             for path in paths:
                 distinct[path].add(frame[[path]])
             for side in self.sides:
-                error = f"{side}.velocity_rmse"
                 self.converged[side] += int(even[f"{side}.converged"].sum())
-                if error not in figures:
-                    continue
-                good = frame[frame[f"{side}.converged"].astype(bool)]
-                if len(good) and (side not in self.best or good[error].min() < self.best[side][error]):
-                    self.best[side] = good.loc[good[error].idxmin(), [error, *paths]]
         self.values = {path: one.frame()[path] for path, one in distinct.items()}
+        for side in self.sides if result.config.sweep.design == "grid" else []:
+            gains = [path for path in paths if path.startswith(f"observer.{side}.") and len(self.values[path]) > 1]
+            if gains and f"{side}.velocity_rmse" in figures:
+                names = [name for name in wanted[side] if name in figures]
+                groups = Groups(Rows(result, [*paths, "finite", *names]), gains, paths)
+                runs = worst_runs(groups, f"{side}.velocity_rmse", f"{side}.margin_alpha" in figures)
+                self.best[side] = best_gains(runs), runs
 
 
 def headline(result: StudyResult) -> Lines:
@@ -132,13 +133,21 @@ def _headline(result: StudyResult, found: _Survey) -> Lines:
         lines.append(f"The study is not finished: it has {result.runs} runs{more}. Go on with 'jaxbl sweep'.")
     if found.diverged:
         lines.append(f"{found.diverged} runs diverged: finite = false in the table, grey in the figures.")
-    for side, row in found.best.items():
-        varied = [path for path, values in found.values.items() if len(values) > 1 and path.startswith(f"observer.{side}")]
-        if varied:
-            where = ", ".join(f"{path} = {row[path]:.3g}" for path in varied)
-            least = f"{row[f'{side}.velocity_rmse']:.3g} rad/s rms"
-            lines.append(f"Least {side} velocity error of a run that converged: {least}, at {where}.")
-    return lines
+    return [*lines, *(f"{side}: {_best_line(best, runs)}" for side, (best, runs) in found.best.items())]
+
+
+def _best_line(best: BestGains | None, runs: pd.DataFrame) -> str:
+    """The best gains of a side, their margin, and how many others are as good."""
+    if best is None:
+        return "no gains converged in all runs with α above f⁺."
+    row, names = runs.iloc[best.index], runs.index.names
+    place = ", ".join(f"{name} = {runs.index.get_level_values(name)[best.index]:.3g}" for name in names)
+    ends = (f" Its {gain} is the {way.replace('er', 'est')} of its axis." for gain, way in best.ends.items())
+    return (
+        f"best gains {place}: velocity error {row['error']:.3g} rad/s rms, the worst of their runs (least: "
+        f"{best.least_error:.3g}). {describe_margins(best.margins)} {best.nearly_as_good} of {len(runs)} gains are as good "
+        f"within {100 * NEARLY_AS_GOOD:g} %.{''.join(ends)}"
+    )
 
 
 def _law_lines(laws: list[Law]) -> Lines:

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jaxbl.files import write_atomic, write_json
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD, describe_margins
 from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -23,7 +24,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .gain_plane import conditions_line, name_gains, name_ratio
-from .maps import cell_edges, color_norm, condition_curves, fit_axes, hatch_failures
+from .maps import cell_edges, color_norm, condition_curves, fit_axes, flat_remark, hatch_failures
 from .page import PageTable, write_report
 
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
@@ -87,6 +88,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     name_gains(ax, bound)
     ax.set_title(
         f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
+        + (f"\n{flat}" if (flat := flat_remark(grid)) else "")
     )
     figure.colorbar(ScalarMappable(norm, MAP), ax=ax, pad=0.02, aspect=28, label=_label(tuning))
     if np.isnan(grid).any():
@@ -376,16 +378,18 @@ def _where(summary: JsonObject) -> str:
 
 
 def tune_headline(summary: JsonObject) -> list[str]:
-    """The chosen gains and their errors on the held-out runs, in sentences."""
-    lines, metric = [], f"{summary['objective']}_rmse"
+    """Whether gains matter, the chosen ones, and their errors on the held-out runs, in sentences."""
+    metric = f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
+    lines = [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
     for side, gains in summary["gains"].items():
-        found = summary["achieved"][side]
+        found, verdict = summary["achieved"][side], summary["verdict"][side]
         lines.append(
             f"{side}: lambda = {gains['lambda']:.4g} √rad/s, alpha = {gains['alpha']:.4g} rad/s² "
             f"({gains['lambda_ratio']:.3g} √f⁺, {gains['alpha_ratio']:.3g} f⁺): {summary['objective']} error "
-            f"{found[metric]:.3g} {unit} rms, converged after "
-            f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
+            f"{found[metric]:.3g} {unit} rms, converged after {found['convergence_time']:.3g} s, the worst of "
+            f"{_runs_behind(summary)}. {describe_margins(verdict['margins'])} "
+            f"{verdict['nearly_as_good']} of {verdict['tried']} gains are as good within {100 * NEARLY_AS_GOOD:g} %."
         )
     lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in summary["limits"].items()]
     if any(way["by"] for found in summary["limits"].values() for ways in found["towards"].values() for way in ways.values()):
@@ -409,6 +413,19 @@ def tune_headline(summary: JsonObject) -> list[str]:
         after = "not converged in all runs" if time is None else f"converged after {time:.3g} s"
         lines.append(f"{side}, {where}: worst {summary['objective']} error {own} ({after}); {'; '.join(parts)}.")
     return lines
+
+
+def describe_verdict(verdict: JsonObject) -> str:
+    """Say whether gains matter (`verdict` of a side), and what limits the error."""
+    factor, shares = verdict["worst_over_least"], verdict["causes"]
+    more = f"{100 * (factor - 1):.2g} %"
+    limits = ", ".join(f"{part} {100 * share:.2g} %" for part, share in sorted(shares.items(), key=lambda part: -part[1]))
+    said = {
+        "yes": f"gains matter: the worst that meet all constraints have {factor:.3g} times the least error.",
+        "no": f"gains do not matter: all that meet the constraints are within {more} of the least error.",
+        "range": "limited by the range searched: better gains may lie beyond it.",
+    }
+    return f"{said[verdict['gains_matter']]} What the mean square error is due to: {limits}."
 
 
 def _gains_table(summary: JsonObject) -> PageTable:

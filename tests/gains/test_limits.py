@@ -125,7 +125,7 @@ def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
 def test_between_two_rows_of_the_coarse_map_errors_are_interpolated():
     search = build_search(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
     line = pd.DataFrame(find_limits(search, "motor")["profiles"]["alpha"])
-    best = search.best_candidate("motor")["lambda"]
+    best = search.least_candidate("motor")["lambda"]
     exact = np.sqrt(np.log(best / 13.0) ** 2 + np.log(line["alpha"] / 10.0) ** 2 + 1.0)
     assert best not in search.candidates["motor"].query("stage == 0")["lambda"].to_numpy()
     # a chord of a parabola lies above it by a quarter of its squared width at most

@@ -72,8 +72,9 @@ def test_pilot_agrees_with_the_trace_of_a_run():
         assert pilot_data[side]["largest_velocity"] == pytest.approx(trace[f"{side}.velocity"].abs().max())
         error = pilot_data[side]["velocity_error"]
         assert pilot_data[side]["start"] == pytest.approx(unknown.iloc[0] + viscous / inertia * error)
-        assert pilot_data[side]["f_plus"] == max(pilot_data[side]["disturbance"], pilot_data[side]["start"])
-    # none given: the largest velocity of the run
+    assert pilot_data["load"]["f_plus"] == max(pilot_data["load"]["disturbance"], pilot_data["load"]["start"])
+    # none given: the largest velocity of the run, whose friction brakes the error
+    assert pilot_data["motor"]["f_plus"] == pilot_data["motor"]["disturbance"] < pilot_data["motor"]["start"]
     assert pilot_data["motor"]["velocity_error"] == pilot_data["motor"]["largest_velocity"]
     assert pilot_data["motor"]["starting_error_assumed"] and not pilot_data["load"]["starting_error_assumed"]
     assert pilot_data["load"]["velocity_error"] == 0.3

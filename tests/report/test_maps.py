@@ -55,7 +55,10 @@ def legend_texts(drawing):
 
 def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
     drawing = draw_only_figure(
-        tmp_path, small_study(axes=GAINS, figures=[heatmap_figure()]), motor__velocity_rmse=product_error
+        tmp_path,
+        small_study(axes=GAINS, figures=[heatmap_figure()]),
+        motor__velocity_rmse=product_error,
+        motor__margin_alpha=lambda frame: 2.0 * frame[ALPHA],
     )
     (ax,) = panels(drawing)
     values, corners = find_mesh(ax).get_array(), find_mesh(ax).get_coordinates()
@@ -118,7 +121,11 @@ def test_what_did_not_converge_is_hatched(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure()])
     plain_drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product_error)
     partly_hatched = draw_only_figure(
-        tmp_path, data, motor__velocity_rmse=product_error, motor__converged=lambda frame: frame[ALPHA] > 5.0
+        tmp_path,
+        data,
+        motor__velocity_rmse=product_error,
+        motor__converged=lambda frame: frame[ALPHA] > 5.0,
+        motor__margin_alpha=lambda frame: frame[ALPHA],
     )
     fully_hatched = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=product_error, motor__converged=lambda frame: frame[ALPHA] < 0.0

@@ -92,13 +92,17 @@ def test_page_of_a_sweep(tmp_path):
     ]
     data = rigid_study({"title": "a <b> c", "notes": ["first remark"]}, axes=axes)
     result = make_result(
-        data, motor__velocity_rmse=lambda frame: frame[ALPHA], motor__converged=lambda frame: frame[ALPHA] > 2.0
+        data,
+        motor__velocity_rmse=lambda frame: frame[ALPHA],
+        motor__converged=lambda frame: frame[ALPHA] > 2.0,
+        motor__margin_alpha=lambda frame: frame[ALPHA],
     )
     lead = write_sweep_report(result, tmp_path)
     assert lead == [
         "40 runs. The observers converged in 80.0 % (motor) of them.",
-        "Least motor velocity error of a run that converged: 2.66 rad/s rms, at observer.motor.alpha = 2.66, "
-        "observer.motor.lambda = 1.",
+        "motor: best gains observer.motor.alpha = 2.66, observer.motor.lambda = 2.71: velocity error 2.66 rad/s rms, the "
+        "worst of their runs (least: 2.66). Margin 2.66 (alpha over f⁺ 2.66, to gains that fail 2.66, to twice the error "
+        "2.66). 4 of 20 gains are as good within 5 %.",
     ]
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == len(list((tmp_path / "figures").iterdir())) == 1

@@ -37,6 +37,7 @@ def make_refined_study(function, *axes, figures=(MAP,), depth=3, seeds=1):
     frame = make_rows(vertices)
     frame["motor.converged"] = function(frame)
     frame[RMSE] = frame[LAMBDA]
+    frame["motor.margin_alpha"] = 2.0 * frame[ALPHA]
     frames = [frame.assign(seed=seed) for seed in range(seeds)]
     return StudyResult(config, pd.concat(frames, ignore_index=True).sample(frac=1.0, random_state=0, ignore_index=True))
 

@@ -68,7 +68,7 @@ def test_numbers_figures_and_page(report_folder, tuning):
     lines = (report_folder / "lines").read_text().splitlines()
     for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
         assert text in page.text
-    assert lines[0].startswith(f"motor: lambda = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
+    assert lines[2].startswith(f"motor: lambda = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
     assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
 
 

@@ -97,7 +97,7 @@ def test_the_page_in_a_browser(verify_report):
 
 
 def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):
-    folder = tmp_path / "results" / "study"
+    folder = tmp_path / "results" / "study_verdict"
     shutil.copytree(verified_study[1], folder)
     for name in ("verdict.json", "counterexamples.parquet"):
         (folder / name).unlink()
@@ -109,6 +109,6 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor", "conservatism", "claimed_bound"}
     assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "verify/manifest.json"))
     assert re.fullmatch(r"normalised: 63 cells, of which \d+ converge, with no counterexample to any condition.", lines[0])
-    assert lines[-1] == "results/study/report.html"
+    assert lines[-1] == "results/study_verdict/report.html"
     # the second call says the same
     assert call("verify", "study.toml")[:2] == (0, lines)

@@ -1,0 +1,114 @@
+"""The best of the gains that were tried: of those with nearly the least error, the ones furthest from where they fail.
+
+`jaxbl tune`, the sentence on a sweep and the stars of its maps share this definition.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import KDTree
+
+AS_GOOD = 0.02
+"""Relative difference of two errors that does not count; a larger scatter over noise seeds takes its place."""
+NEARLY_AS_GOOD = 0.05
+"""Relative difference of errors that rarely matters in practice: gains within it are counted."""
+_DOUBLED = 2.0
+"""An error of so many times the least one is too large."""
+
+
+class BestGains(NamedTuple):
+    """The best of several gains.
+
+    Attributes:
+        index: their row.
+        least_error: of all gains that work.
+        margins: factors that the gains may change by: `f_plus`, alpha over f⁺, by which alpha may fall; `failure`, to the
+            nearest gains that do not work, or the end of those tried; `error`, to the nearest with twice the least error,
+            or the end.
+        nearly_as_good: number of gains that work with an error within `NEARLY_AS_GOOD` of the least.
+        ends: gains that are at an end of those tried, as are all that are as good: "smaller" or "larger" by gain.
+    """
+
+    index: int
+    least_error: float
+    margins: dict[str, float]
+    nearly_as_good: int
+    ends: dict[str, str]
+
+    @property
+    def margin(self) -> float:
+        """The smallest of the margins."""
+        return min(self.margins.values())
+
+
+def find_best_gains(
+    gains: pd.DataFrame,
+    error: np.ndarray,
+    works: np.ndarray,
+    *,
+    allowed: np.ndarray | None = None,
+    alpha_ratio: np.ndarray | None = None,
+    scatter: np.ndarray | None = None,
+) -> BestGains | None:
+    """Find the best gains, or None if none are allowed.
+
+    Args:
+        gains: a row for each of n candidates; the columns are `lambda`, `alpha` or others.
+        error: shape (n,), the worst of all runs with these gains; NaN if one diverged.
+        works: shape (n,), whether they converge in all runs.
+        allowed: shape (n,), whether they may be chosen; those that work if left out.
+        alpha_ratio: shape (n,), alpha over f⁺, which has to be above 1; not known if left out.
+        scatter: shape (n,), relative standard error of their mean over noise seeds; none if left out.
+    """
+    works = works & np.isfinite(error)
+    if alpha_ratio is not None:
+        works = works & (alpha_ratio > 1.0)
+    allowed = works if allowed is None else works & allowed
+    if not allowed.any():
+        return None
+    # a gain of 0 is far from all others
+    place = np.log(np.maximum(gains.to_numpy(float), np.finfo(float).tiny))
+    least = int(np.argmin(np.where(allowed, error, np.inf)))
+    tolerance = AS_GOOD if scatter is None else max(AS_GOOD, scatter[least])
+    as_good = np.flatnonzero(allowed & (error <= (1.0 + tolerance) * error[least]))
+    low, high = place.min(axis=0), place.max(axis=0)
+    is_varied = high > low
+    # below the smallest alpha, its ratio to f⁺ is the margin
+    counts_below = is_varied & ((gains.columns != "alpha") | (alpha_ratio is None))
+    to_ends = np.minimum(
+        np.where(is_varied, high - place[as_good], np.inf).min(axis=1),
+        np.where(counts_below, place[as_good] - low, np.inf).min(axis=1),
+    )
+    margins = {
+        "f_plus": np.full(len(as_good), np.inf) if alpha_ratio is None else alpha_ratio[as_good],
+        "failure": np.exp(np.minimum(_distances(place[as_good], place[~works]), to_ends)),
+        "error": np.exp(np.minimum(_distances(place[as_good], place[works & (error >= _DOUBLED * error[least])]), to_ends)),
+    }
+    # of equal margins that with the smaller error
+    margin = np.minimum.reduce(list(margins.values()))
+    chosen = int(np.lexsort((error[as_good], -margin))[0])
+    ends = {}
+    for name, column, smallest, largest in zip(gains.columns, place[as_good].T, low, high, strict=True):
+        for way, end in (("smaller", smallest), ("larger", largest)):
+            if smallest < largest and (column == end).all():
+                ends[str(name)] = way
+    return BestGains(
+        index=int(as_good[chosen]),
+        least_error=float(error[least]),
+        margins={name: float(values[chosen]) for name, values in margins.items() if np.isfinite(values[chosen])},
+        nearly_as_good=int((works & (error <= (1.0 + NEARLY_AS_GOOD) * error[least])).sum()),
+        ends=ends,
+    )
+
+
+def describe_margins(margins: dict[str, float]) -> str:
+    """Say how large margins are, the smallest first."""
+    words = {"f_plus": "alpha over f⁺", "failure": "to gains that fail", "error": "to twice the error"}
+    factors = sorted(margins.items(), key=lambda margin: margin[1])
+    return f"Margin {factors[0][1]:.3g} ({', '.join(f'{words[name]} {factor:.3g}' for name, factor in factors)})."
+
+
+def _distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the largest difference of a coordinate to the nearest of the others; infinite without others."""
+    return KDTree(others).query(points, p=np.inf)[0] if len(others) else np.full(len(points), np.inf)
