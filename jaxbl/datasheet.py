@@ -40,6 +40,7 @@ _LEAD: Units = {
     "m": lambda travel: 2.0 * math.pi / travel, "mm": lambda travel: 2e3 * math.pi / travel,
 }  # fmt: skip
 """Travel of a load for one turn of the motor: it becomes a gear ratio, rad/m."""
+_RATIO: Units = {"%": 0.01, "": 1.0}
 _STEP: Units = _ANGLE | {
     "counts": lambda count: 2.0 * math.pi / count,
     "lines": lambda count: 0.5 * math.pi / count,  # of which each makes four counts
@@ -120,7 +121,8 @@ class Item(NamedTuple):
 
     def default_answer(self) -> "Answer":
         """Return the answer for a number that the user leaves out."""
-        return Answer(self.read(self.default).value, "not given")
+        value = self.read(self.default).value
+        return Answer(value, f"not given: {self.default} is assumed" if value else "not given")
 
     @property
     def option(self) -> str:
@@ -177,7 +179,12 @@ _END = (
     Item("sample_period", "sampling period of the drive", _PERIOD, "0.25 ms", "1 ms"),
     Item("frequency", "lowest frequency of the test input", {"Hz": 1.0}, "0.5 Hz", "0.5 Hz"),
 )
-_ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "0 rad", is_above=False)
+_ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "17 bit", is_above=False)
+_LOAD_ENCODER = Item(
+    "load_encoder", "one count of the load's encoder", _STEP, "20 bit", "17 bit", is_above=False, absent=True
+)
+_SCALE = Item("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "1 um", is_above=False, absent=True)
+_DAMPING = Item("damping", "damping ratio of the gear's oscillation", _RATIO, "5 %", "3 %", is_above=False)
 _MOTOR_VISCOUS = Item(
     "motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False
 )
@@ -200,10 +207,11 @@ KINDS = {
             Item("gear_ratio", "gear ratio, motor turns for one turn of the load", {"": 1.0}, "50"),
             Item("stiffness", "torsional stiffness of the gear at its output", _STIFFNESS, "12 N m/arcmin"),
             Item("backlash", "backlash of the gear at its output, end to end", _ANGLE, "3 arcmin", is_above=False),
+            _DAMPING,
             Item("load_inertia", "inertia of the load at its own shaft", _INERTIA, "0.4 kg m²"),
             Item("load_viscous", "viscous friction at the load", _VISCOUS, "0.5 N m s/rad", "0 N m s/rad", is_above=False),
             _ENCODER,
-            Item("load_encoder", "one count of the load's encoder", _STEP, "20 bit", "0 rad", is_above=False, absent=True),
+            _LOAD_ENCODER,
             _NOISE,
             *_END,
         ),
@@ -218,10 +226,11 @@ KINDS = {
             Item("lead", "travel of the carriage for one turn of the motor", _LEAD, "10 mm", key="gear_ratio"),
             Item("stiffness", "axial stiffness of screw, nut and bearings", _AXIAL, "120 N/um"),
             Item("backlash", "backlash of the nut, end to end", _LENGTH, "20 um", is_above=False),
+            _DAMPING,
             Item("mass", "mass of the carriage, with what it carries", _MASS, "60 kg", key="load_inertia"),
             Item("load_viscous", "viscous friction of the guides", _DRAG, "200 N s/m", "0 N s/m", is_above=False),
             _ENCODER,
-            Item("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "0 m", is_above=False, absent=True),
+            _SCALE,
             _NOISE,
             *_END,
         ),
@@ -248,7 +257,7 @@ KINDS = {
             Item("motor_friction", "dry friction, with what else disturbs", _FORCE, "6 N"),
             Item("force", "rated force of the motor", _FORCE, "200 N", key="torque"),
             Item("speed", "rated speed of the motor", _VELOCITY, "2 m/s"),
-            Item("motor_encoder", "one count of the scale", _LENGTH, "100 nm", "0 m", is_above=False),
+            _SCALE._replace(name="motor_encoder", question="one count of the scale", absent=False),
             Item("encoder_noise", "rms noise of the scale", _LENGTH, "20 nm", "0 m", is_above=False),
             *_END,
         ),
@@ -270,8 +279,8 @@ def items_by_name() -> dict[str, list[tuple[str, Item]]]:
 
 _HARMONICS, _PERIODS = 6, 5
 """Of the test input: harmonics, and periods of the lowest."""
-_ERROR_SHARE = 0.05
-"""Of the largest speed: the velocity error that an observer may have."""
+_LARGE_SHARE = 0.1
+"""Of the largest speed: a velocity error from which estimates are poor."""
 
 
 def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[str, JsonObject]:
@@ -283,30 +292,74 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         title: headline of its report.
 
     Returns:
-        The TOML text, and what the pilot run found, by side.
+        The TOML text, and what the pilot run found, by side; of the motor also the error that is `expected`.
 
     Raises:
         InputError: numbers that no study can have together.
         NoResult: the drive diverges.
     """
-    from .config import TuneTable, read_config, read_model
+    from .config import read_config
+    from .gains.expected_error import expect_errors
     from .gains.gain_search import usual_rule
-    from .gains.pilot import Scenarios, run_pilot
+    from .gains.machine_study import propose_tolerances
 
     answers = rename_to_geared(kind, answers)
-    text = _write_drive(kind, answers, title)
+    peak = _HARMONICS**-0.5 * _peak_of_waves(_HARMONICS)
+    amplitude = min(answers["torque"].value / peak, _choose_amplitude(answers, _HARMONICS))
     try:
-        model, _ = read_model(_parse_toml(text))
-        pilot_metrics = run_pilot(Scenarios(model, ["nominal"], {}), TuneTable())
+        data = _parse_toml(_write_drive(kind, answers, title, amplitude))
+        amplitude, pilot_metrics = _limit_speed(data, answers)
         _check_motion(kind, pilot_metrics)
+        text = _write_drive(kind, answers, title, amplitude)
+        chirp = _make_chirp(answers, min(answers["torque"].value, _choose_amplitude(answers, 1)))
+        chirp["amplitude"], _ = _limit_speed(data | {"excitation": chirp}, answers)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
-        text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0))
+        observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
+        config = read_config(_parse_toml(text) | {"observer": observers})
+        expected = expect_errors(config, list(gains))
+        pilot_metrics["motor"]["expected"] = expected["motor"]._asdict()
+        tolerances = propose_tolerances(config, expected)
+        text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances)
         read_config(_parse_toml(text))
     except InputError as error:
         raise InputError(
             f"these numbers make no study; look at their units: {str(error).removeprefix('config: ')}"
         ) from None
     return text, pilot_metrics
+
+
+def _peak_of_waves(count: int) -> float:
+    """Largest sum of the waves of a multisine (:class:`jaxbl.drive.excitation.Multisine`) of size 1 each."""
+    import numpy as np
+
+    k, phase = np.arange(1, count + 1), np.linspace(0.0, 2.0 * np.pi, 2048)
+    return float(np.abs(np.cos(phase[:, None] * k - np.pi * k * (k - 1) / count).sum(axis=1)).max())
+
+
+def _limit_speed(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]:
+    """Reduce the amplitude of a study's input until the motor stays within its rated speed; returns the pilot run, too."""
+    from .config import TuneTable, read_model
+    from .gains.pilot import Scenarios, run_pilot
+
+    model, _ = read_model(data)
+    amplitude, friction, rated = data["excitation"]["amplitude"], answers["motor_friction"].value, answers["speed"].value
+    while True:
+        amplitude = float(_format_number(amplitude, 3))
+        # a gear that rattles never repeats its motion: eight runs that differ by rounding show the largest accelerations
+        amplitudes = [amplitude * (1.0 + i * 1e-9) for i in range(8)]
+        pilot_metrics = run_pilot(Scenarios(model, ["nominal"], {"excitation.amplitude": amplitudes}), TuneTable())
+        speed = pilot_metrics["motor"]["largest_velocity"]
+        if speed <= rated:
+            return amplitude, pilot_metrics
+        # what friction leaves moves the motor; a little below, so that few runs suffice
+        amplitude = friction + (amplitude - friction) * 0.95 * rated / speed
+
+
+def _make_chirp(answers: Answers, amplitude: float) -> JsonObject:
+    """Make the input that gains are compared on."""
+    frequency = answers["frequency"].value
+    ends = {"start_frequency": frequency, "stop_frequency": 4.0 * frequency, "sweep_time": _PERIODS / frequency}
+    return {"kind": "chirp", "amplitude": amplitude} | {name: float(_format_number(end)) for name, end in ends.items()}
 
 
 def _check_motion(kind: DriveKind, pilot_metrics: JsonObject) -> None:
@@ -335,7 +388,7 @@ def _format_number(value: float, digits: int = 6) -> str:
     return repr(float(f"{value:.{digits}g}"))
 
 
-def _write_drive(kind: DriveKind, answers: Answers, title: str) -> str:
+def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float) -> str:
     """The tables of the drive, its input and its sensors; numbers are :func:`rename_to_geared`."""
     import tomli_w
 
@@ -354,9 +407,7 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str) -> str:
         return [line(f"{side}_{key}", f"{side}_{key}", kind.unit(side, unit) + where) for key, unit in units]
 
     angle, torque = kind.unit("motor", "rad"), kind.unit("motor", "N m")
-    amplitude = _choose_amplitude(answers, _HARMONICS)
-    rated = f"the rated {'torque' if torque == 'N m' else 'force'}"
-    limit = rated if amplitude == value["torque"] else "what takes its lowest wave to the rated speed"
+    rated = "torque" if torque == "N m" else "force"
     limits = ", and ".join(answers[name].text.removeprefix("given: ") for name in ("torque", "speed"))
     lines = [
         "# Written by jaxbl init from a data sheet. All numbers are in SI units; behind each stands what was given.",
@@ -372,10 +423,16 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str) -> str:
         lines += ["", "[[effects]]", f'kind = "motor.{CoulombFriction.kind}"', line("torque", "motor_friction", torque)]
     noise, load = "", []
     if kind.law:
+        stiffness, ratio = value["stiffness"] / value["gear_ratio"] ** 2, value["gear_ratio"]
+        inertias = value["motor_inertia"], value["load_inertia"] / ratio**2
+        shaft = 2.0 * math.sqrt(stiffness * math.prod(inertias) / sum(inertias))
+        if value["damping"]:
+            how = " of the oscillation of both inertias"
+            damping = line("damping", "damping", "N m s/rad on the motor's shaft", shaft, how)
+            lines += ["", "[[effects]]", 'kind = "transmission.damping"', damping]
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
         load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
         load_numbers = value["load_inertia"], value["load_viscous"]
-        ratio = value["gear_ratio"]
         at_motor = (factor * value[name] for factor, name in zip(_to_motor(ratio), ("stiffness", "backlash"), strict=True))
         nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, *at_motor)
     else:
@@ -385,7 +442,7 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str) -> str:
         "# The input: six waves at once. Replace it by a motion of your own: kind = 'recorded' plays a file back.",
         "[excitation]",
         'kind = "multisine"',
-        f"amplitude = {_format_number(amplitude, 3)} # {torque}: {limit}; given: {limits}",
+        f"amplitude = {_format_number(amplitude, 3)} # {torque}: within the rated {rated} and speed; given: {limits}",
         line("frequency", "frequency", "Hz"),
         f"count = {_HARMONICS}",
         "",
@@ -463,30 +520,18 @@ def _choose_amplitude(answers: Answers, waves: int) -> float:
     return min(value["torque"], lowest * math.sqrt(waves) + value["motor_friction"])
 
 
-def _choose_tolerances(answers: Answers, pilot_metrics: JsonObject) -> tuple[float, float]:
-    """Choose the velocity and position error (rad/s, rad; m/s, m) that the motor's observer may have.
-
-    A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what
-    readings off by e cost a differentiator of such signals, in proportion to sqrt(f+ e).
-    Reference: A. Levant, Automatica 34 (1998).
-    """
-    period, noise = answers["sample_period"].value, 4.0 * answers["encoder_noise"].value
-    costs, reading_errors = [], []
-    for side, metrics in pilot_metrics.items():
-        # on the motor's shaft
-        ratio = answers["gear_ratio"].value if side == "load" else 1.0
-        bound, reading_error = ratio * metrics["f_plus"], ratio * answers[f"{side}_encoder"].value + noise
-        costs.append(2.0 * bound * period + 4.0 * math.sqrt(bound * reading_error))
-        reading_errors.append(reading_error)
-    velocity = _ERROR_SHARE * pilot_metrics["motor"]["largest_velocity"] + max(costs)
-    return velocity, velocity * period + 4.0 * max(reading_errors)
+def describe_expectation(kind: DriveKind, pilot_metrics: JsonObject) -> str:
+    """Describe in a sentence the error that the motor's observer will have, and what it is due to."""
+    expected, unit = pilot_metrics["motor"]["expected"], kind.unit("motor", "rad")
+    causes = ", ".join(f"{100 * share:.2g} % {cause}" for cause, share in expected["shares"].items())
+    error = f"{expected['velocity']:.2g} {unit}/s of velocity error (rms)"
+    return f"Expect about {error} of the motor with the study's gains; shares of its square: {causes}."
 
 
-def describe_obstacle(kind: DriveKind, answers: Answers, pilot_metrics: JsonObject) -> str:
+def describe_obstacle(pilot_metrics: JsonObject) -> str:
     """Describe in a sentence why estimates will be poor; "" if they will not."""
-    velocity, _ = _choose_tolerances(rename_to_geared(kind, answers), pilot_metrics)
-    share = velocity / pilot_metrics["motor"]["largest_velocity"]
-    if share < 2.0 * _ERROR_SHARE:
+    share = pilot_metrics["motor"]["expected"]["velocity"] / pilot_metrics["motor"]["largest_velocity"]
+    if share < _LARGE_SHARE:
         return ""
     return (
         f"Observers may be off by {100.0 * share:.2g} % of the largest speed: the torque changes within few samples, or the "
@@ -500,33 +545,33 @@ def _write_observers(
     pilot_metrics: JsonObject,
     gains: Mapping[str, tuple[float, float]],
     usual: tuple[float, float],
+    chirp: JsonObject,
+    tolerances: Mapping[str, float],
 ) -> str:
     """Write the rest of `[run]`: the accepted errors; then the observers, and the tables for sweep and tune.
 
-    `usual`: the usual rule's gains where f+ is 1.
+    `usual`: the usual rule's gains where f+ is 1; `chirp`: the input to compare gains on; `tolerances`: of errors.
     """
     import tomli_w
 
-    from .gains.machine_study import propose_map
+    from .gains.machine_study import TOLERANCE_FACTOR, propose_map
 
-    velocity, position = _choose_tolerances(answers, pilot_metrics)
     bound = {side: float(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
-    frequency, angle = answers["frequency"].value, kind.unit("motor", "rad")
+    angle = kind.unit("motor", "rad")
     load = "; on the load both are divided by the gear ratio" if kind.law else ""
     bounds = ", ".join(f"{f_plus:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, f_plus in bound.items())
-    rated = f"the rated {'torque' if angle == 'rad' else 'force'}"
     lines = [
-        f"# Errors of the motor observer that are accepted: {100 * _ERROR_SHARE:g} % of the largest speed, and what "
-        "period, counts",
-        f"# and noise cost any observer{load}. Put in what you need.",
-        f"velocity_tolerance = {_format_number(velocity, 2)} # {angle}/s",
-        f"position_tolerance = {_format_number(position, 2)} # {angle}",
+        f"# Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times what is to be expected (rms) of "
+        f"either side",
+        f"# with the gains below{load}. Put in what you need.",
+        f"velocity_tolerance = {tolerances['velocity_tolerance']!r} # {angle}/s",
+        f"position_tolerance = {tolerances['position_tolerance']!r} # {angle}",
         "",
         f"# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest",
         f"# acceleration in a run of this study that observers do not know: {bounds}.",
         "# 'jaxbl tune' looks for better ones.",
         f"# The motor's largest speed in that run: {pilot_metrics['motor']['largest_velocity']:.3g} {angle}/s; rated: "
-        f"{answers['speed'].value:.3g}. Change excitation.amplitude if that is too fast.",
+        f"{answers['speed'].value:.3g}.",
         "[observer]",
     ]
     for side, (lambda_, alpha) in gains.items():
@@ -537,15 +582,12 @@ def _write_observers(
         "# jaxbl tune: gains of the least error, compared on another input",
         "[tune]",
         'objective = "velocity" # or "torque"',
-        "[tune.holdout]",
-        'kind = "chirp"',
-        f"amplitude = {_format_number(_choose_amplitude(answers, 1), 3)} # {kind.unit('motor', 'N m')}: {rated}, or what "
-        "takes it to the rated speed",
-        f"start_frequency = {_format_number(frequency)} # Hz",
-        f"stop_frequency = {_format_number(4.0 * frequency)}",
-        f"sweep_time = {_format_number(_PERIODS / frequency)} # s",
+        "# within the rated torque and speed, too",
+        f"[tune.holdout]\n{tomli_w.dumps(chirp).strip()}",
         "",
         "# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.",
     ]
     tables = propose_map(bound["motor"]).items()
-    return "\n".join([*lines, *(f"[[{name}]]\n{tomli_w.dumps(table)}" for name, rows in tables for table in rows)])
+    lines += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, rows in tables for table in rows]
+    lines.append(f"# {describe_expectation(kind, pilot_metrics)}")
+    return "\n".join(lines) + "\n"

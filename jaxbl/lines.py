@@ -16,6 +16,15 @@ Lines = list[str]
 """Lines of text, for a terminal or a page."""
 
 
+DOUBT = "Doubtful: "
+"""What sentences begin with that put all others in doubt: a unit, a sign or a factor of a log may be wrong."""
+
+
+def doubts_among(lines: Iterable[str]) -> Lines:
+    """Return the sentences that put all others in doubt."""
+    return [line for line in lines if line.startswith(DOUBT)]
+
+
 class NextStep(NamedTuple):
     """A command line that a user may go on with, and the question that it answers: keys of `next` in `--json`."""
 

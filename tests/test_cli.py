@@ -737,9 +737,9 @@ def axis_log(tmp_path):
     """A log and its study."""
     write_study(tmp_path, AXIS, "axis.toml")
     time = np.arange(600) * 1e-3
-    log = pd.DataFrame(
-        {"t": time, "u": np.cos(20.0 * time), "theta_e": -0.05 * np.cos(20.0 * time) + 1e-5 * np.cos(1e6 * time)}
-    )
+    # inertia and viscous friction as nominal
+    torque = np.cos(20.0 * time) + 0.15 * np.sin(20.0 * time)
+    log = pd.DataFrame({"t": time, "u": torque, "theta_e": -0.05 * np.cos(20.0 * time) + 1e-5 * np.cos(1e6 * time)})
     log.to_csv(tmp_path / "an axis.csv", index=False)
 
 
@@ -895,6 +895,18 @@ def test_what_cannot_be_diagnosed_is_told(arguments, message, axis_log, quick_ta
         call(*arguments)
     assert "\n" not in str(error.value)
     assert not quick_tasks and not (tmp_path / "new").exists()
+
+
+def test_no_search_starts_on_a_doubtful_log_unless_it_is_forced(axis_log, quick_tasks, call, tmp_path):
+    """A torque that is too small by a factor of 20."""
+    log = pd.read_csv("an axis.csv")
+    log.assign(u=0.05 * log["u"]).to_csv("an axis.csv", index=False)
+    for command in (IDENTIFY, DIAGNOSE):
+        with pytest.raises(InputError, match=r"an axis\.csv: Doubtful: u .* --force searches all the same$"):
+            call(*command, "--out", "new")
+    assert not quick_tasks and not (tmp_path / "new").exists()
+    code, _, _ = call(*DIAGNOSE, "--force")
+    assert code == 0 and len(quick_tasks) == 1
 
 
 def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):

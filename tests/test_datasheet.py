@@ -1,13 +1,16 @@
 """A first study from a data sheet: units, what is written, and that the commands run it."""
 
+import itertools
+import json
 import math
+import re
 import tomllib
-from itertools import chain
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from jaxbl import read_config
+from jaxbl import open_study, read_config
 from jaxbl.cli import setup
 from jaxbl.datasheet import KINDS, Answer, items_by_name, write_first_study
 from jaxbl.errors import InputError
@@ -60,11 +63,13 @@ def test_numbers_of_linear_axes_become_si(kind, name, text, value):
 
 
 def test_examples_and_defaults_can_be_read():
-    items = [item for _, item in chain.from_iterable(items_by_name().values())]
+    items = [item for _, item in itertools.chain.from_iterable(items_by_name().values())]
     assert len(items) == sum(len(kind.items) for kind in KINDS.values())
     for item in items:
         assert item.read(item.example).value > 0.0
-        assert not item.default or item.default_answer().text == "not given"
+        # what is assumed is said
+        assert not item.default or item.default_answer().text.startswith("not given")
+        assert not item.default or (item.default in item.default_answer().text) == (item.default_answer().value > 0.0)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +114,14 @@ def test_a_study_is_written_beside_what_was_given_and_nothing_overwritten(call, 
     # both at the output on the sheet: an angle there is 50 of the motor's, and a torque a fiftieth
     assert study.transmission.half_gap == pytest.approx(50.0 * math.radians(1.5 / 60.0), rel=1e-5)
     assert study.transmission.stiffness == pytest.approx(12.0 / math.radians(1.0 / 60.0) / 2500.0, rel=1e-5)
-    assert [effect.kind for effect in study.effects] == ["motor.coulomb_friction"]
+    kinds = {effect.kind: effect for effect in study.effects}
+    assert list(kinds) == ["motor.coulomb_friction", "transmission.damping"]
+    # 3 % of critical damping: the oscillation of both inertias on the shaft
+    reduced = 1.0 / (1.0 / 4.8e-5 + 2500.0 / 0.4)
+    damping = 2.0 * 0.03 * math.sqrt(study.transmission.stiffness * reduced)
+    assert kinds["transmission.damping"].damping == pytest.approx(damping, rel=1e-4)
+    # nobody has ideal encoders
+    assert study.encoders.motor_resolution == pytest.approx(2.0 * math.pi / 2**17, rel=1e-5)
     with pytest.raises(InputError, match=r"^axis.toml: is there already; init needs a new name$"):
         call("init", "axis.toml", *WORDS)
     assert (tmp_path / "axis.toml").read_text() == text
@@ -136,7 +148,7 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
 
     monkeypatch.setattr("typer.prompt", answer_prompt)
     assert setup._ask_number(GEARED_QUESTIONS["motor_inertia"]).value == pytest.approx(5e-5)
-    assert setup._ask_number(GEARED_QUESTIONS["sample_period"]).text == "not given"
+    assert setup._ask_number(GEARED_QUESTIONS["sample_period"]).text == "not given: 1 ms is assumed"
     assert questions[0] == questions[1] and questions[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
@@ -162,7 +174,11 @@ SHORT_RUN = {"frequency": "20 Hz"}
 
 
 def option_words(kind, numbers):
-    return ["--kind", kind, *chain.from_iterable((f"--{name.replace('_', '-')}", text) for name, text in numbers.items())]
+    return [
+        "--kind",
+        kind,
+        *itertools.chain.from_iterable((f"--{name.replace('_', '-')}", text) for name, text in numbers.items()),
+    ]
 
 
 def read_answers(kind, numbers):
@@ -317,9 +333,10 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     ("kind", "commands"), [("geared", ("simulate", "sweep")), ("screw", ("simulate", "tune")), ("linear", ("tune",))]
 )
 def test_simulate_sweep_and_tune_run_what_is_written(kind, commands, call):
-    numbers = {"screw": option_words("screw", SCREW), "linear": option_words("linear", LINEAR)}
+    numbers = {"screw": option_words("screw", SCREW), "linear": option_words("linear", LINEAR)}.get(kind, WORDS)
+    sheet = dict(itertools.pairwise(numbers))
     noise = {"linear": "20 nm"}.get(kind, "5 arcsec")
-    code, lines, _ = call("init", "axis.toml", *numbers.get(kind, WORDS), "--frequency", "5 Hz", "--encoder-noise", noise)
+    code, lines, _ = call("init", "axis.toml", *numbers, "--frequency", "5 Hz", "--encoder-noise", noise)
     assert code == 0
     # as they are printed
     printed = {line.split()[1]: line.split()[1:] for line in lines if line.startswith("  jaxbl ")}
@@ -327,6 +344,17 @@ def test_simulate_sweep_and_tune_run_what_is_written(kind, commands, call):
     for command in commands:
         code, lines, _ = call(*printed[command])
         assert code == 0 and lines[-1].endswith("/report.html")
+    if "simulate" in commands:
+        metrics = json.loads(Path("results/axis_run/summary.json").read_text())["metrics"]
+        assert metrics["motor.converged"] and metrics["load.converged"]
+        trace, speed = pd.read_parquet("results/axis_run/trace.parquet"), KINDS[kind].items[4].read(sheet["--speed"]).value
+        assert trace["motor.velocity"].abs().max() <= 1.02 * speed
+        assert trace["u"].abs().max() <= KINDS[kind].items[3].read(sheet["--torque"]).value
+        (expected,) = re.findall(r"^# Expect about (\S+) rad/s of velocity error", Path("axis.toml").read_text(), re.M)
+        assert 1 / 1.5 < metrics["motor.velocity_rmse"] / float(expected) < 1.5
+    if "sweep" in commands:
+        shares = open_study("results/axis_map").frame["motor.converged"].mean()
+        assert 0.05 < shares < 0.95
     if "tune" in commands:
         observer = tomllib.loads(Path("results/axis_gains/gains.toml").read_text())["observer"]
         assert observer["motor"]["alpha"] > 0.0 and ("load" in observer) == KINDS[kind].law

@@ -15,12 +15,14 @@ from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_e
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
 from .options import (
     FORMATS,
+    ForceOption,
     LogArgument,
     LogOutOption,
     LogOverwriteOption,
     MaxTorqueOption,
     MaxTravelOption,
     SchedulerOption,
+    check_doubts,
     check_new,
     folder_of,
 )
@@ -100,6 +102,7 @@ def identify(
     ] = None,
     max_torque: MaxTorqueOption = None,
     max_travel: MaxTravelOption = None,
+    force: ForceOption = False,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
@@ -124,6 +127,7 @@ def identify(
     from jaxbl.report.identify import identification_lines, write_identification_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
+    check_doubts(filter(None, (task.record, task.holdout)), force)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import check_gap_sought
 
@@ -186,6 +190,7 @@ def diagnose(
     ] = None,
     max_torque: MaxTorqueOption = None,
     max_travel: MaxTravelOption = None,
+    force: ForceOption = False,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
@@ -210,6 +215,7 @@ def diagnose(
     from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
+    check_doubts(filter(None, (task.record, task.holdout)), force)
     folder = folder_of(log[0], "diagnosed", out)
     log_call = LogCall(log, model, holdout, next_experiment)
 

@@ -1,12 +1,17 @@
 """Arguments and options that several commands have."""
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jaxbl.errors import InputError
 from jaxbl.files import to_path
+from jaxbl.lines import doubts_among
+
+if TYPE_CHECKING:
+    from jaxbl.records import Record
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
@@ -41,6 +46,7 @@ MaxTorqueOption = Annotated[
 MaxTravelOption = Annotated[
     float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
 ]
+ForceOption = Annotated[bool, typer.Option("--force", help="search although a unit or a sign of the log is doubtful")]
 LogOverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
 ]
@@ -49,6 +55,13 @@ LogOverwriteOption = Annotated[
 def folder_of(source: Path, result: str, out: str | Path | None) -> Path:
     """Return the folder for one kind of result of a study or a log: no two commands share one unless `out` says so."""
     return to_path(out) if out is not None else Path("results") / f"{source.stem}_{result}"
+
+
+def check_doubts(records: "Iterable[Record]", force: bool) -> None:
+    """Refuse a search of minutes on a log of which a unit or a sign is doubtful."""
+    for record in records:
+        if not force and (doubts := doubts_among(record.warnings)):
+            raise InputError(f"{record.path}: {doubts[0]} --force searches all the same")
 
 
 def check_new(file: Path, option: str) -> None:

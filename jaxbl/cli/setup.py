@@ -7,7 +7,17 @@ from typing import Annotated, TypeVar
 import typer
 
 from jaxbl import workers
-from jaxbl.datasheet import KINDS, NONE, Answer, Item, describe_obstacle, items_by_name, option_name, write_first_study
+from jaxbl.datasheet import (
+    KINDS,
+    NONE,
+    Answer,
+    Item,
+    describe_expectation,
+    describe_obstacle,
+    items_by_name,
+    option_name,
+    write_first_study,
+)
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
 from jaxbl.lines import format_descriptions
@@ -69,7 +79,8 @@ def init(
     largest = ", ".join(f"{bound:.3g} {KINDS[name].unit(side, 'rad/s²')} ({side})" for side, bound in bounds.items())
     lines = [
         f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
-        *([other_kinds] if (other_kinds := describe_obstacle(KINDS[name], values, pilot_metrics)) else []),
+        describe_expectation(KINDS[name], pilot_metrics),
+        *([obstacle] if (obstacle := describe_obstacle(pilot_metrics)) else []),
     ]
     data = {
         "file": str(file),

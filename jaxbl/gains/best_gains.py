@@ -109,6 +109,6 @@ def describe_margins(margins: dict[str, float]) -> str:
     return f"Margin {factors[0][1]:.3g} ({', '.join(f'{words[name]} {factor:.3g}' for name, factor in factors)})."
 
 
-def _distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the largest difference of a coordinate to the nearest of the others; infinite without others."""
-    return KDTree(others).query(points, p=np.inf)[0] if len(others) else np.full(len(points), np.inf)
+def _distances(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the largest difference of a coordinate to the nearest target; infinite without targets."""
+    return KDTree(targets).query(points, p=np.inf)[0] if len(targets) else np.full(len(points), np.inf)

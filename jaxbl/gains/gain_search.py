@@ -169,14 +169,14 @@ class GainSearch:
         """Run a stage's map of gains, and append its candidates; those of stage 0 take the place of earlier ones."""
         axes: dict[str, dict[str, list[float]]] = {"alpha": {}, "lambda": {}}
         for side, window in self.windows[stage].items():
-            bound, tried = self.f_plus[side], {}
+            bound, ratios = self.f_plus[side], {}
             for gain, scale in (("alpha", bound), ("lambda", math.sqrt(bound))):
                 values = scale * np.geomspace(*window[gain], self.table.num)
                 # a map that is finer than three digits keeps more
                 digits = 3 if _grid_ratio(window[gain], self.table.num) - 1.0 >= _LEAST_STEP else 16
                 axes[gain][f"observer.{side}.{gain}"] = values = [float(f"{value:.{digits}g}") for value in values]
-                tried[gain] = values[0] / scale, values[-1] / scale
-            self.windows[stage][side] = tried
+                ratios[gain] = values[0] / scale, values[-1] / scale
+            self.windows[stage][side] = ratios
         frame = self._run_study(name, axes)
         for side in self.sides:
             worst = _reduce_to_worst(frame, side, self.table.objective, list(self.scenarios.columns))

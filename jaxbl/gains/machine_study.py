@@ -6,9 +6,10 @@ from contextlib import suppress
 from jaxbl.config import Config, TuneTable, read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import doubts_among
 from jaxbl.records import POSITION_CHANNELS, Record
 
-from .expected_error import expect_errors
+from .expected_error import ExpectedError, expect_errors
 from .pilot import Scenarios, run_pilot
 
 TOLERANCE_FACTOR = 5.0
@@ -18,7 +19,8 @@ the rms, which one in 400 exceeds, no run of thousands of samples would keep."""
 
 def propose_map(f_plus: float) -> JsonObject:
     """Propose `axes` and `figures`: a map of the motor observer's gains about f_plus (rad/s^2) and its root."""
-    ranges = (("lambda", math.sqrt(f_plus), (0.3, 50.0)), ("alpha", f_plus, (0.5, 100.0)))
+    # from well below what convergence asks for to where the encoders' noise rules
+    ranges = (("lambda", math.sqrt(f_plus), (0.2, 100.0)), ("alpha", f_plus, (0.2, 200.0)))
     axes = [
         {"path": f"observer.motor.{gain}"}
         | {name: _round(end * scale) for name, end in zip(("start", "stop"), ends, strict=True)}
@@ -27,6 +29,18 @@ def propose_map(f_plus: float) -> JsonObject:
     ]
     figure = {"kind": "heatmap", "x": "observer.motor.alpha", "y": "observer.motor.lambda", "value": "motor.velocity_rmse"}
     return {"axes": axes, "figures": [figure | {"overlays": ["davila_fridman", "seeber_horn", "exact"]}]}
+
+
+def propose_tolerances(config: Config, expected: dict[str, ExpectedError]) -> dict[str, float]:
+    """Propose the keys of `[run]` for the errors that are accepted: of the motor (rad/s, rad), and so that the load's, which
+    are accepted divided by the gear ratio, suffice as well."""
+    ratios = {side: config.drive.gear_ratio if side == "load" else 1.0 for side in expected}
+    return {
+        f"{name}_tolerance": _round(
+            TOLERANCE_FACTOR * max(ratio * getattr(expected[side], name) for side, ratio in ratios.items())
+        )
+        for name in ("velocity", "position")
+    }
 
 
 def measure_encoders(record: Record) -> JsonObject:
@@ -52,7 +66,9 @@ def complete_study(data: JsonObject, record: Record, written: Config) -> JsonObj
     Returns:
         The study. Its map and tolerances are left out if it does not run, as where no torque disturbs the observers.
     """
-    data = data | {"encoders": data["encoders"] | measure_encoders(record)}
+    # what puts the log in doubt puts all that follows from it in doubt
+    notes = list(dict.fromkeys([*doubts_among(record.warnings), *data["notes"]]))
+    data = data | {"notes": notes, "encoders": data["encoders"] | measure_encoders(record)}
     if written.tune is None:
         data["tune"] = {"objective": "velocity"}
     if "seeds" not in written.sweep.model_fields_set:
@@ -60,10 +76,8 @@ def complete_study(data: JsonObject, record: Record, written: Config) -> JsonObj
     with suppress(InputError, NoResult):
         config = read_config(data)
         pilot = run_pilot(Scenarios(config, ["nominal"], {}), TuneTable())
-        expected = expect_errors(config, list(pilot))["motor"]
-        for name, error in (("velocity", expected.velocity), ("position", expected.position)):
-            if f"{name}_tolerance" not in written.run.model_fields_set:
-                data["run"][f"{name}_tolerance"] = _round(TOLERANCE_FACTOR * error)
+        tolerances = propose_tolerances(config, expect_errors(config, list(pilot)))
+        data["run"] |= {key: value for key, value in tolerances.items() if key not in written.run.model_fields_set}
         if not written.axes and pilot["motor"]["f_plus"] > 0.0:
             data |= propose_map(pilot["motor"]["f_plus"])
     return data

@@ -167,7 +167,7 @@ class Summary:
     def _optimum_remarks(self, side: str) -> list[str]:
         search, row, lines = self.search, self.search.least_candidate(side), []
         labels = {"alpha": "alpha / f⁺", "lambda": "lambda / √f⁺"}
-        for direction, gain in map(str.split, self.limits[side]["range_ends"]):
+        for gain, direction in search.find_best(side).ends.items():
             end = search.limits[gain][direction == "larger"]
             lines.append(
                 f"{side}: the optimum lies at the end {labels[gain]} = {end:g} of the range searched (tune.{gain}_ratio); "

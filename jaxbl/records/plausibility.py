@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from jaxbl.lines import DOUBT
+
 from .alignment import NominalDrive
 from .channels import RawChannel
 from .files import LogFile
@@ -204,7 +206,7 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     # a load that drives the motor returns work as well: no error
     if work_share < -0.1:
         returned_text = f"the drive returns {-100 * work_share:.0f} % of the work"
-        file.warnings.append(f"Doubtful: {returned_text}: the load drives it, or u has the wrong sign or acts late.")
+        file.warnings.append(f"{DOUBT}{returned_text}: the load drives it, or u has the wrong sign or acts late.")
         # a lag turns the torque of an inertia against the speed; a wrong sign turns it against the acceleration, too
         if work_share < _MAX_RETURNED_WORK and not accelerates_with_torque:
             file.contradiction = (
@@ -271,7 +273,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         # the nominal friction may be wrong, so this alone is not sure
         is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio
     if is_doubtful:
-        file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
+        file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
     viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
@@ -312,7 +314,7 @@ def note_channel_faults(file: LogFile, name: str, statistics: ChannelStatistics,
     # 1e4 rad/s, about 100 000 rpm, is beyond drives
     if statistics.unit == "rad" and rate > 1e4:
         rpm = rate * 30.0 / math.pi
-        file.warnings.append(f"Doubtful: {name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
+        file.warnings.append(f"{DOUBT}{name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
 
 
 def note_skew(file: LogFile, gearing: Gearing, period: float) -> None:

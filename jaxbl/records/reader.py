@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
+from jaxbl.lines import DOUBT
 from jaxbl.units import on_a_line
 from jaxbl.validation import check_sizes, explain_first_error
 
@@ -212,7 +213,7 @@ def read_record(
         segments=tuple(grid.segments),
         notes=tuple(file.notes),
         # doubts come before corrections
-        warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith("Doubtful"))),
+        warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith(DOUBT))),
         corrections=file.corrections,
         contradiction=file.contradiction,
         statistics=LogStatistics(segmented.sampling, statistics, gearing, dynamics),

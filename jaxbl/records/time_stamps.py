@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.lines import DOUBT
+
 from .files import LogFile
 from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
 from .table import LogTable, TimeTable
@@ -98,7 +100,7 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
         raise file.error(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
     if median >= _DOUBTFUL_PERIOD:
-        file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
+        file.warnings.append(f"{DOUBT}the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
     return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group_interval))
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, NextStep
+from jaxbl.lines import DOUBT, Lines, NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone
@@ -47,7 +47,7 @@ _FAR = 10.0
 def _headline(summary: JsonObject) -> Lines:
     gains = [1.0 + one["parameters"]["relative"]["value"] for one in summary["findings"] if "relative" in one["parameters"]]
     lines = [
-        f"Doubtful: the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
+        f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
         for gain in gains
         if not 1.0 / _FAR < gain < _FAR
     ]

@@ -7,7 +7,7 @@ from typing import Any
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import is_noise
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, NextStep
+from jaxbl.lines import DOUBT, Lines, NextStep
 
 from .figures import SIDES
 from .identify_figures import draw_identification
@@ -49,7 +49,7 @@ def _headline(summary: JsonObject) -> Lines:
         and one["value"] is not None
         and not 1.0 / _FAR < one["value"] / one["nominal"] < _FAR
     ]
-    lines = [f"Doubtful: {', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
+    lines = [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
     # intervals do not count what a model lacks: that it does is said before them
     lines = [
         *summary["warnings"],

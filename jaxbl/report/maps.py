@@ -187,7 +187,7 @@ def _sampled(config: Config) -> list[str]:
 
 
 def flat_remark(values: np.ndarray) -> str:
-    """What a map says whose values differ by too little to count; "" for others."""
+    """Return what a map says whose values differ by too little to count; "" for others."""
     finite = values[np.isfinite(values)]
     is_flat = finite.size > 1 and np.ptp(finite) <= AS_GOOD * np.abs(finite).max()
     return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""

@@ -18,6 +18,7 @@ from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import doubts_among
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -378,10 +379,11 @@ def _where(summary: JsonObject) -> str:
 
 
 def tune_headline(summary: JsonObject) -> list[str]:
-    """Whether gains matter, the chosen ones, and their errors on the held-out runs, in sentences."""
+    """Say whether gains matter, the chosen ones, and their errors on the held-out runs."""
     metric = f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
-    lines = [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
+    lines = doubts_among(summary["remarks"])
+    lines += [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
     for side, gains in summary["gains"].items():
         found, verdict = summary["achieved"][side], summary["verdict"][side]
         lines.append(
@@ -391,8 +393,9 @@ def tune_headline(summary: JsonObject) -> list[str]:
             f"{_runs_behind(summary)}. {describe_margins(verdict['margins'])} "
             f"{verdict['nearly_as_good']} of {verdict['tried']} gains are as good within {100 * NEARLY_AS_GOOD:g} %."
         )
-    lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in summary["limits"].items()]
-    if any(way["by"] for found in summary["limits"].values() for ways in found["towards"].values() for way in ways.values()):
+    limits = {side: found for side, found in summary["limits"].items() if summary["verdict"][side]["gains_matter"] != "no"}
+    lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in limits.items()]
+    if any(way["by"] for found in limits.values() for ways in found["towards"].values() for way in ways.values()):
         lines[-1] += " (Chatter is what changes from sample to sample, the slow part is the rest.)"
     lines += [conditions_line(side, one, "the largest of all runs") for side, one in summary["conditions"].items()]
     where = _where(summary)
@@ -420,12 +423,12 @@ def describe_verdict(verdict: JsonObject) -> str:
     factor, shares = verdict["worst_over_least"], verdict["causes"]
     more = f"{100 * (factor - 1):.2g} %"
     limits = ", ".join(f"{part} {100 * share:.2g} %" for part, share in sorted(shares.items(), key=lambda part: -part[1]))
-    said = {
+    sentences = {
         "yes": f"gains matter: the worst that meet all constraints have {factor:.3g} times the least error.",
         "no": f"gains do not matter: all that meet the constraints are within {more} of the least error.",
         "range": "limited by the range searched: better gains may lie beyond it.",
     }
-    return f"{said[verdict['gains_matter']]} What the mean square error is due to: {limits}."
+    return f"{sentences[verdict['gains_matter']]} What the mean square error is due to: {limits}."
 
 
 def _gains_table(summary: JsonObject) -> PageTable:

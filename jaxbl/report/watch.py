@@ -11,7 +11,7 @@ import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, NextStep
+from jaxbl.lines import Lines, NextStep, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
 
 from .figures import COLOURS, SIDE_COLOURS, SIDES, Drawn, legend, limits, outline, stacked, style
@@ -75,7 +75,7 @@ def watch_lines(summary: JsonObject) -> Lines:
     """The lines for the terminal, from a `watch.json`."""
     first, last, limit = summary["first"], summary["last"], summary["alarm_gap"]
     units, count = summary["units"]["motor"], summary["values"]
-    lines = []
+    lines = doubts_among(summary["notes"])
     if limit is not None and summary["alarm"] is not None:
         one = summary["alarm"]
         lines.append(

@@ -1,5 +1,7 @@
 """The study of a machine from its log: encoders as measured, and the rest of what a run needs."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -53,5 +55,11 @@ def test_what_the_study_sets_stays(record):
     data = complete_study(written.to_dict(), record, written)
     assert (data["run"]["velocity_tolerance"], data["sweep"]["seeds"], data["tune"]["num"]) == (0.7, 2, 5)
     assert [axis["path"] for axis in data["axes"]] == ["observer.motor.alpha"]
+    assert data["notes"] == []
+    # a doubt about the log stays with what follows from it
+    doubt = "Doubtful: u is small."
+    assert complete_study(written.to_dict(), dataclasses.replace(record, warnings=(doubt, "other")), written)["notes"] == [
+        doubt
+    ]
     # but for the encoders, which were measured
     assert data["encoders"]["motor_resolution"] == pytest.approx(COUNT)
