@@ -182,7 +182,7 @@ REPLACED_COMMANDS = {
     "python docs/cluster/slurm.py .*": "",
     "dask scheduler .*": "",
     "sbatch .* docs/cluster/workers.sbatch .*": "",
-    "jaxbl sweep sweeps/gain_map.toml --scheduler scheduler.json": "",
+    "jaxbl sweep sweeps/gain_map.toml .*--scheduler scheduler.json": "",
 }
 
 
