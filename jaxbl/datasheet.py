@@ -392,7 +392,7 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
     """The tables of the drive, its input and its sensors; numbers are :func:`rename_to_geared`."""
     import tomli_w
 
-    from .drive.effects import CoulombFriction
+    from .drive.effects import CoulombFriction, Damping
     from .records import NominalDrive
     from .records.proposal import count_plant_steps
 
@@ -429,7 +429,7 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
         if value["damping"]:
             how = " of the oscillation of both inertias"
             damping = line("damping", "damping", "N m s/rad on the motor's shaft", shaft, how)
-            lines += ["", "[[effects]]", 'kind = "transmission.damping"', damping]
+            lines += ["", "[[effects]]", f'kind = "transmission.{Damping.kind}"', damping]
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
         load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
         load_numbers = value["load_inertia"], value["load_viscous"]
