@@ -304,15 +304,13 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     from .gains.machine_study import propose_tolerances
 
     answers = rename_to_geared(kind, answers)
-    peak = _HARMONICS**-0.5 * _peak_of_waves(_HARMONICS)
-    amplitude = min(answers["torque"].value / peak, _choose_amplitude(answers, _HARMONICS))
     try:
-        data = _parse_toml(_write_drive(kind, answers, title, amplitude))
-        amplitude, pilot_metrics = _limit_speed(data, answers)
+        data = _parse_toml(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
+        amplitude, pilot_metrics = _limit_input(data, answers)
         _check_motion(kind, pilot_metrics)
         text = _write_drive(kind, answers, title, amplitude)
-        chirp = _make_chirp(answers, min(answers["torque"].value, _choose_amplitude(answers, 1)))
-        chirp["amplitude"], _ = _limit_speed(data | {"excitation": chirp}, answers)
+        chirp = _make_chirp(answers, _choose_amplitude(answers, 1))
+        chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(_parse_toml(text) | {"observer": observers})
@@ -328,21 +326,23 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     return text, pilot_metrics
 
 
-def _peak_of_waves(count: int) -> float:
-    """Largest sum of the waves of a multisine (:class:`jaxbl.drive.excitation.Multisine`) of size 1 each."""
+def _limit_input(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]:
+    """Reduce the amplitude of a study's input until the motor stays within its rated torque and speed.
+
+    Returns the amplitude, and the pilot run with it.
+    """
+    import jax
     import numpy as np
 
-    k, phase = np.arange(1, count + 1), np.linspace(0.0, 2.0 * np.pi, 2048)
-    return float(np.abs(np.cos(phase[:, None] * k - np.pi * k * (k - 1) / count).sum(axis=1)).max())
-
-
-def _limit_speed(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]:
-    """Reduce the amplitude of a study's input until the motor stays within its rated speed; returns the pilot run, too."""
     from .config import TuneTable, read_model
     from .gains.pilot import Scenarios, run_pilot
 
     model, _ = read_model(data)
-    amplitude, friction, rated = data["excitation"]["amplitude"], answers["motor_friction"].value, answers["speed"].value
+    rated, friction = answers["speed"].value, answers["motor_friction"].value
+    times = np.linspace(0.0, model.run.duration, 20_000)
+    peak = float(np.abs(jax.vmap(model.excitation.build())(times)).max())
+    # three digits round by up to half a percent
+    amplitude = data["excitation"]["amplitude"] * min(0.995 * answers["torque"].value / peak, 1.0)
     while True:
         amplitude = float(_format_number(amplitude, 3))
         # a gear that rattles never repeats its motion: eight runs that differ by rounding show the largest accelerations
@@ -352,7 +352,8 @@ def _limit_speed(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]
         if speed <= rated:
             return amplitude, pilot_metrics
         # what friction leaves moves the motor; a little below, so that few runs suffice
-        amplitude = friction + (amplitude - friction) * 0.95 * rated / speed
+        least = min(friction, 0.9 * amplitude)
+        amplitude = least + (amplitude - least) * 0.95 * rated / speed
 
 
 def _make_chirp(answers: Answers, amplitude: float) -> JsonObject:
