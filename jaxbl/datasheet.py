@@ -341,8 +341,7 @@ def _limit_input(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]
     rated, friction = answers["speed"].value, answers["motor_friction"].value
     times = np.linspace(0.0, model.run.duration, 20_000)
     peak = float(np.abs(jax.vmap(model.excitation.build())(times)).max())
-    # three digits round by up to half a percent
-    amplitude = data["excitation"]["amplitude"] * min(0.995 * answers["torque"].value / peak, 1.0)
+    amplitude = data["excitation"]["amplitude"] * min(answers["torque"].value / peak, 1.0)
     while True:
         amplitude = float(_format_number(amplitude, 3))
         # a gear that rattles never repeats its motion: eight runs that differ by rounding show the largest accelerations

@@ -10,7 +10,7 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (399953, 3.82, 4.49, 5.74),
+    "all": (399951, 3.82, 4.49, 5.74),
     "report": (64097, 8.71, 6.12, 16.67),
     "diagnosis": (61881, 10.65, 16.54, 14.57),
     "records": (45847, 0.0, 0.0, 0.0),
@@ -19,7 +19,7 @@ CEILINGS = {
     "sweeps": (28766, 0.07, 0.0, 0.0),
     "exports": (24764, 0.02, 0.0, 0.68),
     "fused": (24004, 0.1, 0.0, 0.0),
-    ".": (17997, 0.03, 0.0, 0.0),
+    ".": (17995, 0.03, 0.0, 0.0),
     "drive": (12780, 0.0, 2.23, 0.0),
     "throughput": (11788, 0.0, 0.0, 0.0),
     "cli": (9855, 0.09, 0.0, 0.0),
