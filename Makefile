@@ -33,7 +33,7 @@ lint: .venv/installed-dev
 
 # every page as written, then the site, and its pages in a browser
 docs: .venv/installed-dev
-	$(PYTEST) -m pages --dist loadgroup
+	$(PYTEST) -m pages
 
 # from the pages, docstrings, and the studies of the gallery
 site: .venv/installed-dev

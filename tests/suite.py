@@ -6,7 +6,6 @@ time stays: in a part of the suite it may compile what another test does in the 
 """
 
 import json
-import re
 import shutil
 import time
 from collections import Counter
@@ -28,8 +27,7 @@ _PACKAGES = {
 
 
 def _name_function(nodeid: str) -> str:
-    # with --dist loadgroup, a group stands at the end
-    return re.split(r"[\[@]", nodeid)[0].rpartition("tests/")[2]
+    return nodeid.partition("[")[0].rpartition("tests/")[2]
 
 
 def _read_durations() -> dict[str, float]:
