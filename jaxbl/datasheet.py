@@ -7,11 +7,14 @@ Numbers are read in the units of data sheets and written in SI, each beside what
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import InputError
 from .json_types import JsonObject
 from .units import on_a_line
+
+if TYPE_CHECKING:
+    from .config import TuneTable
 
 Unit = float | Callable[[float], float]
 """A factor to SI, or a function that gives the SI value."""
@@ -277,6 +280,8 @@ def items_by_name() -> dict[str, list[tuple[str, Item]]]:
     return items
 
 
+_UNCERTAINTY = 0.1
+"""Relative uncertainty of a data sheet's numbers: they hold for a series, and depend on temperature and load."""
 _HARMONICS, _PERIODS = 6, 5
 """Of the test input: harmonics, and periods of the lowest."""
 _LARGE_SHARE = 0.1
@@ -298,26 +303,31 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         InputError: numbers that no study can have together.
         NoResult: the drive diverges.
     """
-    from .config import read_config
+    from .config import TuneTable, read_config
     from .gains.expected_error import expect_errors
     from .gains.gain_search import usual_rule
-    from .gains.machine_study import propose_tolerances
+    from .gains.machine_study import propose_map, propose_tolerances
+    from .gains.pilot import Scenarios, list_scenarios, run_pilot
 
-    answers = rename_to_geared(kind, answers)
+    answers, table = rename_to_geared(kind, answers), TuneTable(worst_over_uncertainty=True)
     try:
         data = _parse_toml(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
-        amplitude, pilot_metrics = _limit_input(data, answers)
+        amplitude, pilot_metrics = _limit_input(data, answers, table)
         _check_motion(kind, pilot_metrics)
         text = _write_drive(kind, answers, title, amplitude)
         chirp = _make_chirp(answers, _choose_amplitude(answers, 1))
-        chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers)
+        chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers, table)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(_parse_toml(text) | {"observer": observers})
-        expected = expect_errors(config, list(gains))
-        pilot_metrics["motor"]["expected"] = expected["motor"]._asdict()
-        tolerances = propose_tolerances(config, expected)
-        text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances)
+        nominal = Scenarios(config, ["nominal"], {})
+        largest = expect_errors(list_scenarios(config, table), list(gains))
+        pilot_metrics["motor"]["expected"] = expect_errors(nominal, ["motor"])["motor"]._asdict() | {
+            "largest": largest["motor"].velocity
+        }
+        gain_map = propose_map(run_pilot(nominal, table)["motor"]["f_plus"])
+        tolerances = propose_tolerances(config, largest)
+        text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances, gain_map)
         read_config(_parse_toml(text))
     except InputError as error:
         raise InputError(
@@ -326,16 +336,16 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     return text, pilot_metrics
 
 
-def _limit_input(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]:
+def _limit_input(data: JsonObject, answers: Answers, table: "TuneTable") -> tuple[float, JsonObject]:
     """Reduce the amplitude of a study's input until the motor stays within its rated torque and speed.
 
-    Returns the amplitude, and the pilot run with it.
+    Returns the amplitude, and the pilot runs with it: of the drive, and of others within the uncertainty of its numbers.
     """
     import jax
     import numpy as np
 
-    from .config import TuneTable, read_model
-    from .gains.pilot import Scenarios, run_pilot
+    from .config import read_model
+    from .gains.pilot import list_scenarios, run_pilot
 
     model, _ = read_model(data)
     rated, friction = answers["speed"].value, answers["motor_friction"].value
@@ -343,10 +353,8 @@ def _limit_input(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]
     peak = float(np.abs(jax.vmap(model.excitation.build())(times)).max())
     amplitude = data["excitation"]["amplitude"] * min(answers["torque"].value / peak, 1.0)
     while True:
-        amplitude = float(_format_number(amplitude, 3))
-        # a gear that rattles never repeats its motion: eight runs that differ by rounding show the largest accelerations
-        amplitudes = [amplitude * (1.0 + i * 1e-9) for i in range(8)]
-        pilot_metrics = run_pilot(Scenarios(model, ["nominal"], {"excitation.amplitude": amplitudes}), TuneTable())
+        amplitude = float(_format_number(0.995 * amplitude, 3))  # rounded, it is not larger
+        pilot_metrics = run_pilot(list_scenarios(model.with_keys("excitation", amplitude=amplitude), table), table)
         speed = pilot_metrics["motor"]["largest_velocity"]
         if speed <= rated:
             return amplitude, pilot_metrics
@@ -446,6 +454,9 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
         line("frequency", "frequency", "Hz"),
         f"count = {_HARMONICS}",
         "",
+        "[uncertainty]",
+        f"relative = {_UNCERTAINTY} # of the numbers above: machines differ from their data sheets",
+        "",
         "[encoders]",
         line("noise", "encoder_noise", f"{angle} rms", how=noise),
         line("motor_resolution", "motor_encoder", f"{angle} a count, 0 is ideal"),
@@ -525,7 +536,10 @@ def describe_expectation(kind: DriveKind, pilot_metrics: JsonObject) -> str:
     expected, unit = pilot_metrics["motor"]["expected"], kind.unit("motor", "rad")
     causes = ", ".join(f"{100 * share:.2g} % {cause}" for cause, share in expected["shares"].items())
     error = f"{expected['velocity']:.2g} {unit}/s of velocity error (rms)"
-    return f"Expect about {error} of the motor with the study's gains; shares of its square: {causes}."
+    return (
+        f"Expect about {error} of the motor with the study's gains, and {expected['largest']:.2g} where numbers are off by "
+        f"{100.0 * _UNCERTAINTY:g} %; shares of its square: {causes}."
+    )
 
 
 def describe_obstacle(pilot_metrics: JsonObject) -> str:
@@ -547,30 +561,32 @@ def _write_observers(
     usual: tuple[float, float],
     chirp: JsonObject,
     tolerances: Mapping[str, float],
+    gain_map: JsonObject,
 ) -> str:
     """Write the rest of `[run]`: the accepted errors; then the observers, and the tables for sweep and tune.
 
-    `usual`: the usual rule's gains where f+ is 1; `chirp`: the input to compare gains on; `tolerances`: of errors.
+    `usual`: the usual rule's gains where f+ is 1; `chirp`: the input to compare gains on; `tolerances`: of errors;
+    `gain_map`: axes and figures.
     """
     import tomli_w
 
-    from .gains.machine_study import TOLERANCE_FACTOR, propose_map
+    from .gains.machine_study import TOLERANCE_FACTOR
 
     bound = {side: float(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
     angle = kind.unit("motor", "rad")
     load = "; on the load both are divided by the gear ratio" if kind.law else ""
     bounds = ", ".join(f"{f_plus:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, f_plus in bound.items())
     lines = [
-        f"# Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times what is to be expected (rms) of "
-        f"either side",
-        f"# with the gains below{load}. Put in what you need.",
+        f"# Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times the largest that is to be expected "
+        f"(rms)",
+        f"# of either side with the gains below, in drives within [uncertainty]{load}. Put in what you need.",
         f"velocity_tolerance = {tolerances['velocity_tolerance']!r} # {angle}/s",
         f"position_tolerance = {tolerances['position_tolerance']!r} # {angle}",
         "",
         f"# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest",
-        f"# acceleration in a run of this study that observers do not know: {bounds}.",
+        f"# acceleration that observers do not know, in runs of drives within [uncertainty]: {bounds}.",
         "# 'jaxbl tune' looks for better ones.",
-        f"# The motor's largest speed in that run: {pilot_metrics['motor']['largest_velocity']:.3g} {angle}/s; rated: "
+        f"# The motor's largest speed in these runs: {pilot_metrics['motor']['largest_velocity']:.3g} {angle}/s; rated: "
         f"{answers['speed'].value:.3g}.",
         "[observer]",
     ]
@@ -582,12 +598,12 @@ def _write_observers(
         "# jaxbl tune: gains of the least error, compared on another input",
         "[tune]",
         'objective = "velocity" # or "torque"',
+        "worst_over_uncertainty = true",
         "# within the rated torque and speed, too",
         f"[tune.holdout]\n{tomli_w.dumps(chirp).strip()}",
         "",
         "# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.",
     ]
-    tables = propose_map(bound["motor"]).items()
-    lines += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, rows in tables for table in rows]
+    lines += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in gain_map.items() for table in tables]
     lines.append(f"# {describe_expectation(kind, pilot_metrics)}")
     return "\n".join(lines) + "\n"

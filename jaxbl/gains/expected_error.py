@@ -1,13 +1,15 @@
 """What the error of a study's observers is due to: its encoders, its gap, and the sampling period."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
 from jaxbl.sweeps.sweep import sweep
+
+from .pilot import Scenarios, list_axes
 
 
 class Causes(NamedTuple):
@@ -20,11 +22,6 @@ class Causes(NamedTuple):
 
     names: list[str]
     columns: dict[str, list[float]]
-
-    def axes(self) -> list[dict[str, Any]]:
-        """Return the runs as axes of a study."""
-        zipped = {"zip": "causes"} if len(self.columns) > 1 else {}
-        return [{"path": path, "values": values} | zipped for path, values in self.columns.items()]
 
     def split(self, frame: pd.DataFrame, metric: str) -> tuple[float, dict[str, float]]:
         """Return the worst error of the study as it is, and the share of its square that each cause has.
@@ -73,16 +70,17 @@ class ExpectedError(NamedTuple):
     shares: dict[str, float]
 
 
-def expect_errors(config: Config, sides: Sequence[str], seeds: int = 4) -> dict[str, ExpectedError]:
-    """Expect the observers' errors of a study, by side, from runs with its own gains.
+def expect_errors(scenarios: Scenarios, sides: Sequence[str], seeds: int = 4) -> dict[str, ExpectedError]:
+    """Expect the largest errors of a study's observers, by side, from runs of drives with the study's own gains.
 
     Raises:
         InputError: the study cannot run.
     """
-    data, causes = config.to_dict(), list_causes(config)
-    for key in ("figures", "tune", "axes"):
+    data, causes = scenarios.config.to_dict(), list_causes(scenarios.config)
+    for key in ("figures", "tune", "uncertainty", "axes"):
         data.pop(key, None)
-    result = sweep(read_config(data | {"axes": causes.axes(), "sweep": {"seeds": seeds}}))
+    data["axes"] = list_axes({"scenario": scenarios.columns, "causes": causes.columns})
+    result = sweep(read_config(data | {"sweep": {"seeds": seeds}}))
     frame = result.read([*causes.columns, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
     expected = {}
     for side in sides:

@@ -18,7 +18,7 @@ from jaxbl.sweeps.metrics import no_disturbance_error
 
 from .best_gains import BestGains, find_best_gains
 from .expected_error import list_causes
-from .pilot import Scenarios
+from .pilot import Scenarios, list_axes
 from .stages import Stages, stage_tables
 
 Gains = dict[str, tuple[float, float]]
@@ -269,7 +269,7 @@ class GainSearch:
         causes = list_causes(self.scenarios.config)
         best = {side: self.best_candidate(side) for side in self.sides}
         gains = {f"observer.{side}.{gain}": [row[gain]] for side, row in best.items() for gain in ("lambda", "alpha")}
-        frame = self._run_study("causes", {"gains": gains} | ({"causes": causes.columns} if causes.names else {}))
+        frame = self._run_study("causes", {"gains": gains, "causes": causes.columns})
         return {side: causes.split(frame, f"{side}.{self.table.objective}_rmse")[1] for side in self.sides}
 
     def _run_study(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
@@ -281,24 +281,17 @@ class GainSearch:
         data = stage_tables(config, name, seeds=seeds, first_seed=first_seed, excitation=excitation)
         for side in self.sides:
             data["observer"][side]["velocity_error"] = self.pilot[side]["velocity_error"]
-        data["axes"] = [
-            {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
-            for label, columns in ({"scenario": self.scenarios.columns} | axes).items()
-            for path, values in columns.items()
-        ]
+        data["axes"] = list_axes({"scenario": self.scenarios.columns} | axes)
         result = self.stages.run(data, name)
         names = [f"{side}.{metric}" for side in self.sides for metric in GAIN_METRICS]
         frame = result.read([*(axis["path"] for axis in data["axes"]), "seed", "finite", *names])
         for side, pilot in self.pilot.items():
-            if pilot["starting_error_assumed"]:
-                # along the run f⁺ has the friction of the assumed error
-                alpha, lambda_ = (frame[f"observer.{side}.{gain}"].to_numpy(float) for gain in ("alpha", "lambda"))
-                bound = np.full(len(frame), pilot["holdout_f_plus" if held_out else "f_plus"])
-                least = apply_elementwise(CONDITIONS["exact"].least_lambda, [alpha, bound])
-                new = {"f_plus": bound, "margin_alpha": alpha / bound, "margin_exact": lambda_ / least}
-                frame = frame.assign(
-                    **{f"{side}.{name}": np.where(frame["finite"], values, np.nan) for name, values in new.items()}
-                )
+            # along a run f⁺ may have the friction of an assumed starting error, and none of what other machines add
+            alpha, lambda_ = (frame[f"observer.{side}.{gain}"].to_numpy(float) for gain in ("alpha", "lambda"))
+            bound = np.full(len(frame), pilot["holdout_f_plus" if held_out else "f_plus"])
+            least = apply_elementwise(CONDITIONS["exact"].least_lambda, [alpha, bound])
+            for name, values in {"f_plus": bound, "margin_alpha": alpha / bound, "margin_exact": lambda_ / least}.items():
+                frame[f"{side}.{name}"] = np.where(frame["finite"], values, np.nan)
         return frame
 
 

@@ -74,9 +74,9 @@ def complete_study(data: JsonObject, record: Record, written: Config) -> JsonObj
     if "seeds" not in written.sweep.model_fields_set:
         data["sweep"]["seeds"] = 4  # what noise does shows only in several runs
     with suppress(InputError, NoResult):
-        config = read_config(data)
-        pilot = run_pilot(Scenarios(config, ["nominal"], {}), TuneTable())
-        tolerances = propose_tolerances(config, expect_errors(config, list(pilot)))
+        scenarios = Scenarios(read_config(data), ["nominal"], {})
+        pilot = run_pilot(scenarios, TuneTable())
+        tolerances = propose_tolerances(scenarios.config, expect_errors(scenarios, list(pilot)))
         data["run"] |= {key: value for key, value in tolerances.items() if key not in written.run.model_fields_set}
         if not written.axes and pilot["motor"]["f_plus"] > 0.0:
             data |= propose_map(pilot["motor"]["f_plus"])

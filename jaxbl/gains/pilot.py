@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -75,6 +76,15 @@ def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
     return Scenarios(
         read_config(data).model_copy(update={"uncertainty": config.uncertainty}), ["nominal", *names[1:]], columns
     )
+
+
+def list_axes(columns_by_label: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[dict[str, Any]]:
+    """List axes of a study from columns of values by path: those of one label advance together."""
+    return [
+        {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
+        for label, columns in columns_by_label.items()
+        for path, values in columns.items()
+    ]
 
 
 class _Extremes(NamedTuple):

@@ -142,18 +142,12 @@ class Summary:
             )
         for side in search.sides:
             pilot = search.pilot[side]
-            if pilot["starting_error_assumed"]:
-                lines.append(
-                    f"{side}: the study gives the observer no starting error, which a convergence time needs: it starts "
-                    f"with a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run, "
-                    f"but f⁺ = {search.f_plus[side]:.4g} rad/s² is the largest |acceleration - f(velocity)| of that run."
-                )
-            else:
-                lines.append(
-                    f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s², the larger of two numbers of the pilot run: the "
-                    f"largest |acceleration - f(velocity)| along it, {pilot['disturbance']:.4g}, and that at the start "
-                    f"with viscous friction times the starting error, {pilot['start']:.4g}."
-                )
+            assumed = "assumed " * pilot["starting_error_assumed"]
+            lines.append(
+                f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s². In the pilot run, |acceleration - f(velocity)| is at most "
+                f"{pilot['disturbance']:.4g}, and at the start, with viscous friction of the {assumed}starting error of "
+                f"{pilot['velocity_error']:.3g} rad/s, {pilot['start']:.4g}{', which does not count' * bool(assumed)}."
+            )
             lines += self._optimum_remarks(side)
         if table.holdout is None:
             lines.append(

@@ -71,11 +71,19 @@ def _find_standstills(values: np.ndarray, segment: slice) -> Iterator[slice]:
 
 
 def check_gear_ratio(
-    file: LogFile, table: LogTable, grid: Grid, gearing: Gearing | None, expected: float | None, tolerance: float, unit: str
+    file: LogFile,
+    table: LogTable,
+    grid: Grid,
+    gearing: Gearing | None,
+    expected: float | None,
+    tolerance: float,
+    unit: str,
+    shaft: NominalDrive | None,
 ) -> None:
     """Compare the ratio of both motions with the expected gear ratio, if there is one.
 
-    A ratio that is off by at most the relative `tolerance` gives a remark. `unit` is that of theta_e.
+    A ratio that is off by at most the relative `tolerance` gives a remark. `unit` is that of theta_e; `shaft` the drive, if
+    its stiffness is known.
 
     Raises:
         InputError: the ratio is further off; the message names the most likely mistake.
@@ -91,13 +99,28 @@ def check_gear_ratio(
     elif expected is not None and gearing.is_loose:
         _check_twist_range(file, unit, gearing, expected)
     elif expected is not None:
-        _check_ratio(file, table, gearing, expected, tolerance)
+        windup = 0.0 if shaft is None else _largest_windup(grid, shaft)
+        _check_ratio(file, table, gearing, expected, tolerance, windup)
 
 
-def _check_ratio(file: LogFile, table: LogTable, gearing: Gearing, expected: float, tolerance: float) -> None:
+_SLOW_SAMPLES = 10
+"""Samples over which the load's velocity is measured: noise counts for little, and motion is slow."""
+
+
+def _largest_windup(grid: Grid, shaft: NominalDrive) -> float:
+    """Return the share of its motion by which the load's inertia may wind the shaft up."""
+    load = grid.values["theta_s"]
+    velocity = (load[_SLOW_SAMPLES:] - load[:-_SLOW_SAMPLES]) / (_SLOW_SAMPLES * grid.period)
+    # inertia and stiffness of a rough fit may both be off by half
+    return 3.0 * shaft.load_inertia * float(velocity.var() / load.var()) / (shaft.gear_ratio**2 * shaft.stiffness)
+
+
+def _check_ratio(
+    file: LogFile, table: LogTable, gearing: Gearing, expected: float, tolerance: float, windup: float
+) -> None:
     relative_ratio = gearing.ratio / expected
     # 2 %: backlash and elasticity change the ratio of a short motion by as much
-    tolerated = max(0.02, 3.0 * gearing.residual, 5.0 * gearing.ratio_error / abs(expected))
+    tolerated = max(0.02, min(windup, 0.25), 3.0 * gearing.residual, 5.0 * gearing.ratio_error / abs(expected))
     if abs(relative_ratio - 1.0) <= tolerated:
         return
     likely_factor, mistake = min(_likely_mistakes(table, expected), key=lambda pair: abs(relative_ratio / pair[0] - 1.0))

@@ -209,13 +209,14 @@ def propose_study(
         raise InputError("--write proposes a drive; a transmission on a test rig has none, and needs only its [log]")
     table, guesses = guess_log_table(path) if log is None else (log, [])
     try:
-        inspection = inspect(path, table, gear_ratio=gear_ratio)
+        # a soft shaft changes the ratio of both motions: it is compared with gear_ratio once the stiffness is known
+        inspection = inspect(path, table)
     except InputError as error:
         if log is not None or "set sign = -1 in [log] u" not in str(error):
             raise
         table["u"]["sign"] = -1
         guesses.append("u is reversed: with its sign in the file the drive would accelerate against it.")
-        inspection = inspect(path, table, gear_ratio=gear_ratio)
+        inspection = inspect(path, table)
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
         rough = vars(_fit_nominal_drive(inspection, guesses, gear_ratio))
         nominal = NominalDrive(
@@ -224,7 +225,7 @@ def propose_study(
     else:
         guesses.append("The numbers of the drive are those of the model.")
     if math.isfinite(nominal.stiffness):
-        inspection = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
+        inspection = inspect(path, table, gear_ratio=gear_ratio or nominal.gear_ratio, nominal=nominal)
         for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
             if key in inspection.record.corrections:
                 name, _ = inspection.log.position_source(channel)

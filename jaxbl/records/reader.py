@@ -179,7 +179,7 @@ def read_record(
         _correct_offset(file, table, grid, channels, shaft)
     # the motion is compared with the drive
     if has_both_encoders:
-        check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit)
+        check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit, shaft)
     position, is_driven = grid.values[encoders[0]], is_drive and "u" in channels
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if is_driven else None
     if dynamics is not None:
