@@ -4,6 +4,7 @@ whose gap stays or grows; and how many samples a second it takes.
     python benchmarks/watch.py alarms [--runs 100]     # constant gaps, several noise levels
     python benchmarks/watch.py growth [--runs 10]      # gaps that double, at several rates
     python benchmarks/watch.py wrong [--runs 10]       # the model's inertias and frictions are off
+    python benchmarks/watch.py damping [--runs 10]     # the gear has damping, the model none
     taskset -c 0 python benchmarks/watch.py speed      # samples a second on one core, from memory and by UDP
 
 Drives: `sweeps/geared_axis.toml` (hard gap, dry friction on the load that the observers do not know) and
@@ -226,6 +227,30 @@ def compare_wrong_models(drives: list[str], runs: int, noise: float = 1e-4) -> N
             )
 
 
+def compare_damped_gears(drives: list[str], runs: int, noise: float = 1e-4) -> None:
+    """Compare gap and stiffness of gears with damping, which the model lacks, by side."""
+    print("| drive | damping (N m s/rad) | side | determined | half gap | 95 % interval holds it | stiffness | holds it |")
+    for name in drives:
+        model = study(name)
+        truths = half_gap_of(model), float(get_leaf(model.build(), "transmission.stiffness"))
+        for damping in (0.0, 0.05, 0.2):
+            effects = [*model.to_dict().get("effects", []), {"kind": "transmission.damping", "damping": damping}]
+            machine = read_config(model.to_dict() | {"effects": effects})
+            rows = simulate_rows(machine, np.ones(round(40.0 / model.run.sample_period)), np.arange(runs), noise)
+            watched = [watch_rows(model, [columns[i] for columns in rows], 10.0) for i in range(runs)]
+            for side in ("motor", "load"):
+                cells = []
+                for number, true in zip(("half_gap", "stiffness"), truths, strict=True):
+                    values, errors = (
+                        np.concatenate([columns[f"{side}.{number}{end}"] for columns in watched]) for end in ("", "_error")
+                    )
+                    finite = np.isfinite(values)
+                    inside = np.abs(values[finite] - true) <= INTERVAL * errors[finite]
+                    cells += [] if cells else [f"{100 * finite.mean():.0f} %"]
+                    cells += [f"{100 * (values[finite].mean() / true - 1.0):+.2g} %", f"{100 * inside.mean():.0f} %"]
+                print(f"| {name} | {damping:g} | {side} | " + " | ".join(cells) + " |", flush=True)
+
+
 def measure_speed(seconds: float = 20.0) -> None:
     """Samples a second on the cores that this process has: from memory, and by UDP from another thread at 10 kHz."""
     model = study("hard gap", run__sample_period=1e-4, run__substeps=1, run__duration=seconds)
@@ -283,14 +308,18 @@ def by_udp(form: str, rows: list[bytes], model: Config) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("alarms", "growth", "wrong", "speed"))
+    functions = {
+        "alarms": (alarms, 100), "growth": (growth, 10), "wrong": (compare_wrong_models, 10),
+        "damping": (compare_damped_gears, 10),
+    }  # fmt: skip
+    parser.add_argument("what", choices=(*functions, "speed"))
     parser.add_argument("--runs", type=int, default=None)
     parser.add_argument("--drive", choices=STUDIES, help="left out: both")
     args = parser.parse_args()
     if args.what == "speed":
         measure_speed()
     else:
-        function, runs = {"alarms": (alarms, 100), "growth": (growth, 10), "wrong": (compare_wrong_models, 10)}[args.what]
+        function, runs = functions[args.what]
         function([args.drive] if args.drive else [*STUDIES], args.runs or runs)
 
 

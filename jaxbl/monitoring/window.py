@@ -7,7 +7,8 @@ without which the numbers of a real drive would be wrong:
 - The observers' torque holds what the nominal model lacks beside the law. Columns sign(v), v and 1 take Coulomb friction, an
   error of the viscous one, and a constant torque of the side. Here v are slopes of cubics through the readings around each
   sample (Savitzky-Golay): observers cannot look ahead, and the noise of their velocities makes friction look smaller.
-- A column -dC/dz takes the zero of the twist, as two encoders seldom count from the same one.
+- A column -dC/dz takes the zero of the twist, as two encoders seldom count from the same one, and the rate of the
+  elastic deflection the damping of the gear, which would pass for a part of the gap.
 - The law is taken at the numbers that the window itself gives, in a few iterations. With a hard dead zone,
   C = K (z - b sign z) in contact, its regression is the Gauss-Newton step of the least squares in K and b.
 
@@ -77,7 +78,8 @@ def _sum_blocks(
     slope = jax.vmap(jax.grad(lambda z: law.torque(law.deflection(z))))(twist)
     ones_column = jnp.ones_like(twist)
     friction = [-column / gain for column in (jnp.sign(velocity), velocity, ones_column)]
-    columns = [*law.regressors(twist), *friction, -slope]
+    damping = jax.jvp(law.deflection, (twist,), (rows["rate"],))[1]
+    columns = [*law.regressors(twist), damping, *friction, -slope]
     raw = jnp.stack(columns, axis=1)
 
     def advance(filtered: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -156,10 +158,11 @@ class Window:
         # the filter of the regressors begins with the window; velocities at its end lack the readings after it
         counts[: max(math.ceil(SETTLING * self._constant / self._period), self._half)] = 0.0
         counts[-self._half :] = 0.0
-        estimates = {}
+        estimates, twist = {}, self._rows["twist"]
         for side in self._experiment.sides:
             velocity = savitzky_golay_slopes(self._rows[f"{side}.position"], self._half) / self._period
-            rows = {"twist": self._rows["twist"], "torque": self._rows[f"{side}.torque"], "velocity": velocity}
+            rows = {"twist": twist, "rate": savitzky_golay_slopes(twist, self._half) / self._period, "velocity": velocity}
+            rows["torque"] = self._rows[f"{side}.torque"]
             side_numbers = self._estimate_side(side, rows | {"counts": counts})
             if side_numbers is not None:
                 estimates[side] = side_numbers
@@ -211,7 +214,7 @@ class Window:
         return numbers if numbers["stiffness"].value > 0.0 else None
 
     def _name_coefficients(self, side: str, law: AbstractTransmission, theta: np.ndarray) -> dict[str, float]:
-        *law_coefficients, coulomb, viscous, _, zero = (float(coefficient) for coefficient in theta)
+        *law_coefficients, _, coulomb, viscous, _, zero = (float(coefficient) for coefficient in theta)
         law_theta = tuple(map(np.float64, law_coefficients))
         law_numbers = {name: float(value) for name, value in law.from_theta(law_theta).items()}  # type: ignore[arg-type]
         nominal = float(self._experiment.drive.viscous(side))  # type: ignore[attr-defined]

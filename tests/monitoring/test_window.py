@@ -42,7 +42,12 @@ def simulate_motion(count):
     return time, twist, RATIO * load + twist, load
 
 
-def observer_rows(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
+def damping_torque(twist, damping, half_gap, zero):
+    in_contact = np.abs(twist - zero) > half_gap
+    return damping * in_contact * np.gradient(twist, PERIOD, edge_order=2)
+
+
+def observer_rows(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0, damping=0.0):
     """Rows of observers without an error, for a drive with known numbers; its model knows half of the friction."""
     time, twist, motor, load = simulate_motion(count)
     speeds = {"motor": np.gradient(motor, time, edge_order=2), "load": np.gradient(load, time, edge_order=2)}
@@ -50,7 +55,8 @@ def observer_rows(count=10_000, half_gap=HALF_GAP, noise=0.0, seed=0):
     rows = {"twist": twist, "motor.position": motor, "load.position": load}
     for side, friction, nominal, gain in (("motor", MOTOR, 0.15, 1.0), ("load", LOAD, 16.0, -1.0 / RATIO)):
         extra = friction["coulomb"] * np.sign(speeds[side]) + (friction["viscous"] - nominal) * speeds[side]
-        torque = hinge_torque(twist, STIFFNESS, half_gap, ZERO) + gain * extra + (PUSH if side == "motor" else 0.0)
+        torque = hinge_torque(twist, STIFFNESS, half_gap, ZERO) + damping_torque(twist, damping, half_gap, ZERO)
+        torque += gain * extra + (PUSH if side == "motor" else 0.0)
         rows[f"{side}.torque"] = filter_late(torque) + noise * draws.standard_normal(count)
     return rows
 
@@ -61,10 +67,13 @@ def fill_window(rows, data=None, seconds=10.0):
     return window
 
 
-@pytest.mark.parametrize("half_gap", [0.5 * HALF_GAP, HALF_GAP, 1.5 * HALF_GAP])
-def test_the_numbers_that_rows_were_made_of(half_gap):
-    """Also where the model's half gap is another one, with an offset of the twist, friction and a constant torque."""
-    estimate = fill_window(observer_rows(half_gap=half_gap)).estimate()
+@pytest.mark.parametrize(
+    ("half_gap", "damping"), [(0.5 * HALF_GAP, 0.0), (HALF_GAP, 0.0), (1.5 * HALF_GAP, 0.0), (HALF_GAP, 0.5)]
+)
+def test_the_numbers_that_rows_were_made_of(half_gap, damping):
+    """Also where the model's half gap is another one, with an offset of the twist, friction, a constant torque, and damping
+    of the gear that the model lacks."""
+    estimate = fill_window(observer_rows(half_gap=half_gap, damping=damping)).estimate()
     for side, friction in (("motor", MOTOR), ("load", LOAD)):
         numbers = estimate[side].numbers
         assert numbers["half_gap"].value == pytest.approx(half_gap, rel=1e-4)
@@ -87,11 +96,14 @@ def test_the_same_as_a_fit_by_scipy():
     selected[:100] = selected[-20:] = False
 
     def residual(x):
-        stiffness, half_gap, zero, coulomb, viscous, push = x
+        stiffness, half_gap, zero, coulomb, viscous, push, damping = x
         torque = hinge_torque(twist, stiffness, half_gap, zero) + coulomb * np.sign(speed) + (viscous - 0.15) * speed + push
+        torque += damping_torque(twist, damping, half_gap, zero)
         return (filter_late(torque) - rows["motor.torque"])[selected]
 
-    fit = least_squares(residual, [55.0, 0.07, 0.0, 0.1, 0.1, 0.0], x_scale=[60, 0.1, 0.01, 0.1, 0.1, 0.1], xtol=1e-14)
+    fit = least_squares(
+        residual, [55.0, 0.07, 0.0, 0.1, 0.1, 0.0, 0.1], x_scale=[60, 0.1, 0.01, 0.1, 0.1, 0.1, 0.1], xtol=1e-14
+    )
     for name, value in zip(("stiffness", "half_gap", "_", "coulomb", "viscous"), fit.x, strict=False):
         if name != "_":
             # the constant torque is held at zero a little, velocities are of other readings
