@@ -280,6 +280,8 @@ def items_by_name() -> dict[str, list[tuple[str, Item]]]:
     return items
 
 
+_OBSERVERS = ["super_twisting", "differentiator_3", "kalman"]
+"""Kinds that a first study is compared for: the usual one, one for motion that is not known, one for noise."""
 _UNCERTAINTY = 0.1
 """Relative uncertainty of a data sheet's numbers: they hold for a series, and depend on temperature and load."""
 _HARMONICS, _PERIODS = 6, 5
@@ -320,13 +322,10 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(_parse_toml(text) | {"observer": observers})
-        nominal = Scenarios(config, ["nominal"], {})
-        largest = expect_errors(list_scenarios(config, table), list(gains))
-        pilot_metrics["motor"]["expected"] = expect_errors(nominal, ["motor"])["motor"]._asdict() | {
-            "largest": largest["motor"].velocity
-        }
-        gain_map = propose_map(run_pilot(nominal, table)["motor"]["f_plus"])
-        tolerances = propose_tolerances(config, largest)
+        expected = expect_errors(list_scenarios(config, table), list(gains))
+        pilot_metrics["motor"]["expected"] = expected["motor"]._asdict()
+        gain_map = propose_map(run_pilot(Scenarios(config, ["nominal"], {}), table)["motor"]["f_plus"])
+        tolerances = propose_tolerances(config, expected)
         text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances, gain_map)
         read_config(_parse_toml(text))
     except InputError as error:
@@ -535,11 +534,41 @@ def describe_expectation(kind: DriveKind, pilot_metrics: JsonObject) -> str:
     """Describe in a sentence the error that the motor's observer will have, and what it is due to."""
     expected, unit = pilot_metrics["motor"]["expected"], kind.unit("motor", "rad")
     causes = ", ".join(f"{100 * share:.2g} % {cause}" for cause, share in expected["shares"].items())
-    error = f"{expected['velocity']:.2g} {unit}/s of velocity error (rms)"
-    return (
-        f"Expect about {error} of the motor with the study's gains, and {expected['largest']:.2g} where numbers are off by "
-        f"{100.0 * _UNCERTAINTY:g} %; shares of its square: {causes}."
-    )
+    error = f"{expected['velocity']:.2g} {unit}/s of velocity error (rms) of the motor with the study's gains"
+    worst = f"{expected['largest_velocity']:.2g} where numbers are off by {100.0 * _UNCERTAINTY:g} %"
+    return f"Expect about {error}, and {worst}; shares of its square: {causes}."
+
+
+def compare_observers(kind: DriveKind, text: str) -> tuple[str, str]:
+    """Compare super-twisting with other observers on a study, each with the gains that suit it best.
+
+    Args:
+        kind: of the drive.
+        text: the study, which says that tune uses another input, and drives within its uncertainty.
+
+    Returns:
+        A sentence on their errors, and the study with the best observer behind it, as a comment.
+    """
+    import tomli_w
+
+    from .gains.tune import tune
+
+    study = _parse_toml(text)
+    # one search of each kind, on the study's own input: each further program takes seconds to compile
+    study["tune"] = {"observers": _OBSERVERS, "trials": 128, "refine": 0, "worst_over_uncertainty": True}
+    choice = tune(study).summary
+    sides, best = choice["points"][0]["sides"], choice["for_both_sides"]
+    units = ", ".join(f"{kind.unit(side, 'rad')}/s of the {side}" for side in sides)
+    ranks = {name: [summary["kinds"][name]["error"] for summary in sides.values()] for name in _OBSERVERS}
+    errors = "; ".join(f"{name} {', '.join(f'{error:.2g}' for error in ranks[name])}" for name in ranks)
+    sentence = f"Velocity errors of observers with the gains that suit each best ({units}): {errors}."
+    gains = {
+        side: {key: float(_format_number(value, 3)) for key, value in summary["kinds"][best]["gains"].items()}
+        for side, summary in sides.items()
+    }
+    table = tomli_w.dumps({"observer": {"kind": best} | gains})
+    lines = [sentence, f"In place of [observer] above, for {best}:", *table.strip().splitlines()]
+    return sentence, text + "\n" + "".join(f"# {line}".rstrip() + "\n" for line in lines)
 
 
 def describe_obstacle(pilot_metrics: JsonObject) -> str:

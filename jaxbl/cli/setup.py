@@ -12,6 +12,7 @@ from jaxbl.datasheet import (
     NONE,
     Answer,
     Item,
+    compare_observers,
     describe_expectation,
     describe_obstacle,
     items_by_name,
@@ -73,6 +74,8 @@ def init(
     workers.start_jax()
     with show_task(context, "running a pilot for the gains"):
         text, pilot_metrics = write_first_study(KINDS[name], values, title or file.stem)
+    with show_task(context, "comparing observers"):
+        comparison, text = compare_observers(KINDS[name], text)
     check_new(file, "init")
     write_atomic(file, text)
     bounds = {side: item["f_plus"] for side, item in pilot_metrics.items()}
@@ -80,6 +83,7 @@ def init(
     lines = [
         f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
         describe_expectation(KINDS[name], pilot_metrics),
+        comparison,
         *([obstacle] if (obstacle := describe_obstacle(pilot_metrics)) else []),
     ]
     data = {

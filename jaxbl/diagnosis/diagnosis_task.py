@@ -10,11 +10,10 @@ from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
 from jaxbl.identification.segments import led_in
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
+from jaxbl.records.plausibility import GEAR_TOLERANCE
 
 HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
-GEAR_TOLERANCE = 0.25
-"""A missing effect (a soft shaft, a gap) shifts the ratio of both motions, on a short log by a fifth."""
 _LEAST_SAMPLES = 100
 """Samples of a part of a log, and of what is held out: the smoother's ends, some ten samples each, are then a small part."""
 _ALIKE = 4.0
@@ -41,7 +40,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
         InputError: unfit log or study, or a hold-out log of another machine.
     """
     config, missing = read_model(model)
-    record, other = read_with_holdout(config, log, holdout, GEAR_TOLERANCE)
+    record, other = read_with_holdout(config, log, holdout)
     if other is None:
         record, other = split_off_last_quarter(record)
     else:

@@ -37,7 +37,7 @@ class Causes(NamedTuple):
         # without a disturbance the error may be larger by chance
         squares = np.minimum.accumulate(np.square(errors))
         with np.errstate(invalid="ignore", divide="ignore"):
-            shares = np.append(-np.diff(squares), squares[-1]) / squares[0]
+            shares = np.append(np.abs(np.diff(squares)), squares[-1]) / squares[0]
         return errors[0], dict(zip([*self.names, "period"], map(float, shares), strict=True))
 
 
@@ -57,21 +57,23 @@ def list_causes(config: Config) -> Causes:
 
 
 class ExpectedError(NamedTuple):
-    """The error of an observer in a run of a study.
+    """The errors of an observer in runs of a study: rms over the last quarter, the worst of the noise seeds.
 
     Attributes:
-        velocity: rms over the last quarter of the run, rad/s; the worst of the noise seeds.
-        position: the same of the position, rad.
-        shares: share of each cause in the square of `velocity`.
+        velocity: of the first of the drives, rad/s.
+        shares: share of each cause in its square.
+        largest_velocity: of all drives, rad/s.
+        largest_position: of all drives, rad.
     """
 
     velocity: float
-    position: float
     shares: dict[str, float]
+    largest_velocity: float
+    largest_position: float
 
 
 def expect_errors(scenarios: Scenarios, sides: Sequence[str], seeds: int = 4) -> dict[str, ExpectedError]:
-    """Expect the largest errors of a study's observers, by side, from runs of drives with the study's own gains.
+    """Expect the errors of a study's observers, by side, from runs of drives with the study's own gains.
 
     Raises:
         InputError: the study cannot run.
@@ -81,9 +83,14 @@ def expect_errors(scenarios: Scenarios, sides: Sequence[str], seeds: int = 4) ->
         data.pop(key, None)
     data["axes"] = list_axes({"scenario": scenarios.columns, "causes": causes.columns})
     result = sweep(read_config(data | {"sweep": {"seeds": seeds}}))
-    frame = result.read([*causes.columns, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
-    expected = {}
-    for side in sides:
-        velocity, shares = causes.split(frame, f"{side}.velocity_rmse")
-        expected[side] = ExpectedError(velocity, causes.split(frame, f"{side}.position_rmse")[0], shares)
-    return expected
+    paths = [*scenarios.columns, *causes.columns]
+    frame = result.read([*paths, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
+    is_first = [(frame[path] == values[0]).to_numpy() for path, values in scenarios.columns.items()]
+    first = frame.loc[np.logical_and.reduce([np.ones(len(frame), bool), *is_first])]
+    return {
+        side: ExpectedError(
+            *causes.split(first, f"{side}.velocity_rmse"),
+            *(causes.split(frame, f"{side}.{name}_rmse")[0] for name in ("velocity", "position")),
+        )
+        for side in sides
+    }

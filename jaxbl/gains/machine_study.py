@@ -37,7 +37,7 @@ def propose_tolerances(config: Config, expected: dict[str, ExpectedError]) -> di
     ratios = {side: config.drive.gear_ratio if side == "load" else 1.0 for side in expected}
     return {
         f"{name}_tolerance": _round(
-            TOLERANCE_FACTOR * max(ratio * getattr(expected[side], name) for side, ratio in ratios.items())
+            TOLERANCE_FACTOR * max(ratio * getattr(expected[side], f"largest_{name}") for side, ratio in ratios.items())
         )
         for name in ("velocity", "position")
     }

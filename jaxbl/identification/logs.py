@@ -80,8 +80,8 @@ _NEAR = 1e-2
 """Relative difference of the sampling periods of a log and what is held out that changes no result."""
 
 
-def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Record | None = None) -> Record:
-    """Read logs as a study says, with the channels that its drive needs; `gear_tolerance` as of `read_record`.
+def read_logs(config: Config, logs: Logs, like: Record | None = None) -> Record:
+    """Read logs as a study says, with the channels that its drive needs.
 
     A skew and an offset between the encoders that one log of a machine is sure of hold for those that are not: that of
     the first such log, or of the record that they are to be `like`. Logs are read at the longest of their sampling periods,
@@ -90,13 +90,11 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    records = [
-        _checked(config, one) if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several
-    ]
+    records = [_checked(config, one) if isinstance(one, Record) else _read_one(config, one) for one in several]
     config = _at_one_period(config, records, like)
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
         if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
-            records[i] = _read_one(config, log, gear_tolerance)
+            records[i] = _read_one(config, log)
     known: dict[str, float] = {}
     for one in [*reversed(records)] if like is None else [like]:
         known |= one.corrections
@@ -110,7 +108,7 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
             if key in given and (key in record.corrections or key != "offset")
         }
         if not isinstance(log, Record) and given != record.corrections:
-            again = _read_one(_corrected(config, given), log, gear_tolerance)
+            again = _read_one(_corrected(config, given), log)
             # the reader counts what [log] gives as no correction of its own
             records[i] = replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
@@ -134,18 +132,16 @@ def _at_one_period(config: Config, records: Sequence[Record], like: Record | Non
     return config.with_keys("log", resample=longest)
 
 
-def read_with_holdout(
-    config: Config, logs: Logs, holdout: Logs | None, gear_tolerance: float = 0.0
-) -> tuple[Record, Record | None]:
+def read_with_holdout(config: Config, logs: Logs, holdout: Logs | None) -> tuple[Record, Record | None]:
     """Logs and what is held out, both at the longest of their sampling periods; as :func:`read_logs`."""
-    record = read_logs(config, logs, gear_tolerance)
+    record = read_logs(config, logs)
     if holdout is None:
         return record, None
-    other = read_logs(config, holdout, gear_tolerance, like=record)
+    other = read_logs(config, holdout, like=record)
     if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
         config = config.with_keys("log", resample=other.sample_period)
-        record = read_logs(config, logs, gear_tolerance)
-        other = read_logs(config, holdout, gear_tolerance, like=record)
+        record = read_logs(config, logs)
+        other = read_logs(config, holdout, like=record)
     check_positions(record, other)
     return record, other
 
@@ -190,10 +186,10 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     return config.model_copy(update={"log": table})
 
 
-def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
+def _read_one(config: Config, log: str | Path) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
-    return _checked(config, read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal))
+    return _checked(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal))
 
 
 def _checked(config: Config, record: Record) -> Record:

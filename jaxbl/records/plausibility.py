@@ -70,19 +70,22 @@ def _find_standstills(values: np.ndarray, segment: slice) -> Iterator[slice]:
     )
 
 
+GEAR_TOLERANCE = 0.25
+"""A missing effect (a soft shaft, a gap) shifts the ratio of both motions, on a short log by a fifth."""
+
+
 def check_gear_ratio(
     file: LogFile,
     table: LogTable,
     grid: Grid,
     gearing: Gearing | None,
     expected: float | None,
-    tolerance: float,
     unit: str,
     shaft: NominalDrive | None,
 ) -> None:
     """Compare the ratio of both motions with the expected gear ratio, if there is one.
 
-    A ratio that is off by at most the relative `tolerance` gives a remark. `unit` is that of theta_e; `shaft` the drive, if
+    A ratio that is off by at most `GEAR_TOLERANCE` puts the log in doubt. `unit` is that of theta_e; `shaft` the drive, if
     its stiffness is known.
 
     Raises:
@@ -100,7 +103,7 @@ def check_gear_ratio(
         _check_twist_range(file, unit, gearing, expected)
     elif expected is not None:
         windup = 0.0 if shaft is None else _largest_windup(grid, shaft)
-        _check_ratio(file, table, gearing, expected, tolerance, windup)
+        _check_ratio(file, table, gearing, expected, windup)
 
 
 _SLOW_SAMPLES = 10
@@ -115,21 +118,19 @@ def _largest_windup(grid: Grid, shaft: NominalDrive) -> float:
     return 3.0 * shaft.load_inertia * float(velocity.var() / load.var()) / (shaft.gear_ratio**2 * shaft.stiffness)
 
 
-def _check_ratio(
-    file: LogFile, table: LogTable, gearing: Gearing, expected: float, tolerance: float, windup: float
-) -> None:
+def _check_ratio(file: LogFile, table: LogTable, gearing: Gearing, expected: float, windup: float) -> None:
     relative_ratio = gearing.ratio / expected
     # 2 %: backlash and elasticity change the ratio of a short motion by as much
-    tolerated = max(0.02, min(windup, 0.25), 3.0 * gearing.residual, 5.0 * gearing.ratio_error / abs(expected))
+    tolerated = max(0.02, min(windup, GEAR_TOLERANCE), 3.0 * gearing.residual, 5.0 * gearing.ratio_error / abs(expected))
     if abs(relative_ratio - 1.0) <= tolerated:
         return
     likely_factor, mistake = min(_likely_mistakes(table, expected), key=lambda pair: abs(relative_ratio / pair[0] - 1.0))
     if abs(relative_ratio / likely_factor - 1.0) > tolerated:
         mistake = "gear_ratio, or a unit in [log], is wrong"
     comparison = f"theta_e moves {gearing.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
-    if abs(relative_ratio - 1.0) <= tolerance:
-        file.notes.append(
-            f"{comparison}: effects that the model leaves out may cause this, or gear_ratio is a little wrong."
+    if abs(relative_ratio - 1.0) <= GEAR_TOLERANCE:
+        file.warnings.append(
+            f"{DOUBT}{comparison}: wind-up of a soft shaft may cause this, or gear_ratio is a little wrong."
         )
         return
     if gearing.residual < 0.05:

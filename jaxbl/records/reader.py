@@ -135,7 +135,6 @@ def read_record(
     log: LogTable | Mapping[str, Any] | None = None,
     *,
     gear_ratio: float | None = None,
-    gear_tolerance: float = 0.0,
     nominal: NominalDrive | None = None,
 ) -> Record:
     """Read a measured log.
@@ -147,7 +146,6 @@ def read_record(
         path: CSV or other text, Parquet, MATLAB (.mat up to 7.3), or JSON file.
         log: the `[log]` table of a study, or its keys; if left out, columns t, u, theta_e, theta_s in s, N m, rad, rad.
         gear_ratio: expected ratio of motor over load motion, which is compared with that of the log.
-        gear_tolerance: relative deviation of the ratio up to which the log is read with a note in place of an error.
         nominal: nominal drive of the log. It is needed to correct a skew and an offset between the encoders that no
             friction or gap can cause, if the `[log]` table does not give them.
 
@@ -179,7 +177,7 @@ def read_record(
         _correct_offset(file, table, grid, channels, shaft)
     # the motion is compared with the drive
     if has_both_encoders:
-        check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit, shaft)
+        check_gear_ratio(file, table, grid, gearing, gear_ratio, channels["theta_e"].unit, shaft)
     position, is_driven = grid.values[encoders[0]], is_drive and "u" in channels
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if is_driven else None
     if dynamics is not None:

@@ -130,7 +130,7 @@ def test_what_is_printed_is_proven(certified_gains, change):
     certificate_data["assumptions"] = certified_gains["assumptions"] | arguments
     summary = {"certificates": {"motor": certificate_data}, "passed_over": {"motor": 0}}
     line = certificate_lines(summary)[0]
-    accuracy, time, final, noise, f_plus, period, velocity, position = map(
+    accuracy, time, final, end, noise, f_plus, period, velocity, position = map(
         float, re.findall(r"[\d.]+(?:e-\d+)?(?= |\.$)", line)
     )
     assert period == certified_gains["assumptions"]["period"]
@@ -138,9 +138,10 @@ def test_what_is_printed_is_proven(certified_gains, change):
     assert table.columns == ["", "motor"]
     row = dict(table.rows)
     for value, other, printed in (
-        (certificate_data["accuracy"], "accuracy (rad/s)", accuracy),
-        (certificate_data["reaching_time"], "kept from (s)", time),
-        (certificate_data["final_accuracy"], "in the end (rad/s)", final),
+        (certificate_data["accuracy"], "promised accuracy (rad/s)", accuracy),
+        (certificate_data["reaching_time"], "promised from (s)", time),
+        (certificate_data["final_accuracy"], "proven later (rad/s)", final),
+        (certificate_data["curve"]["time"][-1], "that from (s)", end),
     ):
         assert value * (1.0 - 1e-12) <= printed == float(f"{row[other]:.4g}") <= 1.001 * value
     for name, other, printed in (
@@ -221,8 +222,8 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, tuned_st
     assert (arguments["velocity_error"], arguments["position_error"], arguments["period"]) == (0.1, arguments["noise"], 1e-3)
     assert certificate_data == certify(gains["lambda"], gains["alpha"], **arguments, runs=1)
     lines = write_tune_report(tuned, tmp_path)
-    assert any(line.startswith("motor, proven: velocity error at most ") for line in lines)
-    assert any("none violates what is proven" in line for line in lines)
+    assert any(line.startswith("motor, promised: a velocity error of at most ") for line in lines)
+    assert any("not more than the" in line for line in lines)
     stored = json.loads((tmp_path / "certificate.json").read_text())
     assert stored["sides"] == {"motor": certificate_data}
     # the runs that were certified stay below
