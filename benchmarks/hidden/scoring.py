@@ -250,8 +250,10 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "rough_line": rate(rough, lambda case_outcome: case_outcome.says_rough),
         "rough_step": rate(rough, lambda case_outcome: case_outcome.sends_to_identify),
         "rough_identified": rate(
-            [case_outcome for case_outcome in rough if case_outcome.identified],
-            lambda case_outcome: case_outcome.worst_identified[1] <= case_outcome.conditions["uncertainty"],
+            rough,
+            lambda case_outcome: (
+                bool(case_outcome.identified) and case_outcome.worst_identified[1] <= case_outcome.conditions["uncertainty"]
+            ),
         ),
         "rough_error": number(errors),
         "rough_worst": {"value": max(errors), "count": len(errors)} if errors else None,
