@@ -7,6 +7,7 @@ extra `bench`) 100 cases take a quarter of a CPU minute to draw; without it, in 
     python benchmarks/hidden_effects.py --seed 1 --count 66 --kind single          # all effects at 3, 10 and 30 %
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --out results/hidden
     python benchmarks/hidden_effects.py --seed 1 --count 100 --kind clutter --out results/clutter
+    python benchmarks/hidden_effects.py --seed 1 --count 20 --kind rough --out results/rough   # nothing is missing
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --save results/cases    # logs and models as files
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --results results/diagnosed   # what a batch left
 """
@@ -21,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hidden.cases import ALONE, KINDS, Case, Log, cases, save
+from hidden.cases import ALONE, KINDS, Case, Log, cases, plant_numbers, save
 from hidden.scoring import Diagnose, Oracle, Outcome, markdown, outcome, prove, run, write
 from hidden.simulator import engine
 
@@ -41,6 +42,21 @@ def _files(logs: Sequence[Log], holdout: Log, folder: Path) -> tuple[list[Path],
     return paths, folder / "holdout.csv"
 
 
+def _first_advice(
+    logs: Sequence[Path], model: Mapping[str, Any], holdout: Path, diagnosis: Mapping[str, Any]
+) -> dict[str, str]:
+    """The first line that `jaxbl diagnose` prints, after warnings about the log, and the first command that it proposes."""
+    from jaxbl.cli.next_steps import LogCall, after_diagnosis
+    from jaxbl.diagnosis.diagnose import read_diagnosis_task
+    from jaxbl.report.diagnose import diagnosis_lines
+
+    task = read_diagnosis_task(list(logs), model, holdout=holdout)
+    log_call = LogCall(list(logs), Path("model.toml"), holdout, None)
+    steps = after_diagnosis(task, dict(diagnosis), ["diagnose", *map(str, log_call.words())], Path("diagnosed"), log_call)
+    lines = [line for line in diagnosis_lines(dict(diagnosis)) if line not in diagnosis["warnings"]]
+    return {"first_line": lines[0], "next_step": steps[0].command}
+
+
 def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapping[str, Any]:
     """`jaxbl.diagnose`."""
     import jaxbl
@@ -50,7 +66,8 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files(logs, holdout, Path(folder))
         diagnosis = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)
-    return {**diagnosis.summary, "model": diagnosis.model.to_dict()}
+        advice = _first_advice(paths, model, other, diagnosis.summary)
+    return {**diagnosis.summary, **advice, "model": diagnosis.model.to_dict()}
 
 
 def oracle(case: Case) -> Mapping[str, float]:
@@ -71,6 +88,20 @@ def oracle(case: Case) -> Mapping[str, float]:
         return setup.holdout.compare(fitted.experiment).errors
 
 
+def identify(case: Case) -> dict[str, tuple[float, float]]:
+    """Relative error of each number by `jaxbl.identify` from the case's log and model, and the standard error it states."""
+    import jaxbl
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths, _ = _files([case.log], case.holdout, Path(folder))
+        parameters = jaxbl.identify(paths[0], case.model).summary["parameters"]
+    return {
+        path: (parameters[path]["value"] / true - 1.0, parameters[path]["standard_error"] / abs(true))
+        for path, true in plant_numbers(case.oracle).items()
+        if path in case.truth["offsets"]
+    }
+
+
 def read_outcomes(hidden_cases: Sequence[Case], folder: Path) -> list[Outcome]:
     """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json, and model.toml beside it, for each case."""
     outcomes, models = [], []
@@ -80,8 +111,14 @@ def read_outcomes(hidden_cases: Sequence[Case], folder: Path) -> list[Outcome]:
         diagnosis = json.loads(path.read_text(encoding="utf-8")) if exists else {}
         if exists and (path.parent / "model.toml").exists():
             diagnosis["model"] = tomllib.loads((path.parent / "model.toml").read_text(encoding="utf-8"))
+        if exists and case.kind == "rough":
+            with tempfile.TemporaryDirectory() as logs:
+                paths, other = _files([case.log], case.holdout, Path(logs))
+                diagnosis |= _first_advice(paths, case.model, other, diagnosis)
         models.append(diagnosis.get("model"))
         outcomes.append(outcome(case, diagnosis, error="" if exists else f"{path}: no such file"))
+        if case.kind == "rough":
+            outcomes[-1].identified = identify(case)
     prove(hidden_cases, outcomes, models)
     return outcomes
 
@@ -117,7 +154,7 @@ def main() -> None:
         if asked.diagnose:
             module, _, function = asked.diagnose.partition(":")
             diagnose, best = getattr(importlib.import_module(module), function), None
-        outcomes = run(hidden_cases, diagnose, best, asked.jobs)
+        outcomes = run(hidden_cases, diagnose, best, asked.jobs, identify)
     heading = f"Seed {asked.seed}, {len(hidden_cases)} cases, {asked.kind}"
     print(markdown(outcomes, heading))
     if asked.out is not None:

@@ -9,6 +9,8 @@ Conditions of `single`, `pairs`, `none`, `unknown`: 10-20 s, 1 kHz or 500 Hz, th
 off by 1-3 %, a quarter with 1 % noise on the torque channel; `new` as `single`, with the effects that the package has learnt
 since (`all` is without them); `clutter` as `single`, with a little cogging and a random torque besides. `hard` are single
 effects with at least three of: closed loop, 3 s, coarse encoders, numbers off by 4-6 %, 1-3 % noise on the torque channel.
+`rough` as `none`, on the geared plants: every nominal number is off by what data sheets are off by (`ROUGH`), at least three
+times the 2 % that the model states.
 Three in ten machines have another effect that the nominal model knows.
 """
 
@@ -24,10 +26,23 @@ from .effects import EFFECTS, LEVELS, NEW, UNKNOWN, Motion, draw, error_of, excl
 from .simulator import Machine, Run, Trace, simulate
 
 KINDS = ("single", "pairs", "none", "unknown", "hard")
-ALONE = ("new", "clutter")
-"""Kinds that `all` leaves out: the effects of :data:`.effects.NEW`, as `single`; and `single` with clutter beside it."""
+ALONE = ("new", "clutter", "rough")
+"""Kinds that `all` leaves out: the effects of :data:`.effects.NEW`, as `single`; `single` with clutter beside it; and models
+that lack nothing, with rough numbers."""
 _CLUTTER = 0.002, 0.006
 """Least and largest size of clutter, as a share of the driving torque's rms: above what may be named, below what matters."""
+ROUGH = {
+    "inertia": (0.06, 0.2),
+    "viscous": (0.2, 0.5),
+    "torque": (0.2, 0.5),
+    "stiffness": (0.2, 0.4),
+    "half_gap": (0.2, 0.4),
+    "dead_zone": (0.2, 0.4),
+    "slope": (0.2, 0.4),
+}
+"""Last word of a number's name -> least and largest relative error of `rough`, of either sign."""
+_STATED = 0.02
+"""Relative uncertainty that the models of `rough` state: the package's default."""
 EXCITATIONS = ("sine", "multisine", "chirp", "steps")
 
 _PLANTS: dict[str, dict[str, Any]] = {
@@ -77,6 +92,7 @@ _PLANTS: dict[str, dict[str, Any]] = {
 }
 """Tables, rms torque (N m), frequency of excitation (Hz), bandwidth of the loop (rad/s), share of machines with a gap."""
 PLANTS = tuple(_PLANTS)
+GEARED = tuple(name for name, ranges in _PLANTS.items() if ranges["drive"]["kind"] == "two_inertia")
 
 _LEAST_MOTION, _LEAST_SEEN = 0.25, 4.0
 """A case is drawn again where the hidden effect leaves less than this share of the motion (the drive sticks), or changes
@@ -112,10 +128,12 @@ class Case:
     Attributes:
         name: kind, seed and number.
         kind: one of `KINDS` or `ALONE`.
-        truth: `verdict` (as in diagnosis.json), `effects` (name -> parameters; empty, or the unknown effect), `sizes`
-            (name -> share of the driving torque's rms), `clutter` (names of small effects besides), `level` asked for (the
-            largest of a pair), `seen` (change of what the encoders read over their noise), `growth` (change of the motor
-            position for one of 1 rad/s in the initial speed, s; thousands mean that a free run cannot be foretold).
+        truth: `verdict` (as in diagnosis.json; of `rough` it is `rough_numbers`, which the package does not say yet),
+            `effects` (name -> parameters; empty, or the unknown effect), `sizes` (name -> share of the driving torque's
+            rms), `clutter` (names of small effects besides), `offsets` (dotted path -> relative error of the nominal
+            number), `level` asked for (the largest of a pair), `seen` (change of what the encoders read over their noise),
+            `growth` (change of the motor position for one of 1 rad/s in the initial speed, s; thousands mean that a free
+            run cannot be foretold).
         conditions: plant, excitation, holdout (its excitation), loop, period, duration, initial_state, uncertainty, ...
         log, holdout: of the same machine, under two excitations.
         model: nominal study for the package, as plain data (no excitation, no observer).
@@ -198,8 +216,10 @@ def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[st
     def plants(effects: Iterable[str]) -> list[str]:
         return [plant for plant in PLANTS if plant != "direct" or all(on_rigid(effect) for effect in effects)]
 
-    if kind == "none":
-        return [(PLANTS[i % len(PLANTS)], ()) for i in range(count)]
+    if kind in ("none", "rough"):
+        # two numbers of a rigid drive that are off are a pair of effects
+        possible = PLANTS if kind == "none" else GEARED
+        return [(possible[i % len(possible)], ()) for i in range(count)]
     if kind == "unknown":
         hidden = [(((effect, level),), PLANTS) for effect in UNKNOWN for level in LEVELS[1:]]
     elif kind == "pairs":
@@ -254,6 +274,7 @@ def _conditions(kind: str, plant: str, rng: np.random.Generator) -> tuple[dict[s
     coarse = 2 in hard
     torque_noise = float(rng.uniform(0.01, 0.03)) if 4 in hard else 0.01 if kind != "hard" and rng.random() < 0.25 else 0.0
     uncertainty = round(float(rng.uniform(0.04, 0.06) if 3 in hard else rng.uniform(0.01, 0.03)), 3)
+    uncertainty = _STATED if kind == "rough" else uncertainty
     quantised = rng.random() < (0.7 if coarse else 0.4)
     first, second = rng.permutation(EXCITATIONS)[:2]
     conditions = {
@@ -485,19 +506,35 @@ def _case(
     drift = hidden.get("unknown.drifting_friction")
     if drift is not None:  # its mean is known
         nominal_effects.append({"kind": f"{drift['side']}.coulomb_friction", "torque": drift["torque"]})
-    verdict = {"none": "no_discrepancy", "unknown": "unknown_effect"}.get(plan.kind, "explained")
+    no_effect = {"none": "no_discrepancy", "unknown": "unknown_effect", "rough": "rough_numbers"}
+    verdict = no_effect.get(plan.kind, "explained")
     true = Machine(machine.drive, machine.transmission, (*nominal_effects, *_order_effects(_explain(machine, hidden))))
     nominal = Machine(
         _off(machine.drive, plan.uncertainty, plan.rng, [error_of(kind) for kind in hidden]),
         None if machine.transmission is None else _off(machine.transmission, plan.uncertainty, plan.rng),
         [_off(effect, plan.uncertainty, plan.rng) for effect in nominal_effects],
     )
+    if plan.kind == "rough":
+        nominal = Machine(
+            _misstate(machine.drive, plan.rng),
+            _misstate(machine.transmission or {}, plan.rng),
+            [_misstate(effect, plan.rng) for effect in nominal_effects],
+        )
     name = f"{plan.kind}-{seed}-{plan.index:03d}"
+    study, oracle = (
+        _study(title, model, plan.conditions, runs[0]) for title, model in ((name, nominal), (f"{name} as it is", true))
+    )
+    true_numbers = plant_numbers(oracle)
     truth = {
         "verdict": verdict,
         "effects": hidden,
         "sizes": sizes,
         "clutter": [str(effect["kind"]) for effect in clutter],
+        "offsets": {
+            path: value / true_numbers[path] - 1.0
+            for path, value in plant_numbers(study).items()
+            if true_numbers.get(path) and path != "drive.gear_ratio"
+        },
         "level": max((level for _, level in plan.hidden), default=0.0),
         **more,
     }
@@ -509,8 +546,8 @@ def _case(
         plan.conditions,
         logs[0],
         logs[1],
-        _study(name, nominal, plan.conditions, runs[0]),
-        _study(f"{name} as it is", true, plan.conditions, runs[0]),
+        study,
+        oracle,
         runs,
         traces,
     )
@@ -533,6 +570,25 @@ def _off(
             error *= float(np.clip(rng.standard_normal(), -2.0, 2.0))
             nominal[key] = float(f"{value * (1.0 + uncertainty * error):.4g}")
     return nominal
+
+
+def _misstate(table: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """A table as a data sheet has it, to four digits."""
+    nominal = dict(table)
+    for key, value in table.items():
+        reach = next((reach for word, reach in ROUGH.items() if key.endswith(word)), None)
+        if reach is not None:
+            nominal[key] = float(f"{value * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*reach)):.4g}")
+    return nominal
+
+
+def plant_numbers(study: Mapping[str, Any]) -> dict[str, float]:
+    """Numbers of a study's drive, transmission and effects by dotted path, as the package names them."""
+    tables = {"drive": study["drive"], "transmission": study.get("transmission") or {}}
+    tables |= {f"effects.{effect['kind']}": effect for effect in study["effects"]}
+    return {
+        f"{name}.{key}": value for name, table in tables.items() for key, value in table.items() if isinstance(value, float)
+    }
 
 
 def _study(title: str, machine: Machine, conditions: Mapping[str, Any], run: Run) -> dict[str, Any]:

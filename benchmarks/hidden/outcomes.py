@@ -1,6 +1,7 @@
 """Outcomes of diagnoses beside the truth, and their statistics: intervals of rates, calibration, confusions."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,12 @@ from .effects import EFFECTS, NEW, UNKNOWN
 
 BINS = 10
 """Bins of the calibration curve, over confidences from 0 to 1."""
+
+_ROUGH_NUMBERS = "numbers are further off than stated"
+FIRST_LINE = f"The {_ROUGH_NUMBERS}; no effect is needed."
+"""First line that a case of `rough` should get; scored by the words of `_ROUGH_NUMBERS`."""
+NEXT_STEP = "jaxbl identify LOG --model TOML"
+"""First of the next steps that a case of `rough` should get; scored by its first two words."""
 
 TARGETS = {
     "single": (0.97, True),
@@ -42,6 +49,9 @@ class Outcome:
         reduction, worse, ratio: change of the held-out gap by the diagnosis's own account; None if it states none.
         reachable: reduction by the oracle, by the same account.
         proved, proved_worse: reduction of the gap by the bench's simulator; True if the gap has grown there.
+        first_line, next_step: first line of the report (after warnings about the log) and first command that it proposes.
+        identified: of `rough`, dotted path -> relative error of the number by `identify` from the same log and model, and
+            the standard error that it states, over the true value.
         error: the reason why there is no diagnosis.
     """
 
@@ -61,13 +71,24 @@ class Outcome:
     reachable: float | None = None
     proved: float | None = None
     proved_worse: bool | None = None
+    first_line: str = ""
+    next_step: str = ""
+    identified: dict[str, tuple[float, float]] = field(default_factory=dict)
     seconds: float = 0.0
     error: str = ""
 
     @property
+    def truth(self) -> str:
+        """The first hidden effect, known or not, or the verdict where none is missing."""
+        if self.kind == "rough":
+            return "rough_numbers"
+        return self.hidden[0] if self.hidden else self.unknown or "no_discrepancy"
+
+    @property
     def named_effects(self) -> list[str]:
         """Effects that the diagnosis asserts."""
-        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" or self.kind == "clutter" else []
+        partly = self.kind in ("clutter", "rough")
+        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" or partly else []
 
     @property
     def answer(self) -> str:
@@ -80,6 +101,8 @@ class Outcome:
             return self.verdict == "no_discrepancy"
         if self.kind == "unknown":
             return self.verdict == "unknown_effect"
+        if self.kind == "rough":
+            return not self.named_effects and self.says_rough and self.sends_to_identify
         if self.kind == "pairs":
             return set(self.hidden) <= set(self.named_effects)
         return self.answer in self.hidden
@@ -89,6 +112,21 @@ class Outcome:
         """True if a hidden effect is the first finding or among its alternatives."""
         alternatives = self.findings[0][2] if self.named_effects else ()
         return not {self.answer, *alternatives}.isdisjoint(self.hidden)
+
+    @property
+    def says_rough(self) -> bool:
+        """True if the first line says that the numbers, and no effect, are the reason."""
+        return _ROUGH_NUMBERS in self.first_line
+
+    @property
+    def sends_to_identify(self) -> bool:
+        """True if the first command that the diagnosis proposes is an identification."""
+        return re.search(rf"\b{' '.join(NEXT_STEP.split()[:2])} ", self.next_step) is not None
+
+    @property
+    def worst_identified(self) -> tuple[str, float]:
+        """Path of the number whose identified value is furthest off, and the size of its relative error."""
+        return max(((path, abs(relative)) for path, (relative, _) in self.identified.items()), key=lambda pair: pair[1])
 
     @property
     def spurious_effects(self) -> list[str]:
@@ -130,11 +168,11 @@ def calibration_error(rows: Sequence[Mapping[str, float]]) -> float | None:
 def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], np.ndarray]:
     """Confusion matrix of cases with one hidden effect or none: row names (truths), column names (answers), and counts."""
     outcomes = [outcome for outcome in outcomes if outcome.kind != "pairs"]
-    truths = [outcome.hidden[0] if outcome.hidden else outcome.unknown or "no_discrepancy" for outcome in outcomes]
+    truths = [outcome.truth for outcome in outcomes]
     answers = {outcome.answer for outcome in outcomes}
-    effects = *EFFECTS, *NEW
-    rows = [name for name in (*effects, *UNKNOWN, "no_discrepancy") if name in truths]
-    columns = [name for name in (*effects, "unknown_effect", "no_discrepancy", "failed") if name in answers | set(rows)]
+    effects, complete = (*EFFECTS, *NEW), ("no_discrepancy", "rough_numbers")
+    rows = [name for name in (*effects, *UNKNOWN, *complete) if name in truths]
+    columns = [name for name in (*effects, "unknown_effect", *complete, "failed") if name in answers | set(rows)]
     columns += sorted(answers - set(columns))
     counts = np.zeros((len(rows), len(columns)), int)
     for truth, outcome in zip(truths, outcomes, strict=True):

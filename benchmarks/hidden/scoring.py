@@ -6,6 +6,9 @@ What counts as right:
 - clutter: the first finding is the hidden effect, whatever the verdict; clutter that is named is not spurious;
 - pairs: both hidden effects are among the findings; any other finding is spurious;
 - none: the verdict is `no_discrepancy`; everything else is a false alarm;
+- rough: no effect is among the findings, whatever the verdict, the first line is `FIRST_LINE` and the first command proposed
+  is `NEXT_STEP` (outcomes.py). That this advice is right is tried out: `identify` has the same log and model, and its
+  numbers are compared with the true ones;
 - unknown: the verdict is `unknown_effect`; `explained` with a first confidence of at least `CONFIDENT` is confidently wrong.
 
 Gap of a case: the mean over channels of 1 - e(after) / e(before), where e² = rmse² - floor² on held-out data, nought where
@@ -34,20 +37,25 @@ from jaxbl.workers import map_jobs
 
 from .cases import ALONE, KINDS, Case, Log
 from .figures import draw
-from .outcomes import TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
+from .outcomes import FIRST_LINE, NEXT_STEP, TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
 from .proof import proofs
 
-VERDICTS = ("explained", "no_discrepancy", "unknown_effect")
+VERDICTS = ("explained", "no_discrepancy", "unknown_effect", "rough_numbers")
 CONFIDENT = 0.9
 Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
-"""diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it."""
+"""diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it;
+`first_line` and `next_step` are what the report says first, and the first command that it proposes."""
 
 
 Oracle = Callable[[Case], Mapping[str, float]]
 """Held-out rmse by channel of the true effects, fitted."""
+Identify = Callable[[Case], dict[str, tuple[float, float]]]
+"""Relative error and standard error of each number by an identification."""
 
 
-def _diagnose(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome, Mapping[str, Any] | None]:
+def _diagnose(
+    case: Case, diagnose: Diagnose, oracle: Oracle | None, identify: Identify | None
+) -> tuple[Outcome, Mapping[str, Any] | None]:
     """Outcome of a case, and the extended model; one that fails is an outcome too."""
     start = time.perf_counter()
     try:
@@ -62,20 +70,34 @@ def _diagnose(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Ou
             best = oracle(case)
         except Exception:
             traceback.print_exc()
-    return outcome(case, diagnosis, best, seconds, error), diagnosis.get("model")
+    result = outcome(case, diagnosis, best, seconds, error)
+    if identify is not None and case.kind == "rough":
+        try:
+            result.identified = identify(case)
+        except Exception:
+            traceback.print_exc()
+    return result, diagnosis.get("model")
 
 
-def run(hidden_cases: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None, jobs: int = 1) -> list[Outcome]:
+def run(
+    hidden_cases: Sequence[Case],
+    diagnose: Diagnose,
+    oracle: Oracle | None = None,
+    jobs: int = 1,
+    identify: Identify | None = None,
+) -> list[Outcome]:
     """Diagnose every case.
 
     Args:
-        found: cases.
+        hidden_cases: cases.
         diagnose: what is put to the test.
         oracle: what the true effects can reach.
         jobs: processes that share the work; functions must then be importable.
+        identify: what the numbers of `rough` are after the advice has been taken.
     """
     results = []
-    for i, (result, model) in enumerate(map_jobs(partial(_diagnose, diagnose=diagnose, oracle=oracle), hidden_cases, jobs)):
+    diagnose_case = partial(_diagnose, diagnose=diagnose, oracle=oracle, identify=identify)
+    for i, (result, model) in enumerate(map_jobs(diagnose_case, hidden_cases, jobs)):
         results.append((result, model))
         judgement = "right" if result.is_right and not result.spurious_effects else "WRONG"
         print(
@@ -125,6 +147,8 @@ def outcome(
             (finding["effect"], float(finding["confidence"]), [other["effect"] for other in finding.get("alternatives", [])])
             for finding in diagnosis.get("findings", [])
         ],
+        first_line=diagnosis.get("first_line", ""),
+        next_step=diagnosis.get("next_step", ""),
         seconds=seconds,
         error=error,
     )
@@ -181,6 +205,8 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     with_effects = [case_outcome for case_outcome in outcomes if case_outcome.hidden]
     curve = calibration(outcomes)
     error = calibration_error(curve)
+    rough = by_kind["rough"]
+    errors = [abs(relative) for case_outcome in rough for relative, _ in case_outcome.identified.values()]
     return {
         "single": rate(by_kind["single"], lambda case_outcome: case_outcome.is_right),
         "single_strong": rate(
@@ -219,6 +245,18 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
             by_kind["unknown"],
             lambda case_outcome: bool(case_outcome.named_effects) and case_outcome.findings[0][1] >= CONFIDENT,
         ),
+        "rough": rate(rough, lambda case_outcome: case_outcome.is_right),
+        "rough_named": rate(rough, lambda case_outcome: bool(case_outcome.named_effects)),
+        "rough_line": rate(rough, lambda case_outcome: case_outcome.says_rough),
+        "rough_step": rate(rough, lambda case_outcome: case_outcome.sends_to_identify),
+        "rough_identified": rate(
+            rough,
+            lambda case_outcome: (
+                bool(case_outcome.identified) and case_outcome.worst_identified[1] <= case_outcome.conditions["uncertainty"]
+            ),
+        ),
+        "rough_error": number(errors),
+        "rough_worst": {"value": max(errors), "count": len(errors)} if errors else None,
         "gap_reduction": number(
             [case_outcome.reduction for case_outcome in with_effects if case_outcome.reduction is not None]
         ),
@@ -260,6 +298,13 @@ _TITLES = {
     "abstentions": "unknown effects: abstains",
     "unknown_missed": "- sees nothing",
     "confidently_wrong": f"- explains them at confidence {CONFIDENT:g} or more",
+    "rough": "rough numbers: no effect named, first line and next step right",
+    "rough_named": "- an effect named, though none is missing",
+    "rough_line": f"- first line: “{FIRST_LINE}”",
+    "rough_step": f"- next step: `{NEXT_STEP}`",
+    "rough_identified": "- `identify` finds every number within what the model states",
+    "rough_error": "- error of a number by `identify`, median",
+    "rough_worst": "- the largest",
     "gap_reduction": "gap reduction on held-out data, median",
     "reachable": "- by the true effects, fitted (the oracle), median",
     "worse": "- made worse",
@@ -271,6 +316,7 @@ _TITLES = {
     "seconds": "seconds a case, median",
 }
 _PLAIN = ("oracle_ratio", "calibration_error", "seconds")
+_FINE = ("rough_error", "rough_worst")
 
 
 def meets_target(key: str, value: float) -> bool | None:
@@ -287,7 +333,7 @@ def markdown(outcomes: Sequence[Outcome], heading: str = "") -> str:
     lines += ["| what | value | 95 % | cases | asked for | |", "| --- | ---: | ---: | ---: | ---: | --- |"]
     for key, figure in ((key, figure) for key, figure in scores(outcomes).items() if figure is not None):
         value = figure["value"]
-        text = f"{value:.3g}" if key in _PLAIN else f"{100 * value:.1f} %"
+        text = f"{value:.3g}" if key in _PLAIN else f"{100 * value:{'.3g' if key in _FINE else '.1f'}} %"
         low, high = figure.get("interval", (None, None))
         interval = "" if low is None else f"{100 * low:.0f}-{100 * high:.0f} %"
         asked, mark = "", ""
@@ -309,6 +355,7 @@ def markdown(outcomes: Sequence[Outcome], heading: str = "") -> str:
         for (truth, finding), times in wrong.most_common():
             lines.append(f"| {truth} | {finding} | {times} | {counts[rows.index(truth)].sum()} |")
     lines += _by_condition([case_outcome for case_outcome in outcomes if case_outcome.kind in ("single", "hard")])
+    lines += _identified_numbers([case_outcome for case_outcome in outcomes if case_outcome.identified])
     missed = [case_outcome for case_outcome in outcomes if not case_outcome.is_right]
     if missed:
         lines += ["", "Wrong: " + "; ".join(f"{case_outcome.name} ({_tells(case_outcome)})" for case_outcome in missed)]
@@ -338,6 +385,20 @@ def _by_condition(group_outcomes: Sequence[Outcome]) -> list[str]:
             right = sum(case_outcome.is_right for case_outcome in group)
             lines.append(f"| {key} | {value} | {100 * right / len(group):.0f} % | {len(group)} |")
     return ["", "| single and hard, by | | right | cases |", "| --- | --- | ---: | ---: |", *lines] if lines else []
+
+
+def _identified_numbers(rough: Sequence[Outcome]) -> list[str]:
+    """Number of each case that `identify` finds worst."""
+    lines = []
+    for case_outcome in rough:
+        path, _ = case_outcome.worst_identified
+        relative, deviation = case_outcome.identified[path]
+        median = float(np.median([abs(error) for error, _ in case_outcome.identified.values()]))
+        lines.append(
+            f"| {case_outcome.name} | {100 * median:.3g} % | {path} | {100 * relative:+.3g} ± {100 * deviation:.2g} % |"
+        )
+    header = ["", "| numbers by `identify` | median error | the worst | its error |", "| --- | ---: | --- | ---: |"]
+    return [*header, *lines] if lines else []
 
 
 def write(outcomes: Sequence[Outcome], folder: Path, heading: str = "") -> list[Path]:

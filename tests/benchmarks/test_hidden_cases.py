@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from blind_diagnosis import fail_to_reach, see_nothing
-from hidden.cases import _PLANTS, ALONE, KINDS, _add_known_effect, _targets, cases, save
+from hidden.cases import _PLANTS, ALONE, KINDS, _add_known_effect, _targets, cases, plant_numbers, save
 from hidden.effects import APART, EFFECTS, LEVELS, NEW, PINION, UNKNOWN, error_of, on_rigid
+from hidden.outcomes import FIRST_LINE, NEXT_STEP
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
 from hidden.simulator import Machine
@@ -87,7 +88,7 @@ def test_same_seed_same_cases():
 
 
 def test_kinds_come_in_their_shares_and_logs_are_whole(hidden_cases):
-    assert [sum(case.kind == kind for case in hidden_cases) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW), 2]
+    assert [sum(case.kind == kind for case in hidden_cases) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW), 2, 0]
     for case in hidden_cases:
         for log in (case.log, case.holdout):
             columns = log.columns()
@@ -157,6 +158,45 @@ def _simulate_positions(plant, initial, torques, period, substeps=20):
         return jax.lax.scan(move_sample, (plant.init(state), jnp.asarray(0.0)), torques)[1]
 
     return np.asarray(move_samples(plant, state, jnp.asarray(torques)))
+
+
+def test_rough_cases_lack_nothing_and_their_numbers_are_further_off_than_stated():
+    rough, again = cases(4, 6, "rough", DURATION), cases(4, 1, "rough", DURATION)[0]
+    assert again.model == rough[0].model and again.truth == rough[0].truth
+    np.testing.assert_array_equal(again.log.theta_e, rough[0].log.theta_e)
+    for case in rough:
+        assert case.truth["verdict"] == "rough_numbers" and not case.truth["effects"] and not case.hidden
+        assert list(case.runs[0].machine.effects) == case.oracle["effects"]
+        assert [effect["kind"] for effect in case.model["effects"]] == [effect["kind"] for effect in case.oracle["effects"]]
+        true_numbers, offsets = plant_numbers(case.oracle), case.truth["offsets"]
+        assert case.model["drive"]["gear_ratio"] == true_numbers.pop("drive.gear_ratio")
+        assert set(offsets) == {path for path, value in true_numbers.items() if value}
+        stated = case.model["uncertainty"]["relative"]
+        assert all(abs(offset) > 2.9 * stated for offset in offsets.values())
+        read_model(case.model)
+    signs = {np.sign(offset) for case in rough for offset in case.truth["offsets"].values()}
+    assert signs == {-1.0, 1.0}
+
+
+def test_a_rough_case_wants_no_effect_but_the_first_line_and_the_next_step():
+    (case,) = cases(4, 1, "rough", DURATION)
+    right = {"verdict": "unknown_effect", "first_line": FIRST_LINE, "next_step": f".venv/bin/{NEXT_STEP} --out results"}
+    finding = {"effect": "motor.viscous_friction", "confidence": 0.9}
+    answers = [
+        right,
+        right | {"findings": [finding]},
+        right | {"first_line": "Unknown."},
+        right | {"next_step": "jaxbl explore"},
+    ]
+    outcomes = [outcome(case, answer) for answer in answers]
+    assert [case_outcome.is_right for case_outcome in outcomes] == [True, False, False, False]
+    outcomes[0].identified = {"drive.motor_inertia": (0.001, 0.002), "transmission.half_gap": (-0.3, 0.1)}
+    figures = scores(outcomes)
+    for key, value in {"rough": 0.25, "rough_named": 0.25, "rough_line": 0.75, "rough_step": 0.75}.items():
+        assert figures[key]["value"] == value
+    assert figures["rough_identified"]["value"] == 0.0 and figures["rough_worst"] == {"value": 0.3, "count": 2}
+    assert "| transmission.half_gap | -30 ± 10 % |" in markdown(outcomes)
+    assert confusion(outcomes)[0] == ["rough_numbers"]
 
 
 def test_an_oracle_gets_full_marks(hidden_cases, oracle):
