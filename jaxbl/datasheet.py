@@ -561,7 +561,8 @@ def compare_observers(kind: DriveKind, text: str) -> tuple[str, str]:
     units = ", ".join(f"{kind.unit(side, 'rad')}/s of the {side}" for side in sides)
     ranks = {name: [summary["kinds"][name]["error"] for summary in sides.values()] for name in _OBSERVERS}
     errors = "; ".join(f"{name} {', '.join(f'{error:.2g}' for error in ranks[name])}" for name in ranks)
-    sentence = f"Velocity errors of observers with the gains that suit each best ({units}): {errors}."
+    drives = "in the worst of drives within [uncertainty]"
+    sentence = f"Velocity errors of observers with the gains that suit each best, {drives} ({units}): {errors}."
     gains = {
         side: {key: float(_format_number(value, 3)) for key, value in summary["kinds"][best]["gains"].items()}
         for side, summary in sides.items()

@@ -10,14 +10,20 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from jaxbl import open_study, read_config
+from jaxbl import open_study, read_config, run
 from jaxbl.cli import setup
-from jaxbl.datasheet import KINDS, Answer, items_by_name, write_first_study
+from jaxbl.datasheet import KINDS, Answer, compare_observers, items_by_name, write_first_study
 from jaxbl.errors import InputError
 from jaxbl.gains.gain_search import usual_rule
 
 QUESTIONS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
 GEARED_QUESTIONS = QUESTIONS["geared"]
+
+
+@pytest.fixture(autouse=True)
+def _no_comparison(monkeypatch):
+    """Leave out the comparison of observers, which takes longer than all else and has a test of its own."""
+    monkeypatch.setattr("jaxbl.cli.setup.compare_observers", lambda kind, text: ("No comparison.", text))
 
 
 @pytest.mark.parametrize(
@@ -259,6 +265,25 @@ def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, rated_name, lines,
     lambda_, alpha = usual_rule(bound / study.drive.motor_inertia)
     assert (study.observer.motor.lambda_, study.observer.motor.alpha) == pytest.approx((lambda_, alpha), rel=6e-3)
     assert call("simulate", "axis.toml")[0] == 0
+
+
+def test_the_best_observer_stands_behind_the_study_with_its_error():
+    text, _ = write_first_study(KINDS["direct"], read_answers("direct", DIRECT | SHORT_RUN), "")
+    sentence, longer_text = compare_observers(KINDS["direct"], text)
+    errors = {name: float(error) for name, error in re.findall(r"(\w+) ([\d.e-]+)(?=[;.])", sentence.partition(": ")[2])}
+    assert list(errors) == ["super_twisting", "differentiator_3", "kalman"]
+    before, comment = longer_text.split(f"\n# {sentence}\n")
+    assert before == text.rstrip("\n") + "\n" * (before != text.rstrip("\n"))
+    study = tomllib.loads(longer_text)
+    other = tomllib.loads("\n".join(line[2:] for line in comment.splitlines()[1:]))
+    best = min(errors, key=errors.__getitem__)
+    assert other["observer"]["kind"] == best != "super_twisting"
+    achieved = []
+    for tables in (other, {}):
+        drives = [{"effects": [*study["effects"], {"kind": "motor.inertia", "inertia": off * 0.05}]} for off in (-0.1, 0.1)]
+        achieved.append(max(run(study | tables | drive).summary["metrics"]["motor.velocity_rmse"] for drive in drives))
+    # super-twisting's own gains are no better than its best
+    assert 0.7 * errors[best] < achieved[0] <= 1.3 * errors[best] < errors["super_twisting"] < 1.1 * achieved[1]
 
 
 def test_the_usual_rule_in_a_study_is_that_of_tune():
