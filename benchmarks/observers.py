@@ -1,6 +1,6 @@
 """Kinds of observer in the situations of an engineer: the figure and the tables of docs/choosing_an_observer.md.
 
-    python benchmarks/observers.py [--out results/observers]    # 12 minutes of processor time; goes on where it stopped
+    python benchmarks/observers.py [--out results/observers]    # about 12 minutes of processor time; goes on if stopped
 
 Two drives: the axis of docs/tutorial.md, whose hard gap makes the transmitted torque jump, and that of
 sweeps/tune_paper_drive.toml, whose soft gap does not. Each kind is tuned by `jaxbl.tune` on the drive's own input: all by
