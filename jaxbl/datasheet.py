@@ -544,10 +544,11 @@ def compare_observers(kind: DriveKind, text: str) -> tuple[str, str]:
 
     Args:
         kind: of the drive.
-        text: the study, which says that tune uses another input, and drives within its uncertainty.
+        text: the study.
 
     Returns:
-        A sentence on their errors, and the study with the best observer behind it, as a comment.
+        A sentence on their errors in the worst drive within the study's uncertainty, and the study with the best observer
+        behind it, as a comment.
     """
     import tomli_w
 
