@@ -280,8 +280,8 @@ def items_by_name() -> dict[str, list[tuple[str, Item]]]:
     return items
 
 
-_OBSERVERS = ["super_twisting", "differentiator_3", "kalman"]
-"""Kinds that a first study is compared for: the usual one, one for motion that is not known, one for noise."""
+_OTHER_OBSERVERS = ["differentiator_3", "kalman"]
+"""Kinds that super-twisting is compared with: one for motion that is not known, one for noise."""
 _UNCERTAINTY = 0.1
 """Relative uncertainty of a data sheet's numbers: they hold for a series, and depend on temperature and load."""
 _HARMONICS, _PERIODS = 6, 5
@@ -299,7 +299,7 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         title: headline of its report.
 
     Returns:
-        The TOML text, and what the pilot run found, by side; of the motor also the error that is `expected`.
+        The TOML text, and what the pilot run found, by side; with the errors that are `expected` there.
 
     Raises:
         InputError: numbers that no study can have together.
@@ -323,7 +323,8 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(_parse_toml(text) | {"observer": observers})
         expected = expect_errors(list_scenarios(config, table), list(gains))
-        pilot_metrics["motor"]["expected"] = expected["motor"]._asdict()
+        for side, metrics in pilot_metrics.items():
+            metrics["expected"] = expected[side]._asdict()
         gain_map = propose_map(run_pilot(Scenarios(config, ["nominal"], {}), table)["motor"]["f_plus"])
         tolerances = propose_tolerances(config, expected)
         text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances, gain_map)
@@ -539,37 +540,48 @@ def describe_expectation(kind: DriveKind, pilot_metrics: JsonObject) -> str:
     return f"Expect about {error}, and {worst}; shares of its square: {causes}."
 
 
-def compare_observers(kind: DriveKind, text: str) -> tuple[str, str]:
-    """Compare super-twisting with other observers on a study, each with the gains that suit it best.
+def compare_observers(kind: DriveKind, text: str, pilot_metrics: JsonObject) -> tuple[str, str]:
+    """Compare a study's own observers, super-twisting, with other kinds, each with the gains that suit it best.
 
     Args:
         kind: of the drive.
         text: the study.
+        pilot_metrics: what :func:`write_first_study` found, by side.
 
     Returns:
-        A sentence on their errors in the worst drive within the study's uncertainty, and the study with the best observer
-        behind it, as a comment.
+        A sentence on the largest errors in drives within the study's uncertainty, and the study with it, and with another
+        kind that is better, as a comment.
     """
     import tomli_w
 
     from .gains.tune import tune
+    from .observer import AbstractSuperTwisting
 
-    study = _parse_toml(text)
+    study, name_of_study = _parse_toml(text), AbstractSuperTwisting.name
     # one search of each kind, on the study's own input: each further program takes seconds to compile
-    study["tune"] = {"observers": _OBSERVERS, "trials": 128, "refine": 0, "worst_over_uncertainty": True}
-    choice = tune(study).summary
-    sides, best = choice["points"][0]["sides"], choice["for_both_sides"]
-    units = ", ".join(f"{kind.unit(side, 'rad')}/s of the {side}" for side in sides)
-    ranks = {name: [summary["kinds"][name]["error"] for summary in sides.values()] for name in _OBSERVERS}
-    errors = "; ".join(f"{name} {', '.join(f'{error:.2g}' for error in ranks[name])}" for name in ranks)
-    drives = "in the worst of drives within [uncertainty]"
-    sentence = f"Velocity errors of observers with the gains that suit each best, {drives} ({units}): {errors}."
-    gains = {
-        side: {key: float(_format_number(value, 3)) for key, value in summary["kinds"][best]["gains"].items()}
-        for side, summary in sides.items()
-    }
-    table = tomli_w.dumps({"observer": {"kind": best} | gains})
-    lines = [sentence, f"In place of [observer] above, for {best}:", *table.strip().splitlines()]
+    study["tune"] = {"observers": _OTHER_OBSERVERS, "trials": 128, "refine": 0, "worst_over_uncertainty": True}
+    sides = tune(study).summary["points"][0]["sides"]
+    errors = {name_of_study: [metrics["expected"]["largest_velocity"] for metrics in pilot_metrics.values()]}
+    for name in _OTHER_OBSERVERS:
+        largest = [sides[side]["kinds"][name]["worst"] for side in pilot_metrics]
+        # a kind of which no gains work has none
+        if None not in largest:
+            errors[name] = largest
+    best = min(errors, key=lambda name: math.prod(errors[name]))
+    units = ", ".join(f"{kind.unit(side, 'rad')}/s of the {side}" for side in pilot_metrics)
+    figures = "; ".join(f"{name} {', '.join(f'{error:.2g}' for error in errors[name])}" for name in errors)
+    sentence = (
+        f"Largest velocity errors (rms) in drives within [uncertainty], {name_of_study} with the study's gains, others with "
+        f"those that suit them best ({units}): {figures}."
+    )
+    lines = [sentence]
+    if best != name_of_study:
+        gains = {
+            side: {key: float(_format_number(value, 3)) for key, value in summary["kinds"][best]["gains"].items()}
+            for side, summary in sides.items()
+        }
+        table = tomli_w.dumps({"observer": {"kind": best} | gains})
+        lines += [f"In place of [observer] above, for {best}:", *table.strip().splitlines()]
     return sentence, text + "\n" + "".join(f"# {line}".rstrip() + "\n" for line in lines)
 
 

@@ -10,7 +10,7 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (400475, 3.82, 4.49, 5.74),
+    "all": (400548, 3.82, 4.49, 5.74),
     "report": (64105, 8.71, 6.12, 16.67),
     "diagnosis": (61884, 10.65, 16.54, 14.57),
     "records": (45944, 0.0, 0.0, 0.0),
@@ -19,10 +19,10 @@ CEILINGS = {
     "sweeps": (28766, 0.07, 0.0, 0.0),
     "exports": (24764, 0.02, 0.0, 0.68),
     "fused": (24004, 0.1, 0.0, 0.0),
-    ".": (18316, 0.03, 0.0, 0.0),
+    ".": (18387, 0.03, 0.0, 0.0),
     "drive": (12780, 0.0, 2.23, 0.0),
     "throughput": (11788, 0.0, 0.0, 0.0),
-    "cli": (9880, 0.09, 0.0, 0.0),
+    "cli": (9882, 0.09, 0.0, 0.0),
     "config": (9686, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
     "monitoring": (5530, 0.0, 0.0, 0.0),

@@ -75,7 +75,7 @@ def init(
     with show_task(context, "running a pilot for the gains"):
         text, pilot_metrics = write_first_study(KINDS[name], values, title or file.stem)
     with show_task(context, "comparing observers"):
-        comparison, text = compare_observers(KINDS[name], text)
+        comparison, text = compare_observers(KINDS[name], text, pilot_metrics)
     check_new(file, "init")
     write_atomic(file, text)
     bounds = {side: item["f_plus"] for side, item in pilot_metrics.items()}
