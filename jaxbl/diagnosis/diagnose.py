@@ -4,9 +4,7 @@ Where model and log disagree, which effect is missing, the model with it, and th
 the fit has seen.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -22,6 +20,8 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
+from .choice import Choice, Chosen, explain
+from .confidence import explained_share
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import (
     contradictions_of,
@@ -34,24 +34,19 @@ from .diagnosis_summary import (
     where_lacking,
 )
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
-from .effect_search import EffectSearch, Explanation, Finding
-from .expected_errors import Expected, expected_errors, failed
-from .judgement import exchanged, explained_share, is_little, judged
+from .fitted_model import free_values
+from .history import Step
+from .judgement import judge
 from .localise import SIGNIFICANT, Localised, localise
 from .motor_alone import diagnose_alone
 from .neutral_effects import without
 from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
-from .proof import SEEN, SURE, Accepted, Control, Proof, beaten, free_values
+from .proof import Proof, prove
 from .reference_log import at_period
 from .residuals import Residual, SideResiduals, residual_torques
 from .setup import Setup, set_up
-from .torque_fit import fit_to_torque
-from .torque_regression import extended
-from .torque_tables import tabulated
 
-_BOUND = 4.0
-"""Standard deviations that the model's own numbers may be off where they are held."""
 _HIDDEN = 0.3
 """Share of the input: where a torque of that size would not have been seen, noise hides everything."""
 
@@ -111,7 +106,7 @@ def diagnose(log: Logs, model: ConfigSource, *, holdout: Logs | None = None) -> 
 
 
 _STAGES, _STAGES_ALONE = 6, 3
-"""Set-up, search, proof, controls, observers, summary; from the motor alone fit, effects, proof."""
+"""Set-up, search, choice, proof, observers, summary; from the motor alone fit, effects, proof."""
 
 
 def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diagnosis:
@@ -130,226 +125,94 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if alone:
             found = diagnose_alone(task, done)
             return Diagnosis(
-                task.config, found.model, task.record, task.holdout, to_jsonable(found.summary), found.trace,
+                task.config, found.model, task.record, found.holdout, to_jsonable(found.summary), found.trace,
                 {}, {}, {}, {}, {},
                 replays="excitation" in task.missing,
             )  # fmt: skip
         announce("smoothing the log")
         setup = set_up(task)
-        proof = Proof(setup)
         done()
         announce("comparing effects")
-        search, found = _explained(setup)
+        history: list[Step] = []
+        search, found = explain(setup, history)
+        if found.verdict == "no_discrepancy":
+            _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())
         done()
-        announce("testing on held-out data")
-        (search, found, accepted, controls), expected = _proved(proof, search, found)
-        fitted, after = accepted.fitted, accepted.after
-        done()
+        announce("choosing by blocks of the log")
+        choice = Choice(setup, history)
+        chosen = choice.choose(search, found)
+        fitted, lacking_after = chosen.fitted, residual_torques(chosen.fitted.experiment, setup.fitted.segments)
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
-        share = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
-        apart = contradictions(task, fitted, setup.fitted, setup.holdout, found.model.linear.drive)
-        errors = proof.other.with_slow(proof.before), proof.other.with_slow(after)
-        judgement = judged(found, fitted, *errors, expected, controls, setup.prior, share, accepted.gains, bool(apart))
-        found = judgement.found
+        tables = choice.tabulate(chosen, lacking_after)
+        _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
+        values = free_values(setup.own, fitted.theta) | gain_values
+        model = extended_study(task.config, fitted.numbers, values, tables.effects() if tables else ())
+        done()
+        # the model stands; only now what was held out is read
+        announce("testing on held-out data")
+        proof = prove(setup, chosen)
+        share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
+        apart = contradictions(task, fitted, setup.fitted, chosen.found.model.linear.drive)
+        judgement = judge(chosen, proof, setup.prior, share, bool(apart))
         done()
         announce("running the observers")
-        missing = _missing(setup, proof, accepted, controls)
-        lacking_after, _ = missing["missing_after"]
-        on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
-        _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
+        missing = _missing(setup, proof, chosen, lacking_after)
+        on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, proof.after.torques)
         observing = set_leaves(setup.bare, arrays(gain_values))
-        observed = _observed(setup, observing)
-        trace = trace_of(setup, missing, observed)
+        observed = _observed(setup, proof, observing)
+        trace = trace_of(setup, proof, missing, observed)
         done()
-        summary = summary_of(setup, accepted, found)
+        summary = summary_of(setup, chosen, history) | {"verdict": judgement.verdict, "explained_share": share}
         about, notes = observers_say(observing, observed[0], setup)
-        for side, one in about.items():
-            summary["where"][side]["observed"] = one
+        for side, witness in about.items():
+            summary["where"][side]["observed"] = witness
         summary["notes"] += notes
-        summary["explained_share"] = share
         summary["contradictions"] = contradictions_of(task.record, fitted, apart)
-        summary["gap"] = proof.gap(fitted, after) | summarise_test(judgement, *errors, expected, controls)
-        if found.verdict == "unknown_effect":
+        summary["gap"] = proof.gap | summarise_test(judgement, proof)
+        if judgement.verdict == "unknown_effect":
             segments = setup.fitted.segments
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)
             left = localise(fitted.experiment, lacking_after, segments, coordinates)
             summary["where_after"] = where_lacking(task.record, left)
-        tables = None
-        if judgement.failed and not judgement.far:
-            tables = tabulated(proof, fitted.experiment, after, lacking_after, setup.sliding)
         if tables is not None:
-            summary["torque_tables"] = tables.said()
-        if found.wrong is not None:
-            summary["rival"] = rival_tables(task.config, setup.own, found.wrong)
-        values = free_values(setup.own, fitted.theta) | gain_values
-        model = extended_study(task.config, fitted.numbers, values, tables.effects() if tables else ())
+            summary["torque_tables"] = tables.summarise(proof.log.compare(tables.experiment).errors)
+        if chosen.found.wrong is not None:
+            summary["rival"] = rival_tables(task.config, setup.own, chosen.found.wrong)
         done()
     pairs = {
         side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]
         for side in on_log
     }
     return Diagnosis(
-        task.config, model, task.record, task.holdout, to_jsonable(summary), trace, setup.lacking, observed[0],
+        task.config, model, task.record, proof.record, to_jsonable(summary), trace, setup.lacking, observed[0],
         setup.coordinates,
         setup.located, pairs, replays="excitation" in task.missing,
     )  # fmt: skip
 
 
 def _missing(
-    setup: Setup, proof: Proof, accepted: Accepted, controls: Sequence[Control]
+    setup: Setup, proof: Proof, chosen: Chosen, lacking_after: SideResiduals
 ) -> dict[str, tuple[SideResiduals, SideResiduals]]:
     """Torques that models lack on the log and on what was held out, by names of columns: the model as given, the one with
     the effects, that without each of them, and the one with another effect in place of the last."""
-    fitted = accepted.fitted
+    fitted = chosen.fitted
     others = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
-    others |= {f"missing_with.{one.effect}": one.experiment for one in controls if one.experiment is not None}
-    after = residual_torques(fitted.experiment, setup.fitted.segments), accepted.after.torques
+    if chosen.rival is not None:
+        others[f"missing_with.{chosen.rival.effect}"] = chosen.rival.experiment
+    after = lacking_after, proof.after.torques
     found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
     for name, experiment in others.items():
         held: SideResiduals = {}
         # the trace has no samples of another log
         if not setup.task.separate:
-            held = residual_torques(at_period(experiment, setup.holdout.period), setup.holdout.segments)
+            held = residual_torques(at_period(experiment, proof.log.period), proof.log.segments)
         found[name] = residual_torques(experiment, setup.fitted.segments), held
     return found
 
 
 def _paired(before: SideResiduals, after: SideResiduals) -> dict[str, list[tuple[Residual, Residual]]]:
     return {side: list(zip(pieces, after[side], strict=True)) for side, pieces in before.items()}
-
-
-def new_search(setup: Setup, bound: float = np.inf, without: Collection[str] = ()) -> EffectSearch:
-    """The search for effects on the log; `bound`: standard deviations that the model's own numbers may be off; `without`:
-    effects that are not sought."""
-    exact = (*setup.task.config.uncertainty.exact, *without)
-    return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound, exact)
-
-
-def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
-    """What the log says that the model lacks.
-
-    Where two effects are missing at once, the model's own numbers may go wrong, and hide both. If they do, effects are
-    sought with these numbers held near to what is known of them; what that finds counts if its numbers stay there without
-    being held, beside something unknown too: numbers that cannot be explain nothing.
-    """
-    search = new_search(setup)
-    found = search.run()
-    if not search.plausible(found):
-        other = new_search(setup, _BOUND)
-        again = other.run()
-        if other.plausible(again):
-            search, found = other, again
-    if found.verdict == "no_discrepancy":
-        _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())
-    return search, found
-
-
-class _Proved(NamedTuple):
-    """An explanation as far as the held-out data bear it out, the search that found it, and the controls of its model."""
-
-    search: EffectSearch
-    found: Explanation
-    accepted: Accepted
-    controls: list[Control]
-
-    def expected(self, setup: Setup) -> dict[str, Expected]:
-        """Errors of a complete model on the held-out data."""
-        drive = self.found.model.linear.drive
-        return expected_errors(setup.holdout, self.accepted.fitted, self.accepted.after, setup.input_noise, drive)
-
-    def or_better(self, proof: Proof, other: "_Proved", least: float) -> "_Proved":
-        """Another one in its place, if the held-out data prefer that by so many standard errors, and not by numbers of the
-        model that cannot be."""
-        if proof.plausible(self.accepted.fitted) and not proof.plausible(other.accepted.fitted):
-            return self
-        if not other.accepted.fitted.names or beaten(proof.other, self.accepted.after, other.accepted.after) < least:
-            return self
-        gone = dict.fromkeys([*self.accepted.withdrawn, *other.accepted.withdrawn])
-        named = other.accepted.fitted.names
-        accepted = other.accepted._replace(withdrawn=[name for name in gone if name not in named])
-        return other._replace(accepted=accepted)
-
-    def by_torque(self, proof: Proof) -> "_Proved":
-        """The model with the numbers of least missing torque, if the held-out data prefer them."""
-        accepted = self.accepted
-        fitted = fit_to_torque(self.search, accepted.fitted, proof.setup.fitted) if accepted.fitted.names else None
-        if fitted is None:
-            return self
-        after = proof.other.compare(fitted.experiment)
-        z = beaten(proof.other, accepted.after, after)
-        if not z > SEEN or proof.worse(after, proof.before) or not proof.plausible(fitted):
-            return self
-        controls = proof.controls(self.search, fitted, after, self.found.wrong)
-        # a complete model has the same numbers by both
-        found = replace(self.found, verdict="unknown_effect")
-        return _Proved(self.search, found, accepted._replace(fitted=fitted, after=after, by_torque=z), controls)
-
-
-def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Proved, dict[str, Expected]]:
-    """What the held-out data leave of an explanation, and the errors of a complete model there.
-
-    Where they take effects away, others are sought in their place. Where more is left than a complete model would leave, so
-    are those that the missing torque itself shows, and numbers that leave less of it.
-    """
-    best = _exchanged(proof, search, found)
-    if best.accepted.withdrawn:
-        other = new_search(proof.setup, search.bound, best.accepted.withdrawn)
-        again = other.run()
-        if again.model.names not in ((), best.accepted.fitted.names) and other.plausible(again):
-            best = best.or_better(proof, _exchanged(proof, other, again), SURE)
-    expected = best.expected(proof.setup)
-    if failed(proof.other.with_slow(best.accepted.after), expected):
-        more = extended(best.search, best.found, best.accepted.fitted, proof.setup.fitted)
-        if more is not best.found:
-            # the log itself prefers it, too
-            better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
-            if better is not best:
-                best, expected = better, better.expected(proof.setup)
-    after = best.accepted.after
-    share = explained_share(proof.setup.nominal, proof.before.errors, after.errors, expected)
-    if failed(proof.other.with_slow(after), expected) or is_little(share):
-        better = best.by_torque(proof)
-        if better is not best:
-            return better, better.expected(proof.setup)
-    return best, expected
-
-
-def _exchanged(proof: Proof, search: EffectSearch, found: Explanation) -> _Proved:
-    """As :func:`_proved`; an effect that another one beats on the held-out data changes places with it, once."""
-    other: Explanation | None = found
-    for _ in range(2):
-        found = other or found
-        accepted = proof.accepted(search, found)
-        if accepted.withdrawn:
-            found = search.without(found, accepted.withdrawn)
-        controls = proof.controls(search, accepted.fitted, accepted.after, found.wrong)
-        other = exchanged(found, controls)
-        if other is None:
-            break
-    for name in accepted.fitted.names:
-        plainer = proof.plainer(search, accepted, name)
-        if plainer is not None:
-            found, accepted = _renamed(search, found, plainer, name), plainer
-            controls = proof.controls(search, accepted.fitted, accepted.after, found.wrong)
-    return _Proved(search, found, accepted, controls)
-
-
-def _renamed(search: EffectSearch, found: Explanation, accepted: Accepted, name: str) -> Explanation:
-    """An explanation with a special case in place of an effect, as probable as that was."""
-    numbers = accepted.fitted.numbers
-    (plain,) = set(numbers) - {one.effect for one in found.findings}
-    findings = []
-    for one in found.findings:
-        if one.effect == name:
-            others = tuple(other for other in one.alternatives if other[0] != plain)
-            one = Finding(plain, one.confidence, numbers[plain], others)
-        findings.append(one)
-    renamed = search.adopted(found, numbers, accepted.fitted.theta[: len(search.free)], findings)
-    # a rival stands beside the same effects
-    if found.wrong is not None and name == found.model.names[-1] and found.wrong.names[-1] != plain:
-        return replace(renamed, wrong=found.wrong)
-    return renamed
 
 
 def _check_shown(setup: Setup, shown: float) -> None:
@@ -370,9 +233,11 @@ def _check_shown(setup: Setup, shown: float) -> None:
     )
 
 
-def _observed(setup: Setup, nominal: Experiment) -> tuple[dict[str, list[Observed]], dict[str, list[Observed]]]:
+def _observed(
+    setup: Setup, proof: Proof, nominal: Experiment
+) -> tuple[dict[str, list[Observed]], dict[str, list[Observed]]]:
     """What the observers see on the log, and on what was held out of it; nothing is decided by it."""
     held = {}
     if not setup.task.separate:
-        held = observed_torques(at_period(nominal, setup.holdout.period), setup.holdout.segments)
+        held = observed_torques(at_period(nominal, proof.log.period), proof.log.segments)
     return observed_torques(nominal, setup.fitted.segments), held

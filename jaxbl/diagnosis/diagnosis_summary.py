@@ -20,38 +20,40 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .candidates import EffectNumbers
+from .choice import Chosen
 from .diagnosis_task import input_rms
-from .effect_search import Explanation, Finding, Model
-from .expected_errors import LEVEL, Expected
+from .effect_search import Finding, Model
+from .expected_errors import LEVEL
+from .fitted_model import FittedModel, free_values
+from .history import Step
 from .judgement import Judgement
 from .localise import SIGNIFICANT, Localised
 from .neutral_effects import with_added
 from .numbers_by_log import Contradiction
 from .observer_residual import Observed, compared
-from .proof import Accepted, Control, FittedModel, free_values
-from .reference_log import Errors
+from .proof import Proof
 from .residuals import SideResiduals
 from .sentences import sentence_of
 from .setup import Setup
 
 
-def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObject:
-    """The summary but for the proof, and for what the observers say."""
+def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObject:
+    """The summary but for the proof, the verdict, and what the observers say."""
     task, record, located = setup.task, setup.task.record, setup.located
-    fitted = accepted.fitted
+    fitted, found = chosen.fitted, chosen.found
     where = where_lacking(record, located)
     values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [
-        f"{name} was found, and withdrawn: with it the held-out data are not surely met better."
-        for name in accepted.withdrawn
+        f"{name} was found, and withdrawn: by blocks of the log the model is not surely better with it."
+        for name in chosen.withdrawn
     ]
-    if accepted.by_torque > 0.0:
+    if chosen.by_torque > 0.0:
         notes.append(
-            "The model is not complete: its numbers are those of least missing torque. On the held-out data they are better "
-            f"than those of least prediction errors by {accepted.by_torque:.1f} standard errors."
+            "The model is not complete: its numbers are those of least missing torque. By blocks of the log they are better "
+            f"than those of least prediction errors by {chosen.by_torque:.1f} standard errors."
         )
     for one in found.findings:
         if task.separate and EFFECTS[one.effect].in_time:
@@ -71,12 +73,11 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObje
         )
     return {
         **task.heading,
-        "verdict": found.verdict,
         # what has the larger torque matters more
         "findings": sorted(
             (
                 _finding(record, one, values, errors, where)
-                | {"share": fitted.share(one.effect), "z": accepted.gains.get(one.effect)}
+                | {"share": fitted.share(one.effect), "z": chosen.gains.get(one.effect)}
                 for one in found.findings
             ),
             key=lambda one: -one["share"],
@@ -92,7 +93,8 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> JsonObje
         },
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
-        "withdrawn": list(accepted.withdrawn),
+        "withdrawn": list(chosen.withdrawn),
+        "history": [step._asdict() for step in history],
         "notes": notes,
     }
 
@@ -119,15 +121,10 @@ def _finding(record: Record, one: Finding, values: Numbers, errors: Numbers, whe
     }
 
 
-def summarise_test(
-    judgement: Judgement,
-    before: Errors,
-    after: Errors,
-    expected: Mapping[str, Expected],
-    controls: Sequence[Control],
-) -> JsonObject:
-    """What the held-out errors of a complete model would be, which of them are larger, and the controls; errors `before` and
-    `after` with those of slow torques."""
+def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
+    """What the held-out errors of a complete model would be, which of them are larger, and the controls."""
+    expected = proof.expected
+    before, after = (proof.log.with_slow(each) for each in (proof.before, proof.after))
     return {
         "expected": {name: one._asdict() for name, one in expected.items() if " below " not in name},
         "slow_torques": {
@@ -141,12 +138,17 @@ def summarise_test(
             "far": judgement.far,
             "chance": judgement.chance,
             "remainder": judgement.remainder,
-            "powerless": judgement.powerless,
+            "worse": judgement.worse,
             "little": judgement.little,
             "contradicting": judgement.contradicting,
+            "weak": proof.weak,
+            "untested": {
+                name: proof.untested[name]._asdict() if name in proof.untested else {} for name in judgement.untested
+            },
         },
         "controls": {
-            one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {}) for one in controls
+            one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {})
+            for one in proof.controls
         },
     }
 
@@ -222,6 +224,7 @@ def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> 
 
 def trace_of(
     setup: Setup,
+    proof: Proof,
     missing: Mapping[str, tuple[SideResiduals, SideResiduals]],
     observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]],
 ) -> pd.DataFrame:
@@ -231,13 +234,13 @@ def trace_of(
     the observers.
     """
     task = setup.task
-    whole = task.record if task.separate else task.holdout
+    whole = task.record if task.separate else proof.record
     columns: JsonObject = {"t": whole.time, "u": whole.torque}
     columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
     if setup.nominal.transmission is not None:
         columns["twist"] = setup.nominal.plant.twist(whole.positions)
     columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
-    logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(task.holdout, setup.holdout.segments)])
+    logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(proof.record, proof.log.segments)])
     parts = [rows for record, _ in logs for rows in record.segments]
 
     def along(values: Iterable[Any]) -> np.ndarray:
@@ -257,7 +260,7 @@ def trace_of(
                 columns[f"{side}.noise"] = along(one.deviation for one in pieces)
     for side in observed[0]:
         torque, noise = np.full((2, len(whole.time)), np.nan)
-        for record, pieces in zip((task.record, task.holdout), observed, strict=True):
+        for record, pieces in zip((task.record, proof.record), observed, strict=True):
             for part, one in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
                 if one.converged:
                     rows = slice(part.start + one.skipped, part.stop)

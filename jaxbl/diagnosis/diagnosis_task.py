@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbl.config import ConfigSource, read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
+from jaxbl.identification.logs import Logs, LogTask, SealedRecord, read_with_holdout
 from jaxbl.identification.segments import led_in
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
@@ -22,14 +22,14 @@ _ALIKE = 4.0
 
 @dataclass(frozen=True)
 class DiagnosisTask(LogTask):
-    """A study and its log, part of which may be held out.
+    """A study and its log, part of which is held out.
 
     Attributes:
         holdout: the rest of the log, or another log.
         separate: whether it is another log.
     """
 
-    holdout: Record
+    holdout: SealedRecord
     separate: bool
 
 
@@ -47,7 +47,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
         _check_machine(record, other)
     rest = config.log.initial_state == "rest"
     record, other = (led_in(_long(one), rest) for one in (record, other))
-    return DiagnosisTask(config, missing, record, other, holdout is not None)
+    return DiagnosisTask(config, missing, record, SealedRecord(other), holdout is not None)
 
 
 def input_rms(record: Record) -> float:

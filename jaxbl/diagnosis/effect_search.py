@@ -21,15 +21,17 @@ from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
+from .blocks import FLOOR, mean_squares, standard_errors_between
 from .candidates import SHARE, Candidate, EffectNumbers, Numbers, variants_of
 from .evidence import Evidence, evidence_of
 from .free_functions import functions_of
+from .history import Step, describe_change
 from .linearised_model import DIVERGED, Linear, Predictor
 from .neutral_effects import candidates, complete, corrected
 from .refit import Refined, refined
 from .whittle import Spectrum, spectrum_of
 
-VerdictName = Literal["explained", "no_discrepancy", "unknown_effect"]
+VerdictName = Literal["explained", "no_discrepancy", "unknown_effect", "not_tested"]
 
 ODDS = -2.0
 """Log prior odds of each effect to be missing: a probability of 0.12."""
@@ -69,8 +71,6 @@ _RECENT = 4
 """Models along the record, and refits, that are kept: where one ended the next one begins; some are asked for again."""
 LEAST = 1e-3
 """Share of the driving torque that an effect must have to be named; the error of time stepping is a twentieth of it."""
-FLOOR = 0.006
-"""Nats a prediction error that structure in the noise (above all quantisation) may bring: 1.2 % of its variance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,6 +209,7 @@ class EffectSearch:
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
         self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
         self.segments = segments
+        self.history: list[Step] = []
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
         self._models: dict[tuple, Model] = {}
@@ -323,12 +324,16 @@ class EffectSearch:
             if not tried or tried[0][0] <= 0.0:
                 predictor, tried = self._coloured_round(current)
             if not tried or tried[0][0] <= 0.0:
+                self._note_round(current, predictor, tried)
                 break
+            self._note_round(current, predictor, tried)
             (_, current), *others = tried
             record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
-            current = self._pruned(current, predictor.smoothness)
+            pruned = self._pruned(current, predictor.smoothness)
+            current = self._note_change(current, pruned, "a later effect has made it needless")
             found = {name: one for name, one in found.items() if name in current.names} | {record[0].name: record}
-            current, renamed = self._simplified(current, predictor.smoothness)
+            simpler, renamed = self._simplified(current, predictor.smoothness)
+            current = self._note_change(current, simpler, "the simple effect gains as much as the general one")
             found = {renamed.get(name, name): one for name, one in found.items()}
             for plain in renamed.values():
                 first, *rivals = found[plain]
@@ -345,9 +350,10 @@ class EffectSearch:
         left = _most(rest)
         before = current.names
         if left > CLEAR and found:
-            current, found = self._fewest(current, found, left)
+            fewest, found = self._fewest(current, found, left)
+            current = self._note_change(current, fewest, "beside something unknown the fewest numbers are kept")
         if len(current.names) > 1:
-            current = self._settled(current)
+            current = self._note_change(current, self._settled(current), "needless with the numbers of the last fit")
             found = {name: tried for name, tried in found.items() if name in current.names}
         if current.names != before:
             # a rival stands beside the same effects
@@ -358,10 +364,38 @@ class EffectSearch:
             # a free function that was needed beside the effect is needed without it, too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
+        unknown = f"a free function still gains {left:.3g} nats; {CLEAR:g} show something unknown"
+        self.history.append(Step("fit free functions to what remains", left, None, left > CLEAR, unknown))
         heat = self._heat(current) if left > CLEAR and found else 1.0
         findings = tuple(_finding(one, current, heat) for one in found.values())
         general = {one.name: one.numbers for name, tried in found.items() for one in tried if contains(one.name, name)}
         return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest, general)
+
+    def _note_round(self, before: Model, predictor: Predictor, tried: Sequence[tuple[float, Model]]) -> None:
+        """Write down which effects were put into the model, and what became of them."""
+        for rank, (gain, model) in enumerate(tried):
+            kept = rank == 0 and gain > 0.0
+            why = "gains most" if kept else "gains less" if gain > 0.0 else "gains nothing beyond what noise may"
+            z = self._standard_errors(before, model, predictor.smoothness)
+            self.history.append(Step(describe_change(before.numbers, model.numbers), gain, z, kept, why))
+        if not tried:
+            self.history.append(Step("add one more effect", None, None, False, "none of them gains anything on the log"))
+
+    def _note_change(self, before: Model, after: Model, why: str) -> Model:
+        """The second model; written down if it has other effects."""
+        if set(before.names) != set(after.names):
+            z = self._standard_errors(before, after, after.linear.choose(()).smoothness)
+            nats = after.log_evidence - before.log_evidence
+            self.history.append(Step(describe_change(before.numbers, after.numbers), nats, z, True, why))
+        return after
+
+    def _standard_errors(self, before: Model, after: Model, smoothness: Sequence[float]) -> float:
+        """By how many standard errors the prediction errors of one model are below another's, by blocks of the log."""
+        costs = []
+        for model in (before, after):
+            errors, deviation = np.concatenate(model.linear.left(smoothness)), before.linear.predictor(smoothness).deviation
+            costs.append(mean_squares(errors, deviation))
+        return standard_errors_between(*costs)
 
     def _heat(self, model: Model) -> float:
         """By how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it were

@@ -14,14 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from jaxbl.drive.parameters import set_leaves
-from jaxbl.identification.logs import arrays
 from jaxbl.identification.segments import Segment
-from jaxbl.simulate import Experiment
 
 from .effect_search import LEAST
+from .fitted_model import FittedModel
 from .input_noise import smoothed_input
-from .proof import FittedModel
 from .reference_log import Comparison, Errors, ReferenceLog
 from .setup import InputNoise
 
@@ -30,8 +27,6 @@ LEVEL = 0.01
 _DRAWS = 6
 """Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
 most logs."""
-_LEAST_LEFT = 0.05
-"""Share of a positive number that is left of it at least in a draw."""
 _NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 1.0
 """Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, some of which
 are coarse. That of torques goes with the bandwidth to the power 2.5, which is an estimate, too; the smoother rounds jumps
@@ -86,7 +81,7 @@ def expected_errors(
 
     drawn = []
     for _ in range(_DRAWS):
-        model = _moved(fitted, root @ random.standard_normal(len(root)))
+        model = fitted.move_by(root @ random.standard_normal(len(root)))
         segments = [_disturbed(one, noise, random) for one in log.segments]
         drawn.append(apart(replace(log, segments=segments).compare(model)))
     least = LEAST * driving
@@ -114,16 +109,6 @@ def expected_errors(
 def failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
     """Channels in which a model leaves more than a complete one would, or in which nobody can say: draws of it diverge."""
     return [name for name, one in expected.items() if not errors[name] <= one.limit < np.inf]
-
-
-def _moved(fitted: FittedModel, change: np.ndarray) -> Experiment:
-    """A model whose numbers are off by a change of theta, to first order: a number that the log hardly shows may be off by
-    several times its size, and by no more; what must stay positive stays so."""
-    values = {}
-    for one, at, by in zip(fitted.free, fitted.theta, change, strict=True):
-        value, slope = float(one.value(at)), float(one.slope(at))
-        values[one.path] = max(value + slope * by, _LEAST_LEFT * value) if one.positive else value + slope * by
-    return set_leaves(fitted.experiment, arrays(values))
 
 
 def _disturbed(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:

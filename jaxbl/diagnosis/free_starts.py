@@ -23,17 +23,31 @@ _SETTLED = 1e-9
 decides is 1e-2."""
 
 
+SEEN_SHARE = 0.2
+"""Share of a window that its initial state is fitted to; the rest is foretold."""
+_RANK = 1e-10
+"""Influence of a combination of states, over the largest, below which it stays where it is."""
+_LEAST_SEEN = 8
+"""Samples of a window that are seen at least: twice what the states of a side need."""
+
+
+def count_seen(samples: int) -> int:
+    """Samples of a window that its initial state is fitted to."""
+    return min(max(int(np.ceil(SEEN_SHARE * samples)), _LEAST_SEEN), samples - 1)
+
+
 class Run(NamedTuple):
     """A model on windows of a log.
 
     Attributes:
-        residual: measured less simulated positions over the noise, without what initial states can explain; shape
-            (windows, samples, sides).
+        residual: measured less simulated positions over the noise; shape (windows, samples, sides).
         states: simulated, leaves of shape (windows, samples).
+        noise: what noise in the samples seen adds to the residual, rms, over that noise; shape (sides,).
     """
 
     residual: np.ndarray
     states: PlantState
+    noise: np.ndarray
 
 
 class _Model(NamedTuple):
@@ -80,7 +94,7 @@ class _Model(NamedTuple):
 
 
 def best_runs(experiment: Experiment, windows: Windows, passes: int, rest: bool, varying: NamedArrays | None = None) -> Run:
-    """Runs from the best initial states, found by damped Gauss-Newton.
+    """Runs from the initial states that suit the first fifth of each window best, found by damped Gauss-Newton.
 
     Args:
         experiment: the model, at the windows' period.
@@ -110,6 +124,7 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
     best = np.stack([np.broadcast_to(leaf, len(windows.time)) for leaf in leaves], axis=1).astype(float)
     runs, count = best.shape
     samples = windows.torque.shape[1]
+    seen = count_seen(samples)
     moving = [places.velocity[side] for side in sides]
     still, known = best.copy(), np.ones_like(best)
     still[:, moving] = 0.0
@@ -135,7 +150,7 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
             break
         found = model.states(tried[which], which)
         value = model.residual(found, which)
-        squares = np.sum(value**2, axis=(1, 2))
+        squares = np.sum(value[:, :seen] ** 2, axis=(1, 2))
         better = (squares < cost[which]) | ~np.isfinite(cost[which])
         new = which[better]
         damping[which] = np.where(better, np.maximum(0.01 * damping[which], RIDGE), np.maximum(30.0 * damping[which], 1e-2))
@@ -144,21 +159,23 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
             for kept, one in zip(states, found, strict=True):
                 kept[new] = one[better]
             slope[new] = model.slope([one[better] for one in found], new) * known[new][:, None, None, :]
-        flat = slope[which].reshape(len(which), -1, count)
+        flat = slope[which][:, :seen].reshape(len(which), -1, count)
         size = np.sqrt(np.sum(flat**2, axis=1))
         # a state without influence stays where it is
         size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
         unit = flat / size[:, None, :]
-        towards = np.einsum("wrn,wr->wn", unit, residual[which].reshape(len(which), -1))
+        towards = np.einsum("wrn,wr->wn", unit, residual[which][:, :seen].reshape(len(which), -1))
         matrix = unit.transpose(0, 2, 1) @ unit + damping[which][:, None, None] * np.eye(count)
         change = np.linalg.solve(matrix, towards[:, :, None])[:, :, 0]
         tried[which] = best[which] - change / size
         going[which] = ~(np.einsum("wn,wn->w", change, towards) <= _SETTLED * cost[which])
-    flat = slope.reshape(runs, -1, count)
-    size = np.sqrt(np.sum(flat**2, axis=1))
-    seen = size > INFLUENCE * np.max(size, axis=1, keepdims=True)
-    # of a column of zeros the decomposition makes any direction
-    basis = np.linalg.qr(flat / np.where(seen, size, np.inf)[:, None, :])[0] * seen[:, None, :]
-    left = residual.reshape(runs, -1)
-    left = left - np.einsum("wrn,wn->wr", basis, np.einsum("wrn,wr->wn", basis, left))
-    return Run(left.reshape(residual.shape), shape.unflatten(states))
+    first = slope[:, :seen].reshape(runs, -1, count)
+    size = np.sqrt(np.sum(first**2, axis=1))
+    # a state that the samples seen do not show stays where it is, and adds no noise
+    size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)[:, None, :]
+    unit, first = slope / size[:, :, None, :], first / size
+    inverse = np.linalg.pinv(np.where(np.isfinite(first), first, 0.0), rcond=_RANK)
+    change = np.einsum("wnr,wr->wn", inverse, residual[:, :seen].reshape(runs, -1))
+    left = residual - np.einsum("wrsn,wn->wrs", unit, change)
+    spread = np.einsum("wrsn,wnm,wrsm->wrs", unit[:, seen:], inverse @ inverse.transpose(0, 2, 1), unit[:, seen:])
+    return Run(left, shape.unflatten(states), np.sqrt(np.mean(spread, axis=(0, 1))))

@@ -24,7 +24,7 @@ from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, 
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
 from jaxbl.json_types import JsonObject
-from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
@@ -45,11 +45,12 @@ _FAR = 5.0
 
 
 class Found(NamedTuple):
-    """What a diagnosis consists of: the study with what was missing, `diagnosis.json`, and the trace."""
+    """What a diagnosis consists of: the study with what was missing, `diagnosis.json`, the trace, and what was held out."""
 
     model: Config
     summary: JsonObject
     trace: pd.DataFrame
+    holdout: Record
 
 
 class _Search(NamedTuple):
@@ -150,12 +151,14 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     alone = alone_of(model, point, width, slope, held, gap, why)
     done()
     announce("testing on held-out data")
-    summary = _summary(task, search, alone, gains, out)
+    # names and numbers stand: only the verdict depends on what was held out
+    held_out = task.holdout.open()
+    summary = _summary(task, held_out, search, alone, gains, out)
     numbers = {name: _numbers(alone, name) for name in search.effects if name not in out}
     own = {one.path: alone.values[one.path] for one in _own(search)}
     study = extended_study(task.config, numbers, own)
     done()
-    return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)))
+    return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)), held_out)
 
 
 def _own(search: _Search) -> list[FreeParameter]:
@@ -215,14 +218,14 @@ def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread,
 
 
 def _summary(
-    task: DiagnosisTask, search: _Search, alone: Alone, gains: Mapping[str, float], out: Sequence[str]
+    task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Mapping[str, float], out: Sequence[str]
 ) -> JsonObject:
     """As `diagnosis.json`."""
     record, model = task.record, search.model
     noise, unit = reading_noise(model.segments)["motor"], record.statistics.channels[POSITION_CHANNELS["motor"]].unit
     deviation = {one.path: alone.found.spread.covariance[i, i] ** 0.5 for i, one in enumerate(alone.found.free)}
     values = {one.path: (one, alone.values[one.path], deviation.get(one.path)) for one in model.free}
-    holdout = alone_on_holdout(task.config, task.holdout, alone, search.none)["position"]["motor"]
+    holdout = alone_on_holdout(task.config, held_out, alone, search.none)["position"]["motor"]
     on_log = float(np.sqrt(alone.point.variance))
     limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
     left, size = model.unexplained(alone.point), input_rms(record)
@@ -268,8 +271,8 @@ def _summary(
     if alone.why:
         kept = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.needed else ""
         notes.append(f"No gap is shown: {alone.why}.{kept}")
-    part = task.holdout.segments
-    times = [float(task.holdout.time[part[0].start]), float(task.holdout.time[part[-1].stop - 1])]
+    part = held_out.segments
+    times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
         "verdict": verdict,
@@ -287,13 +290,14 @@ def _summary(
         "rest": {},
         "withdrawn": [],
         "contradictions": [],
+        "history": [],
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing
         "explained_share": None if before <= limit**2 else 1.0 - min(max(after - noise**2, 0.0) / (before - noise**2), 1.0),
         "backlash": None if alone.gap is None else {**(gap_summary(alone) or {}), "nominal": None},
         "gap": {
             "holdout": {
-                "file": str(task.holdout.path.resolve()), "separate": task.separate, "window": None,
+                "file": str(held_out.path.resolve()), "separate": task.separate, "window": None,
                 "from": times[0], "to": times[1],
             },
             "holdout_rmse_before": {"theta_e": holdout["nominal_rms"]},
@@ -303,8 +307,8 @@ def _summary(
             "free_run": {},
             "expected": {"theta_e": {"limit": limit}},
             "test": {
-                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": remainder, "powerless": False,
-                "little": False, "contradicting": False,
+                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": remainder, "weak": [],
+                "worse": holdout["rms"] > holdout["nominal_rms"], "little": False, "contradicting": False, "untested": {},
             },
             "controls": {},
         },

@@ -17,7 +17,7 @@ from jaxbl.identification.logs import arrays
 from jaxbl.records.least_squares import BLOCKS
 
 from .diagnosis_task import DiagnosisTask
-from .proof import FittedModel
+from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
 
 _STEP = 1e-3
@@ -56,20 +56,16 @@ class Contradiction(NamedTuple):
     most: OfLog
 
 
-def contradictions(
-    task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, holdout: ReferenceLog, driving: float
-) -> list[Contradiction]:
+def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, driving: float) -> list[Contradiction]:
     """Numbers of a model that its logs surely do not agree on; none of a single log.
 
     Args:
         task: names the logs.
         fitted: the model, its numbers fitted to all of `log` at once.
-        log, holdout: what was fitted, and what was held out.
+        log: what was fitted.
         driving: torque that drives the machine, rms, N m.
     """
     parts = [(path, _rows_of(log, rows)) for path, rows in task.record.logs]
-    if task.separate:
-        parts += [(path, _rows_of(holdout, rows)) for path, rows in task.holdout.logs]
     parts = [(path, one) for path, one in parts if one.segments]
     if len(parts) < 2 or not fitted.free:
         return []

@@ -1,7 +1,7 @@
 """How well a model predicts a log that it was not fitted to: positions, speeds and missing torques, and their noise.
 
-Positions by short windows and by one free run, each from the best initial state: what an initial state can explain is no
-error of the model. Torques by the equations of motion at the smoothed motion, behind one low-pass for all models.
+Positions by short windows and by one free run: the state at the beginning of each is fitted to its first fifth, and the rest
+is foretold. Torques by the equations of motion at the smoothed motion, behind one low-pass for all models.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment, NamedArrays
 
-from .free_starts import Run, best_runs
+from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques
 from .residuals import SideResiduals, narrowed, residual_torques
 
@@ -66,12 +66,18 @@ class Comparison(NamedTuple):
         samples: the errors one by one, in the order of time; of positions and speeds shape (windows, samples), of torques
             behind the low-pass (samples,).
         gain: torque on the motor for one unit of the input.
+        noise: what noise of the readings adds by way of the initial states, over that noise, by position.
     """
 
     errors: Errors
     torques: SideResiduals
     samples: NamedArrays
     gain: float
+    noise: Errors
+
+    def with_samples(self, samples: NamedArrays) -> "Comparison":
+        """The same with other errors."""
+        return self._replace(samples=samples, errors=_all_rms(samples))
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,7 @@ class ReferenceLog:
             for name in found:
                 if name == position or name.partition(" ")[0].endswith(f"_{side}"):
                     found[name] *= more
+            found[position] *= np.hypot(1.0, compared.noise.get(position, 0.0))
         return found
 
     def with_slow(self, compared: Comparison) -> Errors:
@@ -165,8 +172,16 @@ class ReferenceLog:
         for side, table in (added or {}).items():
             pieces = zip(torques[side], self._rows(), strict=True)
             torques[side] = [replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
-        samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
-        return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain))
+        positions, noise = self._samples(experiment, self.samples, _STATES, added or {})
+        samples = positions | self._narrowed(torques)
+        return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain), noise)
+
+    def readings(self) -> NamedArrays:
+        """Positions as they were read, rad, by channel."""
+        return {
+            POSITION_CHANNELS[side]: np.concatenate([segment.readings[side] for segment in self.segments])
+            for side in self.noise
+        }
 
     def rounding(self, experiment: Experiment) -> Errors:
         """Torques that a model seems to lack along its own motion, rms, N m, by channel, since a smoother rounds jumps of
@@ -216,14 +231,14 @@ class ReferenceLog:
         spare = max(longest.bit_length() - 4, 0)
         length = longest >> spare << spare
         one = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
-        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN, {}))
+        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN, {})[0])
         smoothed = one.segments[0].smoothed
         deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
         return errors, one._growth(experiment, length, deviation)
 
-    def _samples(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> NamedArrays:
-        """Errors of positions and speeds on windows of a length, under torques added sample by sample; shape
-        (windows, samples)."""
+    def _samples(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> tuple[NamedArrays, Errors]:
+        """Errors of positions and speeds on windows of a length, under torques added sample by sample, where windows are
+        foretold; shape (windows, samples). And what noise adds by way of the initial states, as of a comparison."""
         run, firsts = self._runs(experiment, length, passes, added)
         rows = firsts[:, None] + np.arange(length)[None, :]
         found = {
@@ -234,7 +249,8 @@ class ReferenceLog:
             for one in self.segments:
                 smoothed[one.rows] = one.smoothed[side].velocity
             found[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
-        return found
+        noise = {POSITION_CHANNELS[side]: float(run.noise[i]) for i, side in enumerate(experiment.sides)}
+        return {name: errors[:, count_seen(length) :] for name, errors in found.items()}, noise
 
     def _runs(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> tuple[Run, np.ndarray]:
         """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""

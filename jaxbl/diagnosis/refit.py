@@ -31,6 +31,8 @@ _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
 _ROUNDS = 2
 """Choices of the predictor, each followed by a fit."""
+_QUARTERS = 4
+"""Parts of a log of which each is left out once: as much as is held out."""
 
 
 class Refined(NamedTuple):
@@ -44,6 +46,8 @@ class Refined(NamedTuple):
         smoothness: of the predictor, by side.
         start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
         linear: the model along the path of its predictor, with the numbers that were free.
+        left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
+        log_likelihood: nats, with the numbers' prior; only differences count.
     """
 
     experiment: Experiment
@@ -53,6 +57,8 @@ class Refined(NamedTuple):
     smoothness: list[float]
     start: Arrays
     linear: Linear
+    left_out: np.ndarray
+    log_likelihood: float
 
     @property
     def deviation(self) -> np.ndarray:
@@ -143,11 +149,12 @@ class _Refiner:
                     break
         return best
 
-    def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray]:
-        """Covariance of theta: of the errors, which may be correlated, and the prior together; and if they are not."""
+    def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Covariance of theta: of the errors, which may be correlated, and the prior together; and if they are not. And how
+        theta changes where one quarter of the log after the other is left out."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
         if not own:
-            return np.zeros((0, 0)), np.zeros((0, 0))
+            return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((_QUARTERS, 0))
         residual, jacobian = [], []
         for errors in linear.errors(point.predictor.smoothness):
             flat = (errors / np.sqrt(point.predictor.given / linear.count)[None, :, None]).reshape(-1, errors.shape[2])
@@ -157,13 +164,39 @@ class _Refiner:
             rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
             residual.append(rest[:, 0].reshape(-1, sides))
             jacobian.append(rest[:, 1:].reshape(-1, sides, own))
-        found = spread_of(np.concatenate(residual)[None], np.concatenate(jacobian)[None], 2 * sides)
+        errors, slopes = np.concatenate(residual), np.concatenate(jacobian)
+        found = spread_of(errors[None], slopes[None], 2 * sides)
         # samples that only fill up
-        real = linear.count / sum(map(len, residual))
+        real = linear.count / len(errors)
         information, sandwich = real * found.information, found.covariance
         prior = np.diag(self.width**-2.0)
         inverse = np.linalg.inv(information + prior)
-        return inverse @ (information @ sandwich @ information + prior) @ inverse, inverse
+        changes = leave_quarters_out(errors, slopes, prior)
+        return inverse @ (information @ sandwich @ information + prior) @ inverse, inverse, changes
+
+
+def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """How least-squares numbers change where one quarter of the rows after the other is left out, to first order.
+
+    Args:
+        errors: left by the numbers, over their deviation; shape (rows, sides).
+        slopes: their derivatives by the numbers; shape (rows, sides, numbers).
+        prior: precision of the numbers, shape (numbers, numbers).
+
+    Returns:
+        Changes, shape (quarters, numbers).
+    """
+    parts = np.array_split(np.arange(len(errors)), _QUARTERS)
+    grams = np.stack([np.einsum("rsp,rsq->pq", slopes[rows], slopes[rows]) for rows in parts])
+    towards = np.stack([np.einsum("rsp,rs->p", slopes[rows], errors[rows]) for rows in parts])
+    whole = np.sum(grams, axis=0) + prior
+    # no number moves by more than once its size: beyond that a first order says nothing
+    return np.stack(
+        [
+            np.clip(np.linalg.lstsq(whole - gram, by, rcond=None)[0], -1.0, 1.0)
+            for gram, by in zip(grams, towards, strict=True)
+        ]
+    )
 
 
 def refined(
@@ -173,4 +206,6 @@ def refined(
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
     model = set_free_parameters(experiment, free, best.theta)
-    return Refined(model, best.theta, *refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)
+    covariance, white, left_out = refiner.covariance(best)
+    smoothness = best.predictor.smoothness
+    return Refined(model, best.theta, covariance, white, smoothness, best.start, best.linear, left_out, -0.5 * best.cost)

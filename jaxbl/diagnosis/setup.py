@@ -1,4 +1,4 @@
-"""What a diagnosis begins with: the nominal model on both logs, and where it lacks torque."""
+"""What a diagnosis begins with: the nominal model on the log that is fitted, and where it lacks torque."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -57,7 +57,6 @@ class Setup(NamedTuple):
         prior: relative standard deviation of each.
         recorded: segments of the log that numbers are fitted to, with the input as it was recorded.
         fitted: that log, with the input that drives models.
-        holdout: what is held out.
         lacking: torques that the model lacks on the log, by side, segment by segment.
         coordinates: along these torques.
         located: where it lacks them, by side.
@@ -72,7 +71,6 @@ class Setup(NamedTuple):
     prior: np.ndarray
     recorded: Sequence[Segment]
     fitted: ReferenceLog
-    holdout: ReferenceLog
     lacking: SideResiduals
     coordinates: dict[str, list[dict[str, CoordinateValues]]]
     located: dict[str, Localised]
@@ -80,7 +78,7 @@ class Setup(NamedTuple):
 
 
 def set_up(task: DiagnosisTask) -> Setup:
-    """The nominal model on both logs.
+    """The nominal model on the log that is fitted; what is held out is not opened.
 
     Raises:
         InputError: a model that diverges, or whose effects are in an order that others would change.
@@ -94,25 +92,23 @@ def set_up(task: DiagnosisTask) -> Setup:
     own = make_free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
-    recorded, held = (segments_of(one, nominal.sides, rest) for one in (record, task.holdout))
+    recorded = segments_of(record, nominal.sides, rest)
     _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
-    noise, segments = _input_noise(input_rms(record), nominal, own, recorded), recorded
-    if noise.unfelt > 0.0:
-        segments, held = (_quiet(some, noise.unfelt) for some in (recorded, held))
+    noise = _input_noise(input_rms(record), nominal, own, recorded)
+    segments = quiet(recorded, noise.unfelt)
     lacking = residual_torques(nominal, segments)
     sliding = [side for side in nominal.sides if record.statistics.channels[POSITION_CHANNELS[side]].unit == "m"]
     coordinates = all_coordinates(nominal, segments, lacking, sliding)
     located = localise(nominal, lacking, segments, coordinates)
     bandwidth = {name: one.bandwidth for name, one in located.items()}
     fitted = ReferenceLog(segments, bandwidth, rest)
-    holdout = ReferenceLog(held, bandwidth, rest and task.separate)
-    return Setup(
-        task, sliding, bare, nominal, own, prior, recorded, fitted, holdout, lacking, coordinates, located, noise
-    )  # fmt: skip
+    return Setup(task, sliding, bare, nominal, own, prior, recorded, fitted, lacking, coordinates, located, noise)
 
 
-def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
-    """Segments with their inputs smoothed; `noise`: the inputs' standard deviation, N m."""
+def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:
+    """Segments with their inputs smoothed; `noise`: the inputs' standard deviation that the drive did not feel, N m."""
+    if not noise > 0.0:
+        return segments
     return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
 
 
@@ -124,7 +120,7 @@ def _input_noise(size: float, nominal: Experiment, own: Sequence[FreeParameter],
         return InputNoise(0.0, noise)
     # the model as given: numbers that may change would absorb some of the noise
     none, width = np.zeros(len(own)), np.ones(len(own))
-    given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, _quiet(segments, noise)))
+    given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, quiet(segments, noise)))
     smoothness = given.choose(()).smoothness
     share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
     # nats that it did not feel it, rather than did

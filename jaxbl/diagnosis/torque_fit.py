@@ -15,8 +15,9 @@ from jaxbl.identification.free_parameters import set_free_parameters
 from jaxbl.identification.intervals import long_run
 
 from .effect_search import EffectSearch
-from .proof import FittedModel
+from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
+from .refit import leave_quarters_out
 
 _STEP = 1e-4
 """Of theta, for differences: numbers are in units of themselves."""
@@ -58,7 +59,13 @@ def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) 
     variance = float(np.mean((left * np.repeat(np.sqrt(list(apart.values())), counts)) ** 2))
     white = np.linalg.pinv(jacobian.T @ jacobian / variance + np.diag(prior), hermitian=True)
     middle = long_run(jacobian * left[:, None]) / variance**2 + np.diag(prior)
-    model = fitted._replace(experiment=experiment, theta=found.x, covariance=white @ middle @ white, white=white)
+    # sides stand one after the other: a quarter of the log is a quarter of each
+    order = np.argsort(np.concatenate([np.arange(count) / count for count in counts]), kind="stable")
+    changes = leave_quarters_out(left[order, None], jacobian[order, None], np.diag(prior))
+    model = fitted._replace(
+        experiment=experiment, theta=found.x, covariance=white @ middle @ white, white=white, left_out=changes,
+        log_likelihood=np.nan,
+    )  # fmt: skip
     numbers = model.numbers
     if not all(EFFECTS[name].possible(one) for name, one in numbers.items()):
         return None

@@ -17,9 +17,11 @@ from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.identification.segments import Segment
 
+from .blocks import SEEN, standard_errors_better
 from .candidates import Candidate, Forces, Numbers, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
-from .proof import SEEN, FittedModel, beaten, fit_model
+from .fitted_model import FittedModel, fit_model
+from .history import Step, describe_change
 from .reference_log import Comparison, ReferenceLog
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 
@@ -52,7 +54,9 @@ class _Tried(NamedTuple):
     z: float
 
 
-def extended(search: EffectSearch, found: Explanation, fitted: FittedModel, log: ReferenceLog) -> Explanation:
+def extended(
+    search: EffectSearch, found: Explanation, fitted: FittedModel, log: ReferenceLog, history: list[Step]
+) -> Explanation:
     """An explanation with what a regression on the missing torque adds; the same one if it adds nothing.
 
     Args:
@@ -60,9 +64,10 @@ def extended(search: EffectSearch, found: Explanation, fitted: FittedModel, log:
         found: the explanation.
         fitted: the model with it.
         log: the log that was searched, whose low-pass missing torques are looked at behind.
+        history: gets what is tried.
     """
     for _ in range(_ADDED):
-        more = _with_one_more(search, found, fitted, log)
+        more = _with_one_more(search, found, fitted, log, history)
         if more is None:
             break
         found, fitted = more
@@ -70,7 +75,7 @@ def extended(search: EffectSearch, found: Explanation, fitted: FittedModel, log:
 
 
 def _with_one_more(
-    search: EffectSearch, found: Explanation, now: FittedModel, log: ReferenceLog
+    search: EffectSearch, found: Explanation, now: FittedModel, log: ReferenceLog, history: list[Step]
 ) -> tuple[Explanation, FittedModel] | None:
     model = found.model
     compared = log.compare(now.experiment)
@@ -85,16 +90,24 @@ def _with_one_more(
         if not EFFECTS[one.name].possible(fitted.numbers[one.name]):
             continue
         after = log.compare(fitted.experiment)
-        z = beaten(log, compared, after)
-        if z > SEEN and _less(after, compared):
+        z = standard_errors_better(log, compared, after)
+        takes_part = z > SEEN and _less(after, compared)
+        why = f"the missing torque shows it; {SEEN:g} standard error and {_GAIN:.0%} of it are asked"
+        nats = fitted.log_likelihood - now.log_likelihood
+        history.append(Step(describe_change(now.numbers, fitted.numbers), nats, z, takes_part, why))
+        if takes_part:
             tried.append(_Tried(one.name, fitted, after, z))
     if not tried:
         return None
-    # the one that beats all others, or loses by least
-    best = max(tried, key=lambda one: min((beaten(log, other.compared, one.compared) for other in tried if other is not one),
-                                          default=one.z))  # fmt: skip
+
+    def lead(one: _Tried) -> float:
+        """Standard errors by which one beats the nearest of the others."""
+        others = [standard_errors_better(log, other.compared, one.compared) for other in tried if other is not one]
+        return min(others, default=one.z)
+
+    best = max(tried, key=lead)
     findings = [one for one in found.findings if not _replaced(one.effect, best.name)]
-    rivals = {one.name: beaten(log, one.compared, best.compared) for one in tried if one is not best}
+    rivals = {one.name: standard_errors_better(log, one.compared, best.compared) for one in tried if one is not best}
     for name in model.names:
         if _replaced(name, best.name):
             rivals[name] = best.z

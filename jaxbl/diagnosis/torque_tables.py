@@ -1,13 +1,13 @@
 """What no known effect explains, as a table: torque over position, over speed, or both, from what a model still lacks.
 
 Piecewise linear functions are fitted to the missing torque by penalised least squares. Their smoothness, and over which of
-the coordinates they go, are chosen by cross-validation on blocks of the log. They have no name and explain nothing, but the
-model with them predicts better if they are kept: that is decided on held-out data.
+the coordinates they go, are chosen by cross-validation on blocks of the log. They have no name and explain nothing; they are
+kept if the model with them predicts each quarter of the log better by tables that were fitted without it.
 Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from jaxbl.identification.segments import Segment
 from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment, with_effects
 
-from .proof import SURE, Proof, beaten
-from .reference_log import Comparison, ReferenceLog
+from .blocks import SURE, is_worse, standard_errors_better, take_folds
+from .reference_log import Comparison, Errors, ReferenceLog
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
 """Points of a table: waves of 12 periods over the range, or 18 a turn, still show; speeds have them where samples are."""
-_BLOCKS = 10
+_BLOCKS, _QUARTERS = 12, 4
 """Of consecutive samples, each left out once."""
 _GAIN = 0.03
 """Share of the rms that a table has to take away by cross-validation."""
@@ -45,70 +45,80 @@ class Table:
         points: of it, rad or rad/s.
         torques: resisting torque at each, N m.
         errors: their standard errors, from the scatter of blocks of the log.
+        left_out: torques by the rest of the log where one quarter after the other is left out, shape (quarters, points).
     """
 
     over: str
     points: np.ndarray
     torques: np.ndarray
     errors: np.ndarray
+    left_out: np.ndarray
 
 
 @dataclass(frozen=True)
 class Tabulation:
-    """A model with tables, which predicts held-out data better than without.
+    """A model with tables, which predicts parts of the log that they were not fitted to better than without.
 
     Attributes:
         tables: by side.
         experiment: the model with them.
-        after: how it compares on held-out data.
+        compared: how it compares on the log.
         z: standard errors by which it beats the model without them there.
     """
 
     tables: dict[str, list[Table]]
     experiment: Experiment
-    after: Comparison
+    compared: Comparison
     z: float
 
     def effects(self) -> list[JsonObject]:
         """The tables as effects of a study."""
         return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
 
-    def said(self) -> JsonObject:
-        """As JSON."""
-        tables = {side: [asdict(one) for one in tables] for side, tables in self.tables.items()}
-        return {"tables": tables, "z": self.z, "holdout_rmse": self.after.errors}
+    def summarise(self, errors: Errors) -> JsonObject:
+        """As JSON; `errors` are those of the model with them on what was held out."""
+        return {
+            "tables": {
+                side: [{"over": table.over, "points": table.points, "torques": table.torques, "errors": table.errors}
+                       for table in tables]
+                for side, tables in self.tables.items()
+            },
+            "z": self.z,
+            "holdout_rmse": errors,
+        }  # fmt: skip
 
 
-def tabulated(
-    proof: Proof,
+def tabulate(
+    log: ReferenceLog,
     experiment: Experiment,
-    after: Comparison,
+    compared: Comparison,
     lacking: SideResiduals,
     sliding: Sequence[str],
 ) -> Tabulation | None:
-    """Tables of what a model still lacks, if it predicts held-out data better with them; else None.
+    """Tables of what a model still lacks, if parts of the log that they were not fitted to are predicted better with them;
+    else None.
 
     Args:
-        proof: compares models on held-out data.
+        log: that models are compared on.
         experiment: the model.
-        after: how it compares there.
+        compared: how it compares there.
         lacking: torques that it lacks on the log, by side, segment by segment.
         sliding: sides whose positions are no angles.
     """
     best: Tabulation | None = None
+    noise = log.noise_floor(compared.torques)
     for side in experiment.sides:
         if any(effect.name == f"{side}.{Tabulated.kind}" for effect in experiment.effects):
             continue
-        tables = _fitted(proof.setup.fitted, lacking[side], side, rotary=side not in sliding)
+        tables = _fitted(log, lacking[side], side, rotary=side not in sliding)
         if not tables:
             continue
-        known = best.tables if best else {}
-        tried = _with_tables(experiment, {**known, side: tables})
-        compared = proof.other.compare(tried)
-        before = best.after if best else after
-        z = beaten(proof.other, before, compared)
-        if z > SURE and not proof.worse(compared, before):
-            best = Tabulation({**known, side: tables}, tried, compared, beaten(proof.other, after, compared) if best else z)
+        every = {**(best.tables if best else {}), side: tables}
+        model = _with_tables(experiment, every)
+        folds = [log.compare(_with_tables(experiment, every, quarter)) for quarter in range(_QUARTERS)]
+        with_tables, before = take_folds(log.compare(model), folds), best.compared if best else compared
+        if standard_errors_better(log, before, with_tables) > SURE and not is_worse(with_tables, before, noise):
+            best = Tabulation(every, model, with_tables, standard_errors_better(log, compared, with_tables))
     return best
 
 
@@ -144,8 +154,8 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
     limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(_BLOCKS)
     overs, fit = next((overs, one) for overs, one in found if np.mean(one.squares) <= limit)
     ends = np.cumsum([widths[over] for over in overs])[:-1]
-    values, errors = np.split(fit.values, ends), np.split(fit.errors, ends)
-    return [Table(*one) for one in zip(overs, [choices[over] for over in overs], values, errors, strict=True)]
+    parts = (np.split(values, ends, axis=-1) for values in (fit.values, fit.errors, fit.left_out))
+    return [Table(*columns) for columns in zip(overs, [choices[over] for over in overs], *parts, strict=True)]
 
 
 def _sets(overs: Sequence[str]) -> list[list[str]]:
@@ -177,11 +187,13 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Penalised least squares: values, their standard errors, and mean squared errors of each block left out."""
+    """Penalised least squares: values, their standard errors, mean squared errors of each block left out, and values without
+    one quarter of the blocks after the other."""
 
     values: np.ndarray
     errors: np.ndarray
     squares: np.ndarray
+    left_out: np.ndarray
 
     @classmethod
     def of(
@@ -196,18 +208,22 @@ class _Fit:
         grams = [matrix[rows].T @ matrix[rows] for rows in blocks]
         towards = [matrix[rows].T @ target[rows] for rows in blocks]
         inner, right = np.sum(grams, axis=0), np.sum(towards, axis=0)
-        squares = []
-        for rows, gram, one in zip(blocks, grams, towards, strict=True):
-            share = 1.0 - len(rows) / len(target)
-            values = np.linalg.solve(inner - gram + share * penalty, right - one)
-            squares.append(np.mean((target[rows] - matrix[rows] @ values) ** 2))
+
+        def solve_without(out: Iterable[int]) -> np.ndarray:
+            out = list(out)
+            share = 1.0 - sum(len(blocks[i]) for i in out) / len(target)
+            gram, one = (np.sum([parts[i] for i in out], axis=0) for parts in (grams, towards))
+            return np.linalg.solve(inner - gram + share * penalty, right - one)
+
+        squares = [np.mean((target[rows] - matrix[rows] @ solve_without([i])) ** 2) for i, rows in enumerate(blocks)]
+        left_out = np.stack([solve_without(part) for part in np.array_split(np.arange(len(blocks)), _QUARTERS)])
         inverse = np.linalg.inv(inner + penalty)
         values = inverse @ right
         # scatter of the blocks' gradients: errors within a block are correlated
         scores = np.stack([one - gram @ values for gram, one in zip(grams, towards, strict=True)])
         scores -= scores.mean(axis=0)
         covariance = inverse @ (scores.T @ scores * _BLOCKS / (_BLOCKS - 1)) @ inverse
-        return cls(values, np.sqrt(np.diag(covariance)), np.array(squares))
+        return cls(values, np.sqrt(np.diag(covariance)), np.array(squares), left_out)
 
 
 def _numbers(tables: Sequence[Table]) -> JsonObject:
@@ -221,10 +237,12 @@ def _numbers(tables: Sequence[Table]) -> JsonObject:
     return found
 
 
-def _with_tables(experiment: Experiment, tables: Mapping[str, Sequence[Table]]) -> Experiment:
-    """A model with tables on its sides."""
+def _with_tables(experiment: Experiment, tables: Mapping[str, Sequence[Table]], without: int | None = None) -> Experiment:
+    """A model with tables on its sides; `without`: the quarter of the log that they are fitted without."""
     added = []
     for side, some in tables.items():
+        if without is not None:
+            some = [replace(table, torques=table.left_out[without]) for table in some]
         numbers = {key: tuple(one) if isinstance(one, list) else one for key, one in _numbers(some).items()}
         added.append(as_arrays(Tabulated(side=side, **numbers), float))
     return with_effects(experiment, (*added, *experiment.effects))

@@ -25,7 +25,7 @@ from .free_parameters import FreeParameter, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
-from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
+from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .regression import remembers_input
 from .search import ParameterSearch
@@ -77,7 +77,7 @@ def read_identification_task(
     if any(remembers_input(one.build()) for one in config.effects):
         rest = config.log.initial_state == "rest"
         record, other = led_in(record, rest), None if other is None else led_in(other, rest)
-    return LogTask(config, missing, record, other)
+    return LogTask(config, missing, record, None if other is None else SealedRecord(other))
 
 
 def identify(
@@ -154,7 +154,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         if gains:
             summary["gains"] = {side: one._asdict() for side, one in gains.items()}
         if task.holdout is not None:
-            summary["holdout"] = on_holdout(config, task.holdout, nominal, fitted, found.samples)
+            summary["holdout"] = on_holdout(config, task.holdout.open(), nominal, fitted, found.samples)
         done()
     model = with_values(config, values | gain_values)
     return Identification(config, model, record, to_jsonable(summary), trace, "excitation" in task.missing)
@@ -178,7 +178,7 @@ def _from_motor(
         # follows from a number that was not found
         summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
-        summary["holdout"] = alone_on_holdout(config, task.holdout, alone)
+        summary["holdout"] = alone_on_holdout(config, task.holdout.open(), alone)
     done()
     return Identification(
         config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing

@@ -28,6 +28,37 @@ from .segments import Segment
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
 
+class SealedRecord:
+    """A record that can be read once: what is held out until the model stands.
+
+    Attributes:
+        path, notes, warnings: of the record.
+        hash: of all samples.
+    """
+
+    def __init__(self, record: Record):
+        self._record: Record | None = record
+        self.path, self.notes, self.warnings, self.hash = record.path, record.notes, record.warnings, _hash_of(record)
+
+    def open(self) -> Record:
+        """The record.
+
+        Raises:
+            RuntimeError: it has been read before.
+        """
+        record, self._record = self._record, None
+        if record is None:
+            raise RuntimeError(f"{self.path}: what is held out has been read; a second look would be no proof")
+        return record
+
+
+def _hash_of(record: Record) -> bytes:
+    total = hashlib.sha256(str(record.segments).encode())
+    for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+        total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+    return total.digest()
+
+
 @dataclass(frozen=True)
 class LogTask:
     """A study and its log, and what is asked of them: everything that decides the result.
@@ -36,13 +67,13 @@ class LogTask:
         config: the study.
         missing: tables that the study does not have (`excitation`, `observer.motor`, `observer.load`).
         record: the log that numbers are fitted to.
-        holdout: what they are tried out on, or None.
+        holdout: what the model is tried out on when it stands, or None.
     """
 
     config: Config
     missing: frozenset[str]
     record: Record
-    holdout: Record | None
+    holdout: SealedRecord | None
 
     @property
     def heading(self) -> dict[str, Any]:
@@ -61,16 +92,12 @@ class LogTask:
     def identity(self) -> str:
         """Hash of everything that decides the result."""
         text = json.dumps([self.config.to_dict(), sorted(self.missing), version("jaxbl"), _SUMMARIES], sort_keys=True)
-        total = hashlib.sha256(text.encode())
-        for record in (self.record, self.holdout):
-            if record is not None:
-                total.update(str(record.segments).encode())
-                for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
-                    total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        total = hashlib.sha256(text.encode() + _hash_of(self.record))
+        total.update(b"" if self.holdout is None else self.holdout.hash)
         return total.hexdigest()[:16]
 
 
-_SUMMARIES = 5
+_SUMMARIES = 6
 """Version of what `identification.json` and `diagnosis.json` hold: results of another one are computed anew."""
 _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""

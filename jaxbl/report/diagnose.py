@@ -82,9 +82,6 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
 
 
-_TOO_LITTLE = "the data not used for the fit are too noisy, or too few, to show it"
-
-
 def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
     names = _listed([one["effect"] for one in summary["findings"]])
@@ -93,18 +90,20 @@ def verdict_sentence(summary: JsonObject) -> str:
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
     if summary["verdict"] == "no_discrepancy":
         return f"No discrepancy: {_NO_MORE}."
+    if summary["verdict"] == "not_tested":
+        return _not_tested(summary)
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
     alone, test = summary.get("backlash"), summary["gap"]["test"]
     complete = not test["failed"] and not test["remainder"]
     gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
     if not names and gap and complete:
         return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
-    if not names and summary["withdrawn"] and not test["failed"]:
-        return f"Not confirmed: something is missing by the log, perhaps {_listed(summary['withdrawn'])}; {_TOO_LITTLE}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."
-    if test["powerless"] and not any(test[reason] for reason in ("failed", "remainder", "far", "contradicting")):
-        return f"Not confirmed: by the log the model lacks {names}; {_TOO_LITTLE}."
+    if test["worse"]:
+        return (
+            f"Contradicted: by the log the model lacks {names}; data not used for the fit are predicted worse with {them}."
+        )
     share, rest = _share(summary["explained_share"]), ", but not in a way that can be right"
     if not complete:
         rest = f". The rest is none of the known effects: {where}"
@@ -112,6 +111,32 @@ def verdict_sentence(summary: JsonObject) -> str:
     return (
         f"Partly explained: the model lacks {names}; with {them}, {share} of the {what} is explained on data not "
         f"used for the fit{rest}."
+    )
+
+
+def _not_tested(summary: JsonObject) -> str:
+    """What the proof could not test, and what to record."""
+    gap, test = summary["gap"], summary["gap"]["test"]
+    names = _listed([one["effect"] for one in summary["findings"]])
+    found = f"by the log the model lacks {names}" if names else "the log shows nothing that the model lacks"
+    if test["untested"] and all(test["untested"].values()):
+        unit = gap["units"]["torque_motor"]
+        torques = [
+            f"{name} is {rms_text(one['torque'])} {unit} rms there and {rms_text(one['on_log'])} {unit} on the log"
+            for name, one in test["untested"].items()
+        ]
+        why = f"data not used for the fit would be predicted as well without {_listed(list(test['untested']))}"
+        reached = "; ".join(
+            f"{_CHANNELS[name]} {rms_text(reach['log'])} (there {rms_text(reach['proof'])}) {gap['units'][name]}"
+            for name, reach in gap["range"].items()
+        )
+        return f"Not tested: {found}, but {why}: {', '.join(torques)}. Record another log that reaches as far: {reached}."
+    channel = min(gap["range"], key=lambda name: (gap["expected"][name]["limit"] or np.inf) / gap["range"][name]["size"])
+    limit, size = gap["expected"][channel]["limit"], gap["range"][channel]["size"]
+    return (
+        f"Not tested: {found}, but data not used for the fit are no test: even a complete model may leave "
+        f"{rms_text(limit)} {gap['units'][channel]} in {channel}, and there are {rms_text(size)} in all. Record a longer "
+        "or larger motion, or with less noise."
     )
 
 
@@ -168,11 +193,7 @@ def _reasons(summary: JsonObject) -> Lines:
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
             "other. Noise of the torque channel does it, or too small a relative."
         )
-    if test["powerless"]:
-        lines.append(
-            "The data not used for the fit cannot confirm it: the model as given leaves no more there than could be chance."
-        )
-    if test["little"] and not test["failed"] and not test["powerless"]:
+    if test["little"] and not test["failed"]:
         lines.append("It takes away less than half of the torque that is missing on the data not used for the fit.")
     if test["chance"]:
         lines.append("Shuffled in time, the torque that was added does as well.")

@@ -1,0 +1,96 @@
+"""Errors of two models beside one another, block by block of a log."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .reference_log import Comparison, Errors, ReferenceLog
+
+BLOCKS = 16
+"""Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
+logs."""
+SEEN = 1.0
+"""Standard errors by which a channel shows a difference, as a stepwise regression by blocks asks."""
+SURE = 2.0
+"""Standard errors that count as a difference between two models: 2 % by chance."""
+FLOOR = 0.006
+"""Nats a prediction error that structure in the noise (above all quantisation) may bring: 1.2 % of its variance."""
+
+
+def standard_errors_better(log: ReferenceLog, control: Comparison, model: Comparison) -> float:
+    """By how many standard errors a model beats a control, block by block, each channel over its noise.
+
+    All channels together, by the mean of their logarithms, or the channel that shows the difference best if none says
+    otherwise: a ripple is seen in the torque, and hardly in windows of the position. Torques are referred to the input: a
+    model that multiplies all of them, and the input, by one factor misses the same.
+    """
+    both = (control, model)
+    channels = [name for name in control.samples if not name.startswith("velocity")]
+    scales = [{name: each.gain if name.startswith("torque") else 1.0 for name in channels} for each in both]
+    floors = [log.noise_floor(each.torques) for each in both]
+    noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}
+    costs = [
+        np.array([mean_squares(each.samples[name], scale[name] * noise[name]) for name in channels])
+        for each, scale in zip(both, scales, strict=True)
+    ]
+    together = standard_errors_between(*costs)
+    by_channel = [standard_errors_between(*channel) for channel in zip(*costs, strict=True)]
+    return max(together, *by_channel) if min(by_channel) > -SEEN and max(by_channel) > SEEN else together
+
+
+def mean_squares(errors: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
+    """Mean squared errors over their noise, by blocks; errors in the order of time, shape (samples, ...)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.array([np.mean(block) for block in np.array_split(np.square(errors / noise).ravel(), BLOCKS)])
+
+
+def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
+    """By how many standard errors squared errors of a model over their noise, block by block, are below those of a control;
+    shapes (..., blocks), in front channels.
+
+    By logarithms, since a few blocks may have most of the errors, of noise and errors together: what is less than the noise
+    counts for nothing, as on a drive that stands still. What structure in the noise may bring is no gain.
+    """
+    if not (np.isfinite(control).all() and np.isfinite(model).all()):
+        return -np.inf if np.isfinite(control).all() else np.inf
+    gains = np.mean(np.atleast_2d(np.log1p(control) - np.log1p(model)), axis=0)
+    return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(BLOCKS), 2.0 * FLOOR))
+
+
+def is_better(new: Errors, old: Errors) -> bool:
+    """Whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return bool(np.sum(np.log([new[name] for name in old]) - np.log(list(old.values()))) < 0.0)
+
+
+_WORSE, _WORSE_SPEED = 1.02, 1.05
+"""Errors of a model over those of another, or over the noise, up to which it is no worse: what numbers fitted on other data
+cost; of speeds the noise is known less well."""
+_SURELY = 1.1
+"""The same from which on it is worse, whatever the blocks say."""
+
+
+def is_worse(after: Comparison, before: Comparison, noise: Errors) -> bool:
+    """Whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the blocks,
+    or by much."""
+    for name, value in after.errors.items():
+        limit = _WORSE_SPEED if name.startswith("velocity") else _WORSE
+        most = max(before.errors[name], noise[name])
+        if value <= limit * most:
+            continue
+        if not value <= _SURELY * most:
+            return True
+        other, own = (mean_squares(each.samples[name], noise[name]) for each in (before, after))
+        if not standard_errors_between(other, own) > -SURE:
+            return True
+    return False
+
+
+def take_folds(whole: Comparison, folds: Sequence[Comparison]) -> Comparison:
+    """A comparison whose samples are, part by part of the log, those of one model each; torques stay those of the whole."""
+    samples = {name: values.copy() for name, values in whole.samples.items()}
+    for i, fold in enumerate(folds):
+        for name, values in samples.items():
+            rows = np.array_split(np.arange(len(values)), len(folds))[i]
+            values[rows] = fold.samples[name][rows]
+    return whole.with_samples(samples)

@@ -1,0 +1,103 @@
+"""A model with some effects whose numbers are all fitted, and what may be said of these numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbl.drive.effects import EFFECTS, Numbers
+from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves, units_of
+from jaxbl.identification.free_parameters import FreeParameter
+from jaxbl.identification.logs import arrays
+from jaxbl.simulate import Experiment
+
+from .candidates import EffectNumbers
+from .effect_search import EffectSearch
+from .linearised_model import Linear
+
+_LEAST_LEFT = 0.05
+"""Share of a positive number that is left of it at least where it is moved."""
+
+
+class FittedModel(NamedTuple):
+    """A model with some effects, all numbers fitted.
+
+    Attributes:
+        names: of the effects.
+        experiment: the model.
+        free: numbers that were fitted, its own first.
+        theta: of these.
+        covariance: of theta.
+        white: the same if prediction errors are white, as those of a complete model.
+        linear: the model along the log; None of the model as given.
+        left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
+        log_likelihood: nats, with the numbers' prior; only differences count.
+    """
+
+    names: tuple[str, ...]
+    experiment: Experiment
+    free: tuple[FreeParameter, ...]
+    theta: np.ndarray
+    covariance: np.ndarray
+    white: np.ndarray
+    linear: Linear | None = None
+    left_out: np.ndarray | None = None
+    log_likelihood: float = np.nan
+
+    def share(self, name: str) -> float:
+        """Torque of an effect along the log, rms over the driving torque's."""
+        assert self.linear is not None
+        return self.linear.share(name)
+
+    @property
+    def numbers(self) -> dict[str, Numbers]:
+        """All numbers of the effects, those that were not free among them."""
+        effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
+        return {
+            name: {leaf: float(get_leaf(effect, leaf)) for leaf in leaf_paths(effect)} for name, effect in effects.items()
+        }
+
+    def errors(self) -> Numbers:
+        """Standard errors of the values."""
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {number.path: float(number.slope(self.theta[i])) * deviation[i] for i, number in enumerate(self.free)}
+
+    def move_by(self, change: np.ndarray) -> Experiment:
+        """The model with a change of theta, to first order: a number that the log hardly shows may change by several times
+        its size, and by no more; what must stay positive stays so."""
+        values = {}
+        for number, at, by in zip(self.free, self.theta, change, strict=True):
+            value, slope = float(number.value(at)), float(number.slope(at))
+            values[number.path] = max(value + slope * by, _LEAST_LEFT * value) if number.positive else value + slope * by
+        return set_leaves(self.experiment, arrays(values))
+
+
+def fit_model(search: EffectSearch, numbers: EffectNumbers, theta: np.ndarray) -> FittedModel:
+    """A model with some effects, its own numbers and theirs fitted from given ones."""
+    fit = search.refitted({name: dict(values) for name, values in numbers.items()}, theta)
+    return FittedModel(
+        tuple(numbers), fit.experiment, fit.linear.free, fit.theta, fit.covariance, fit.white, fit.linear, fit.left_out,
+        fit.log_likelihood,
+    )  # fmt: skip
+
+
+def special_case(fitted: FittedModel, name: str, noise: Mapping[str, float] | None = None) -> str | None:
+    """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
+    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend. With the `noise` of each
+    side's readings, rad, nor is a way known that is shorter than that."""
+    cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
+    least = {} if noise is None else {"rad": noise.get(place, max(noise.values()))}
+    units = units_of(cls)
+    apart = []
+    for leaf, role in cls.roles().items():
+        path = f"effects.{name}.{leaf}"
+        if role.kind in ("shape", "frequency") and path in errors:
+            known = max(errors[path], least.get(units.get(leaf, ""), 0.0))
+            apart.append(known < abs(float(get_leaf(fitted.experiment, path))))
+    plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
+    return plain if apart and not any(apart) else None
+
+
+def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> Numbers:
+    """Values of free numbers, by path; theta may have others behind them."""
+    return {number.path: float(number.value(theta[i])) for i, number in enumerate(free)}

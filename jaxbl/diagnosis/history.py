@@ -1,0 +1,32 @@
+"""How a name was found: every model that was tried, what it gained, and what became of it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from .candidates import EffectNumbers
+
+
+class Step(NamedTuple):
+    """A model that was tried.
+
+    Attributes:
+        tried: what was changed, such as `add motor.cogging`.
+        nats: gain in log-evidence on the log, or in log-likelihood where numbers alone differ; None where it was not asked.
+        standard_errors: by which the change makes the model better, by blocks of the log; as `nats`.
+        kept: whether the change was made.
+        why: the reason, in words.
+    """
+
+    tried: str
+    nats: float | None
+    standard_errors: float | None
+    kept: bool
+    why: str
+
+
+def describe_change(before: EffectNumbers | Mapping[str, object], after: EffectNumbers | Mapping[str, object]) -> str:
+    """Say which effects one model has that another has not: `add A`, `remove A`, `replace A by B`."""
+    gone, new = (" and ".join(sorted(set(a) - set(b))) for a, b in ((before, after), (after, before)))
+    if gone and new:
+        return f"replace {gone} by {new}"
+    return f"add {new}" if new else f"remove {gone}" if gone else "fit the numbers anew"
