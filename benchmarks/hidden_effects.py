@@ -75,8 +75,10 @@ def oracle(case: Case) -> Mapping[str, float]:
     import jax
     import numpy as np
 
-    from jaxbl.diagnosis.diagnose import new_search, read_diagnosis_task
-    from jaxbl.diagnosis.proof import fit_model
+    from jaxbl.diagnosis.choice import new_search
+    from jaxbl.diagnosis.diagnose import read_diagnosis_task
+    from jaxbl.diagnosis.fitted_model import fit_model
+    from jaxbl.diagnosis.proof import open_held_out
     from jaxbl.diagnosis.setup import set_up
 
     with tempfile.TemporaryDirectory() as folder:
@@ -85,7 +87,7 @@ def oracle(case: Case) -> Mapping[str, float]:
     with jax.enable_x64(True):
         setup = set_up(task)
         fitted = fit_model(new_search(setup), case.truth["effects"], np.zeros(len(setup.own)))
-        return setup.holdout.compare(fitted.experiment).errors
+        return open_held_out(setup)[1].compare(fitted.experiment).errors
 
 
 def identify(case: Case) -> dict[str, tuple[float, float]]:

@@ -6,7 +6,9 @@ PASSED = {
     "far": {},
     "chance": False,
     "remainder": False,
-    "powerless": False,
+    "worse": False,
     "little": False,
     "contradicting": False,
+    "weak": [],
+    "untested": {},
 }

@@ -20,6 +20,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
+from .blocks import standard_errors_better
 from .choice import Choice, Chosen, explain
 from .confidence import explained_share
 from .coordinates import CoordinateValues, all_coordinates
@@ -176,7 +177,9 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             left = localise(fitted.experiment, lacking_after, segments, coordinates)
             summary["where_after"] = where_lacking(task.record, left)
         if tables is not None:
-            summary["torque_tables"] = tables.summarise(proof.log.compare(tables.experiment).errors)
+            with_tables = proof.log.compare(tables.experiment)
+            better = standard_errors_better(proof.log, proof.after, with_tables)
+            summary["torque_tables"] = tables.summarise(with_tables.errors, better)
         if chosen.found.wrong is not None:
             summary["rival"] = rival_tables(task.config, setup.own, chosen.found.wrong)
         done()

@@ -79,7 +79,7 @@ def _with_one_more(
 ) -> tuple[Explanation, FittedModel] | None:
     model = found.model
     compared = log.compare(now.experiment)
-    tried: list[_Tried] = []
+    every: list[_Tried] = []
     # what the search preferred a simpler effect to, with the numbers that it had there
     general = {name: one for name, one in found.general.items() if any(contains(name, other) for other in model.names)}
     proposed = [_Proposal(name, numbers, 0.0) for name, numbers in general.items()]
@@ -91,13 +91,18 @@ def _with_one_more(
             continue
         after = log.compare(fitted.experiment)
         z = standard_errors_better(log, compared, after)
-        takes_part = z > SEEN and _less(after, compared)
-        why = f"the missing torque shows it; {SEEN:g} standard error and {_GAIN:.0%} of it are asked"
-        nats = fitted.log_likelihood - now.log_likelihood
-        history.append(Step(describe_change(now.numbers, fitted.numbers), nats, z, takes_part, why))
-        if takes_part:
-            tried.append(_Tried(one.name, fitted, after, z))
+        every.append(_Tried(one.name, fitted, after, z))
+    tried = [one for one in every if one.z > SEEN and _less(one.compared, compared)]
+
+    def note(kept: str, why: str) -> None:
+        asked = f"{SEEN:g} standard error and {_GAIN:.0%} of the missing torque are asked"
+        for one in every:
+            nats = one.fitted.log_likelihood - now.log_likelihood
+            reason = why if one in tried else asked
+            history.append(Step(describe_change(now.numbers, one.fitted.numbers), nats, one.z, one.name == kept, reason))
+
     if not tried:
+        note("", "")
         return None
 
     def lead(one: _Tried) -> float:
@@ -115,7 +120,9 @@ def _with_one_more(
     alternatives = tuple((name, one) for name, one in chances.items() if one > LEAST_CHANCE)
     confidence = 1.0 - sum(chances.values())
     if confidence < _NAMED:
+        note("", f"the missing torque shows it, but not it alone: confidence {confidence:.2f} of {_NAMED:g}")
         return None
+    note(best.name, f"the missing torque shows {best.name} best")
     findings.append(Finding(best.name, confidence, best.fitted.numbers[best.name], alternatives))
     adopted = search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
     return adopted, best.fitted

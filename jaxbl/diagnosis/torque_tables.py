@@ -75,8 +75,9 @@ class Tabulation:
         """The tables as effects of a study."""
         return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
 
-    def summarise(self, errors: Errors) -> JsonObject:
-        """As JSON; `errors` are those of the model with them on what was held out."""
+    def summarise(self, errors: Errors, z: float) -> JsonObject:
+        """As JSON; `errors` are those of the model with them on what was held out, `z` the standard errors by which it is
+        better there."""
         return {
             "tables": {
                 side: [{"over": table.over, "points": table.points, "torques": table.torques, "errors": table.errors}
@@ -84,6 +85,7 @@ class Tabulation:
                 for side, tables in self.tables.items()
             },
             "z": self.z,
+            "holdout_z": z,
             "holdout_rmse": errors,
         }  # fmt: skip
 

@@ -29,7 +29,8 @@ def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextS
     They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
     terminal.
     """
-    tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
+    summary = found.summary
+    tables = [*_finding_tables(summary), *_history_tables(summary), _gap_table(summary["gap"]), _number_table(summary)]
     lead, remarks = _headline(found.summary), _remarks(found.summary)
     title = found.config.title or f"Diagnosis of {found.record.path.name}"
     return write_results(found, folder, "diagnosis", title, lead, draw_diagnosis(found), tables, remarks, steps)
@@ -116,27 +117,23 @@ def verdict_sentence(summary: JsonObject) -> str:
 
 def _not_tested(summary: JsonObject) -> str:
     """What the proof could not test, and what to record."""
-    gap, test = summary["gap"], summary["gap"]["test"]
-    names = _listed([one["effect"] for one in summary["findings"]])
-    found = f"by the log the model lacks {names}" if names else "the log shows nothing that the model lacks"
-    if test["untested"] and all(test["untested"].values()):
-        unit = gap["units"]["torque_motor"]
-        torques = [
-            f"{name} is {rms_text(one['torque'])} {unit} rms there and {rms_text(one['on_log'])} {unit} on the log"
-            for name, one in test["untested"].items()
-        ]
-        why = f"data not used for the fit would be predicted as well without {_listed(list(test['untested']))}"
-        reached = "; ".join(
-            f"{_CHANNELS[name]} {rms_text(reach['log'])} (there {rms_text(reach['proof'])}) {gap['units'][name]}"
-            for name, reach in gap["range"].items()
-        )
-        return f"Not tested: {found}, but {why}: {', '.join(torques)}. Record another log that reaches as far: {reached}."
-    channel = min(gap["range"], key=lambda name: (gap["expected"][name]["limit"] or np.inf) / gap["range"][name]["size"])
-    limit, size = gap["expected"][channel]["limit"], gap["range"][channel]["size"]
+    gap = summary["gap"]
+    names, units = [one["effect"] for one in summary["findings"]], gap["units"]
+    found = f"by the log the model lacks {_listed(names)}" if names else "the log shows nothing that the model lacks"
+    torques = [
+        f"{name} is {rms_text(one['torque'])} {units['torque_motor']} rms there, {rms_text(one['on_log'])} on the log"
+        for name, one in gap["test"]["untested"].items()
+        if one
+    ]
+    why = "a model without it would pass, too" if torques else "even a complete model may leave as much as moves there"
+    reached = ", ".join(
+        f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
+        f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
+        for name, reach in gap["range"].items()
+    )
     return (
-        f"Not tested: {found}, but data not used for the fit are no test: even a complete model may leave "
-        f"{rms_text(limit)} {gap['units'][channel]} in {channel}, and there are {rms_text(size)} in all. Record a longer "
-        "or larger motion, or with less noise."
+        f"Not tested: {found}; data not used for the fit cannot show it ({'; '.join([why, *torques])}). Hold out a log that "
+        f"reaches as far: {reached}."
     )
 
 
@@ -160,7 +157,8 @@ def _table_lines(summary: JsonObject) -> Lines:
         for name, value in found["holdout_rmse"].items()
         if not name.startswith("velocity")
     )
-    return [f"Not named, but added to model.toml as a table: {which}. On held-out data it takes {errors}."]
+    than = "" if found["holdout_z"] > 0.0 else ", which is no better"
+    return [f"Not named, but added to model.toml as a table: {which}. On held-out data it takes {errors}{than}."]
 
 
 def _share(value: float | None) -> str:
@@ -328,6 +326,18 @@ def _finding_tables(summary: JsonObject) -> list[PageTable]:
     if not rows:
         return []
     return [PageTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)]
+
+
+def _history_tables(summary: JsonObject) -> list[PageTable]:
+    """Every model that was tried, in order."""
+    rows: list[list[object]] = [
+        [step["tried"], step["nats"], step["standard_errors"], "kept" if step["kept"] else "dropped", step["why"]]
+        for step in summary["history"]
+    ]
+    if not rows:
+        return []
+    head = ["tried", "gain on the log (nats)", "by blocks of the log (standard errors)", "", "why"]
+    return [PageTable("How the name was found", head, rows)]
 
 
 def _gap_table(gap: JsonObject) -> PageTable:

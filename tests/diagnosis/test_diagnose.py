@@ -11,17 +11,20 @@ from hidden_log import FRICTION, nominal_study, select_samples, simulate_direct_
 import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
-from jaxbl.diagnosis.diagnose import diagnose, new_search, run_diagnosis
+from jaxbl.diagnosis.blocks import is_better
+from jaxbl.diagnosis.choice import new_search
+from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
 from jaxbl.diagnosis.diagnosis_summary import tied
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
 from jaxbl.diagnosis.next_experiment import next_experiment, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
-from jaxbl.diagnosis.proof import is_better
+from jaxbl.diagnosis.proof import open_held_out
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import read_json
+from jaxbl.identification.logs import SealedRecord
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
@@ -80,7 +83,9 @@ def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
     # where it was felt, by twice the standard error of the share that was not, 0.11; that share is known to one of them
     low, high = 0.02 * np.sqrt([0.11, 0.33]) if felt else (0.018, 0.022)
     assert low < setup.input_noise.possible < high
-    for log, record in ((setup.fitted, task.record), (setup.holdout, task.holdout)):
+    with jax.enable_x64(True):
+        held_out = open_held_out(setup)
+    for record, log in ((task.record, setup.fitted), held_out):
         ((segment,), (rows,)) = log.segments, record.segments
         assert np.array_equal(segment.torque, record.torque[rows]) is felt
 
@@ -101,8 +106,9 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, diagnosis):
     full_record = read_record(logs / "axis.csv")
     task = read_diagnosis_task(logs / "axis.csv", nominal_study())
     assert len(task.record.time) == 1500 and task.record.segments == (slice(DELAY_SAMPLES, 1500),)
-    assert task.holdout.segments == (slice(1500, 2000),)
-    np.testing.assert_array_equal(task.holdout.time, full_record.time)
+    held_out = task.holdout.open()
+    assert held_out.segments == (slice(1500, 2000),)
+    np.testing.assert_array_equal(held_out.time, full_record.time)
     parts = dataclasses.replace(full_record, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
     first, last = split_off_last_quarter(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
@@ -201,10 +207,10 @@ def test_a_steady_torque_is_no_other_one_when_shuffled(logs):
     task = read_diagnosis_task(logs / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
-        (segment,) = setup.holdout.segments
-        assert setup.holdout.permuted(setup.nominal, {"motor": [np.full(len(segment), 0.1)]}) is None
+        (segment,) = setup.fitted.segments
+        assert setup.fitted.permuted(setup.nominal, {"motor": [np.full(len(segment), 0.1)]}) is None
         wave = np.sin(np.linspace(0.0, 20.0, len(segment)))
-        assert setup.holdout.permuted(setup.nominal, {"motor": [wave]}) is not None
+        assert setup.fitted.permuted(setup.nominal, {"motor": [wave]}) is not None
 
 
 def test_new_numbers_are_better_all_in_all():
@@ -229,7 +235,7 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
         fit = refine(experiment, free, *inputs)
         sizes = [number.path for number in free if number.path.startswith("effects.") and number.role == "size"]
         spoilt_experiment = set_leaves(fit.experiment, {path: 4.0 * get_leaf(fit.experiment, path) for path in sizes})
-        return fit._replace(experiment=spoilt_experiment)
+        return fit._replace(experiment=spoilt_experiment, left_out=None)
 
     monkeypatch.setattr(explain, "refined", spoil_sizes)
     task = read_diagnosis_task(logs / "first.csv", nominal_study(), holdout=logs / "last.csv")
@@ -248,6 +254,58 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     after, before = gap["holdout_rmse_after"], gap["holdout_rmse_before"]
     assert sum(np.log(after[name] / before[name]) for name in before) <= 0.0
     assert diagnosis.model.effects == []
+
+
+def test_what_is_held_out_is_read_once_when_the_model_stands(logs, monkeypatch):
+    """Neither model nor history depend on it: they are the same if its samples are others."""
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study())
+    opened = []
+    read = SealedRecord.open
+
+    def count(sealed):
+        opened.append(sealed.path.name)
+        return read(sealed)
+
+    monkeypatch.setattr(SealedRecord, "open", count)
+    first = run_diagnosis(task)
+    assert opened == ["axis.csv"]
+    with pytest.raises(RuntimeError, match=r"axis\.csv: what is held out has been read"):
+        task.holdout.open()
+    # another machine in the same motion: half of its friction, and a wave
+    record = first.holdout
+    torque = np.where(np.arange(len(record.torque)) < 1500, record.torque, record.torque + 0.1 * np.sin(0.1 * record.time))
+    other = dataclasses.replace(task, holdout=SealedRecord(dataclasses.replace(record, torque=torque)))
+    second = run_diagnosis(other)
+    assert second.model == first.model and second.summary["history"] == first.summary["history"]
+    assert [finding["confidence"] for finding in second.summary["findings"]] == [
+        finding["confidence"] for finding in first.summary["findings"]
+    ]
+    assert first.summary["verdict"] == "explained" and second.summary["verdict"] == "unknown_effect"
+
+
+def test_a_proof_that_does_not_move_tests_nothing(logs):
+    """The hold-out log stands still: friction is named by the log, and neither explained nor denied."""
+    task = read_diagnosis_task(logs / "axis.csv", nominal_study())
+    record = task.holdout.open()
+    still = np.random.default_rng(0).normal(0.0, 3e-5, len(record.time))
+    quiet = dataclasses.replace(record, torque=0.0 * record.torque, positions={"motor": still})
+    summary = run_diagnosis(dataclasses.replace(task, holdout=SealedRecord(quiet))).summary
+    assert [finding["effect"] for finding in summary["findings"]] == ["motor.coulomb_friction"]
+    assert summary["verdict"] == "not_tested"
+    (line, *_) = diagnosis_lines(summary)
+    assert line.startswith("Not tested: by the log the model lacks motor.coulomb_friction; data not used for the fit cannot")
+    assert "Hold out a log that reaches as far: motor position " in line
+
+
+def test_the_history_leads_from_log_to_name(diagnosis):
+    """Each line says what was tried, what it gained, and why it was kept or dropped; what is kept is what is named."""
+    history = diagnosis.summary["history"]
+    assert {"tried", "nats", "standard_errors", "kept", "why"} == set(history[0])
+    added = [step for step in history if step["tried"] == "add motor.coulomb_friction" and step["kept"]]
+    assert added and added[0]["nats"] > 100.0 and added[0]["standard_errors"] > 5.0
+    assert any(step["tried"].startswith("add ") and not step["kept"] for step in history)
+    (removed,) = (step for step in history if step["tried"] == "remove motor.coulomb_friction")
+    assert not removed["kept"] and removed["nats"] < -100.0 and removed["standard_errors"] < -5.0
 
 
 def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
@@ -308,14 +366,10 @@ def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
     log.write(fine)
     for inputs, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], fine)):
         task = read_diagnosis_task(inputs, nominal_study(), holdout=holdout)
-        for record in (task.record, task.holdout):
+        records = task.record, task.holdout.open()
+        for record in records:
             assert record.sample_period == pytest.approx(0.004)
-        notes = [
-            note
-            for record in (task.record, task.holdout)
-            for note in record.notes
-            if "every 4 ms, in the log every 2" in note
-        ]
+        notes = [note for record in records for note in record.notes if "every 4 ms, in the log every 2" in note]
         assert notes
 
 

@@ -60,23 +60,19 @@ def compare_logs(
     names = list(zip(map(Path, files), rows, strict=True))
     segments = tuple(SimpleNamespace(rows=row) for row in rows)
     task = SimpleNamespace(
-        record=SimpleNamespace(logs=names[: 1 if separate else 2]),
-        separate=separate,
-        holdout=SimpleNamespace(logs=names[1:]),
+        record=SimpleNamespace(logs=names),
     )
     config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
     with jax.enable_x64(True):
         experiment = prepare(config.with_keys("run", precision="float64"))
         free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
-        log = Torques(segments[: 1 if separate else 2], (first, second), motion_scale, noise, noise_scale)
-        holdout = Torques(segments[1:], (first, second), motion_scale, noise, noise_scale)
-        return contradictions(task, fitted, log, holdout, 5e-3)  # type: ignore[arg-type]
+        log = Torques(segments, (first, second), motion_scale, noise, noise_scale)
+        return contradictions(task, fitted, log, 5e-3)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("separate", [False, True])
-def test_an_inertia_that_two_logs_show_to_differ(separate):
-    (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA, separate=separate)
+def test_an_inertia_that_two_logs_show_to_differ():
+    (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA)
     assert contradiction.path == "drive.motor_inertia" and (contradiction.least.log, contradiction.most.log) == (
         "a.csv",
         "b.csv",
@@ -85,11 +81,8 @@ def test_an_inertia_that_two_logs_show_to_differ(separate):
     assert contradiction.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
 
 
-@pytest.mark.parametrize("separate", [False, True])
-def test_logs_of_one_name_are_two(separate):
-    (contradiction,) = compare_logs(
-        INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv")
-    )
+def test_logs_of_one_name_are_two():
+    (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA, files=("data/run1/log.csv", "data/run2/log.csv"))
     assert (contradiction.least.log, contradiction.most.log) == ("run1/log.csv", "run2/log.csv")
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 
-from jaxbl.diagnosis.diagnose import new_search
+from jaxbl.diagnosis.choice import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.proof import fit_model
+from jaxbl.diagnosis.fitted_model import fit_model
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_fit import fit_to_torque
 from jaxbl.identification.free_parameters import set_free_parameters

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 
-from jaxbl.diagnosis.diagnose import new_search
+from jaxbl.diagnosis.choice import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_regression import _proposals, _replaced

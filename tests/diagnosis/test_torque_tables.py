@@ -10,11 +10,10 @@ from trace_segment import make_segment
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.diagnosis_summary import extended_study
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.proof import Proof
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.residuals import residual_torques
 from jaxbl.diagnosis.setup import set_up
-from jaxbl.diagnosis.torque_tables import _fitted, tabulated
+from jaxbl.diagnosis.torque_tables import _fitted, tabulate
 
 SETTINGS = {"run.duration": 8.0, "run.substeps": 5}
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}}
@@ -66,11 +65,11 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
-        proof = Proof(setup)
-        tabulation = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
+        compared = setup.fitted.compare(setup.nominal)
+        tabulation = tabulate(setup.fitted, setup.nominal, compared, setup.lacking, setup.sliding)
     assert tabulation is not None and tabulation.z > 2.0
     for name in ("theta_e", "torque_motor"):
-        assert tabulation.after.errors[name] < 0.6 * proof.before.errors[name]
+        assert tabulation.compared.errors[name] < 0.6 * compared.errors[name]
     longer = extended_study(task.config, {}, {}, tabulation.effects())
     (effect,) = longer.effects
     assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)

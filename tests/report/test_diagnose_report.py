@@ -161,18 +161,30 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     first, _, _, second, *_ = part_lines(far={"drive.motor_inertia": -25.0})
     assert first == partial_start.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
-    weak_lines = part_lines(powerless=True, little=True)
-    weak_data_end = "the data not used for the fit are too noisy, or too few, to show it."
-    assert weak_lines[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {weak_data_end}"
-    assert weak_lines[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
-    assert not any("less than half" in line for line in weak_lines)
-    withdrawn_summary = change_summary(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
-    unconfirmed_start = "Not confirmed: something is missing by the log, perhaps load.coulomb_friction; "
-    assert diagnosis_lines(withdrawn_summary)[0] == unconfirmed_start + weak_data_end
+    assert part_lines(worse=True)[0].startswith("Contradicted: by the log the model lacks load.coulomb_friction; data that")
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
     motor_line = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
     assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in motor_line
     assert part_lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_what_is_not_tested_is_said_with_what_to_record(names):
+    untested = {"load.coulomb_friction": {"torque": 0.01, "on_log": 0.3}} if names else {}
+    reach = {"theta_e": {"log": 3.0, "proof": 0.1}, "torque_motor": {"log": 2.0, "proof": 0.2}}
+    gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"untested": untested}, "range": reach}
+    findings = SUMMARY["findings"] if names else []
+    line, *_ = diagnosis_lines(change_summary(verdict="not_tested", findings=findings, gap=gap))
+    found, why = (
+        (
+            "by the log the model lacks load.coulomb_friction",
+            "a model without it would pass, too; load.coulomb_friction is 0.01",
+        )
+        if names
+        else ("the log shows nothing that the model lacks", "even a complete model may leave as much as moves there")
+    )
+    assert line.startswith(f"Not tested: {found}; data not used for the fit cannot show it ({why}")
+    assert line.endswith("reaches as far: motor position 3 rad (there 0.1), motor torque 2 N m (there 0.2).")
 
 
 def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
