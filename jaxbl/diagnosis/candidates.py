@@ -91,6 +91,14 @@ class Candidate:
     from_rest: bool = False
 
 
+def are_possible(effects: EffectNumbers, period: float) -> bool:
+    """Whether effects may have these numbers, and can be simulated with them; `period`: sampling period, s."""
+    return all(
+        EFFECTS[name].possible(numbers) and not EFFECTS[name].find_fault(numbers, period)
+        for name, numbers in effects.items()
+    )
+
+
 SHARE = 0.3
 """Prior size of an effect: share of the driving torque's rms."""
 _AT_ONCE = 6

@@ -17,7 +17,7 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .blocks import SEEN, SURE, is_better, is_worse, standard_errors_better, take_folds
-from .candidates import EffectNumbers
+from .candidates import EffectNumbers, are_possible
 from .confidence import exchanged, explained_share, is_little, weigh
 from .effect_search import FAR, EffectSearch, Explanation, Finding
 from .expected_errors import expected_errors, failed
@@ -247,6 +247,7 @@ class Choice:
             every = {name: self._gain(search, fitted, compared, name) for name in names}
             gains = {name: gain for name, (gain, _) in every.items()}
             needless = [name for name in names if not gains[name] > _least_gain(name)]
+            needless += [name for name, own in fitted.numbers.items() if not are_possible({name: own}, search.period)]
             worse = is_worse(compared, self.before, self.noise)
             kept = not needless and not worse
             gone = "" if kept else min(needless, key=fitted.share) if needless else min(names, key=lambda name: gains[name])

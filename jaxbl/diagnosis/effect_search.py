@@ -22,7 +22,7 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .blocks import FLOOR, mean_squares, standard_errors_between
-from .candidates import SHARE, Candidate, EffectNumbers, Numbers, variants_of
+from .candidates import SHARE, Candidate, EffectNumbers, Numbers, are_possible, variants_of
 from .evidence import Evidence, evidence_of
 from .free_functions import functions_of
 from .history import Step, describe_change
@@ -210,6 +210,7 @@ class EffectSearch:
         self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
         self.segments = segments
         self.history: list[Step] = []
+        self.period = segments[0].period
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
         self._models: dict[tuple, Model] = {}
@@ -274,7 +275,7 @@ class EffectSearch:
             if np.max(np.abs(change), initial=0.0) < _REFIT_SETTLED or abs(best.promised) < _REFIT_GAIN:
                 break
             theta, values = self._moved(best, change)
-        if best is None or not all(EFFECTS[name].possible(one) for name, one in best.values.items()):
+        if best is None or not are_possible(best.values, self.period):
             last = best or point
             return Model(last.values, last.theta, -np.inf, -np.inf, last.linear)
         scored = _Scored(best.found, best.linear.count, predictor.deviation)
@@ -282,7 +283,10 @@ class EffectSearch:
         return Model(best.values, best.theta, evidence, scored.log_likelihood, best.linear)
 
     def _point(self, values: dict[str, Numbers], theta: np.ndarray, predictor: Predictor) -> _Point:
-        """Cost at some numbers, and where the linear step leads."""
+        """Cost at some numbers, and where the linear step leads; infinite where they cannot be simulated."""
+        if any(EFFECTS[name].find_fault(numbers, self.period) for name, numbers in values.items()):
+            linear = self.linear({}, theta)
+            return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf, 0.0)
         linear = self.linear(values, theta)
         columns = linear.columns((), predictor.smoothness, predictor.deviation)
         scale, sizes = columns.scale.copy(), {name: linear.size(name) for name in values}
@@ -340,7 +344,11 @@ class EffectSearch:
                 rivals = [one for one in rivals if one.name != plain]
                 found[plain] = [_Tried(plain, first.gain, current.numbers[plain]), *rivals]
             # a rival stands beside the same effects
-            rivals = (model for _, model in others if set(model.names[:-1]) == set(current.names[:-1]))
+            rivals = (
+                model
+                for _, model in others
+                if set(model.names[:-1]) == set(current.names[:-1]) and np.isfinite(model.log_evidence)
+            )
             wrong = next(rivals, None)
             rest = self.remainder(current)
             # small beside what no effect explains: more of them would only imitate that

@@ -1,7 +1,9 @@
 """Whether logs of one machine agree on its numbers.
 
 One model for several logs takes a mean of what they show. Here each log says by itself what the numbers should be: by
-regression of the torque that the model still lacks there on that torque's slopes, with standard errors by blocks.
+regression of the torque that the model still lacks there, while the drive moves, on that torque's slopes, with standard
+errors by blocks. A dry friction and a steady torque that the model lacks take part in it, since they would go into other
+numbers, into other ones in each log.
 """
 
 import dataclasses
@@ -14,7 +16,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
-from jaxbl.records.least_squares import BLOCKS
+from jaxbl.records.least_squares import BLOCKS, rms
 
 from .diagnosis_task import DiagnosisTask
 from .fitted_model import FittedModel
@@ -115,17 +117,21 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         for one, at in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
-    products, torque, lost = [], np.zeros(len(moved)), np.full(len(moved), np.inf)
-    for side, missing in now.items():
-        slopes = np.stack([(one[side] - missing) / _STEP for one in moved])
-        ratio = float(fitted.experiment.drive.ratio(side))
-        size = np.sqrt(np.mean(slopes**2, axis=1))
-        torque = np.hypot(torque, size / ratio)
-        # of a number that has nothing to do with this side
-        with np.errstate(divide="ignore", over="ignore"):
-            lost = np.minimum(lost, np.mean(noises[side] ** 2) / size**2)
-        both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
-        products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
+    products, torque, lost, count = [], np.zeros(len(moved)), np.full(len(moved), np.inf), 1
+    for i, (side, every_row) in enumerate(now.items()):
+        friction, moving = log.lacking_friction(fitted.experiment, side)
+        missing, noise = every_row[moving], noises[side][moving]
+        slopes = np.stack([(one[side][moving] - missing) / _STEP for one in moved])
+        count += len(missing)
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            size = np.sqrt(np.nan_to_num(np.mean(slopes**2, axis=1)))
+            torque = np.hypot(torque, size / float(fitted.experiment.drive.ratio(side)))
+            # of a number that has nothing to do with this side
+            lost = np.fmin(lost, np.mean(noise**2) / size**2)
+        beside = np.zeros((len(friction) * len(now), len(missing)))
+        beside[i * len(friction) : (i + 1) * len(friction)] = friction[:, moving]
+        columns = np.concatenate([slopes, beside, -missing[None]]) / max(rms(every_row), 1e-300)
+        products.append([block @ block.T for block in np.array_split(columns, BLOCKS, axis=1)])
     blocks = np.sum(products, axis=0)
     total = np.sum(blocks, axis=0)
     size = np.sqrt(np.diag(total)[:-1])
@@ -135,14 +141,15 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     def solved(gram: np.ndarray) -> np.ndarray:
         return np.linalg.lstsq(gram[:-1, :-1] / np.outer(size, size), gram[:-1, -1] / size, rcond=1e-10)[0] / size
 
-    change, without = solved(total), np.array([solved(total - one) for one in blocks])
+    own = slice(len(moved))
+    change, without = solved(total)[own], np.array([solved(total - one)[own] for one in blocks])
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
-    count = sum(map(len, now.values()))
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
     inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
-    alone = there & ~agreeing & (lost < _LOST) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    inflation = np.diag(inverse)[own]
+    alone = there[own] & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 
 

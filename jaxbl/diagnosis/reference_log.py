@@ -25,7 +25,7 @@ from jaxbl.simulate import Experiment, NamedArrays
 
 from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques
-from .residuals import SideResiduals, narrowed, residual_torques
+from .residuals import SideResiduals, as_smoothed, low_passed, narrowed, residual_torques
 
 WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
@@ -154,13 +154,21 @@ class ReferenceLog:
         }
 
     def largest_departures(self, experiment: Experiment) -> Errors:
-        """How far a model departs from each side's motion on short windows from the smoothed states, over its range."""
+        """How far a model departs from each side's motion on short windows from the smoothed states, over its range.
+
+        Or over the way on which the input would move a free motor within a window, where that is more: a model that lacks
+        the friction of a slow drive goes as far.
+        """
+        force = max(float(np.max(np.abs(one.torque))) for one in self.segments) * float(experiment.plant.input_gain)
+        free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
         experiment, added = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.rest)[0])
         simulated, found = _run(experiment, windows, windows.start, added).position, {}
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
-            span = max(float(np.ptp(one.readings[side])) for one in self.segments)
+            span = max(
+                *(float(np.ptp(one.readings[side])) for one in self.segments), free / float(experiment.drive.ratio(side))
+            )
             found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
 
@@ -216,6 +224,21 @@ class ReferenceLog:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
         torques = residual_torques(at_period(experiment, self.period), self.segments)
         return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
+
+    def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
+        """A dry friction and a steady torque of 1 N m on a side, behind the low-pass as in :meth:`missing`, shape
+        (2, samples), 0 where the model has one; and where the side moves, shape (samples,)."""
+        effects = [effect for effect in experiment.effects if effect.place == side]
+        dry = not any(type(effect).exclusive for effect in effects)
+        steady = not any(effect.name == f"{side}.constant_torque" for effect in effects)
+        pieces, columns = residual_torques(at_period(experiment, self.period), self.segments)[side], []
+        for segment, piece in zip(self.segments, pieces, strict=True):
+            smoothed = segment.smoothed[side]
+            moving = ~np.asarray(smoothed.held(self.period))
+            signals = np.stack([dry * np.sign(smoothed.velocity), steady * np.ones(len(segment)), moving])
+            columns.append(low_passed(as_smoothed(signals, smoothed, self.period), piece, self.bandwidth[side]))
+        friction = np.concatenate(columns, axis=1)
+        return friction[:2], friction[2] > 0.5
 
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""

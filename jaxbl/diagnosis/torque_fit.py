@@ -10,10 +10,10 @@ References: M. Gautier, Dynamic identification of robots with power model, ICRA 
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaxbl.drive.effects import EFFECTS
 from jaxbl.identification.free_parameters import set_free_parameters
 from jaxbl.identification.intervals import long_run
 
+from .candidates import are_possible
 from .effect_search import EffectSearch
 from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
@@ -67,6 +67,6 @@ def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) 
         log_likelihood=np.nan,
     )  # fmt: skip
     numbers = model.numbers
-    if not all(EFFECTS[name].possible(one) for name, one in numbers.items()):
+    if not are_possible(numbers, log.period):
         return None
     return model._replace(linear=search.linear(numbers, found.x[:own]))

@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.identification.segments import Segment
 
 from .blocks import SEEN, standard_errors_better
-from .candidates import Candidate, Forces, Numbers, columns_of, variants_of
+from .candidates import Candidate, Forces, Numbers, are_possible, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .fitted_model import FittedModel, fit_model
 from .history import Step, describe_change
@@ -87,7 +86,7 @@ def _with_one_more(
     for one in proposed:
         kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
         fitted = fit_model(search, kept | {one.name: one.numbers}, now.theta[: len(search.free)])
-        if not EFFECTS[one.name].possible(fitted.numbers[one.name]):
+        if not are_possible(fitted.numbers, search.period):
             continue
         after = log.compare(fitted.experiment)
         z = standard_errors_better(log, compared, after)

@@ -253,8 +253,8 @@ _DOUBTFUL_TORQUE = 1000.0
 """Factor between the torque and the torque for the nominal inertia that makes a unit doubtful, as mN m for N m. A screw that
 turns slowly against dry friction needs six hundred times the torque of its inertia."""
 _DOUBTFUL_FRICTION = 100.0
-"""Factor between the friction's work and that of the nominal viscous friction that makes a unit doubtful. Dry
-friction that the model lacks takes ten times as much; a tenth is seen only with wrong units."""
+"""Factor between the friction's work, less that of dry friction, and that of the nominal viscous friction that makes a unit
+doubtful. Dry friction may take any multiple, as on a drive that turns slowly; a tenth is seen only with wrong units."""
 
 
 def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: NominalDrive) -> None:
@@ -268,6 +268,8 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     nominal_power = nominal.viscous_at(channel) * rigid_fit.square
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
     power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
+    if power_ratio is not None and power_ratio >= _DOUBTFUL_FRICTION:
+        power_ratio = max((friction_power - rigid_fit.dry_power) / nominal_power, 1.0)
     has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
     sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
     text, is_doubtful, is_surely_wrong, ratio = "", False, False, 1.0
@@ -293,7 +295,10 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         is_doubtful = not 1.0 / _DOUBTFUL_INERTIA < ratio < _DOUBTFUL_TORQUE
         is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < _SURE_FACTOR * _DOUBTFUL_TORQUE)
     if power_ratio is not None and not has_usual_friction and not is_doubtful:
-        text = f"friction takes {friction_power:.3g} W, {power_ratio:.3g} times what the nominal viscous friction would"
+        text = (
+            f"friction takes {friction_power:.3g} W, but for dry friction {power_ratio:.3g} times what the nominal viscous "
+            "friction would"
+        )
         # the nominal friction may be wrong, so this alone is not sure
         is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio
     if is_doubtful:
@@ -302,7 +307,9 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
     viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
     if (
-        viscous < -8.0 * float(rigid_fit.errors[1])
+        # friction that falls with the speed takes work none the less
+        friction_power < 0.0
+        and viscous < -8.0 * float(rigid_fit.errors[1])
         and rigid_fit.inflation[1] < 10.0
         and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
     ):

@@ -28,6 +28,7 @@ class RigidFit:
         torque: rms, N m (N).
         acceleration: rms of the low-passed motion, rad/s² (m/s²).
         power: mean power of the torque, W.
+        dry_power: what the term with the sign of the velocity takes of it, W.
         square: mean of the squared low-passed speed, rad²/s² (m²/s²).
         slowing: fall of the squared speed from begin to end of the segments, over their duration, rad²/s³ (m²/s³).
     """
@@ -43,6 +44,7 @@ class RigidFit:
     torque: float
     acceleration: float
     power: float
+    dry_power: float
     square: float
     slowing: float
 
@@ -114,6 +116,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         torque=rms(target),
         acceleration=rms(rows[:, 0]),
         power=float(np.mean(target * rows[:, 1])),
+        dry_power=float(coefficients[2] * np.mean(rows[:, 2] * rows[:, 1])),
         square=float(np.mean(rows[:, 1] ** 2)),
         slowing=slowing / (len(rows) * period),
     )

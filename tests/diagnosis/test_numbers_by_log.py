@@ -46,6 +46,9 @@ class Torques:
             )
         return {"motor": np.concatenate(result)}
 
+    def lacking_friction(self, experiment, side):
+        return np.zeros((2, len(self.segments) * SAMPLES)), np.full(len(self.segments) * SAMPLES, True)
+
 
 def compare_logs(
     first: float,

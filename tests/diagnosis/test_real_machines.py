@@ -59,7 +59,7 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     assert error[1] < 0.058
     assert summary["verdict"] == "unknown_effect"
     assert summary["where_after"]["motor"]["sentence"]
-    # what remains is no known effect; by blocks of the log a table of it makes the model better, on the other input the force
+    # what remains is no known effect; a table of it is better by blocks of the log, and in force on the other input
     tables = summary["torque_tables"]
     assert tables["z"] > 2.0
     assert tables["holdout_rmse"]["torque_motor"] < summary["gap"]["holdout_rmse_after"]["torque_motor"]

@@ -161,7 +161,7 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     first, _, _, second, *_ = part_lines(far={"drive.motor_inertia": -25.0})
     assert first == partial_start.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
-    assert part_lines(worse=True)[0].startswith("Contradicted: by the log the model lacks load.coulomb_friction; data that")
+    assert part_lines(worse=True)[0].startswith("Contradicted: by the log the model lacks load.coulomb_friction; data not")
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
     motor_line = diagnosis_lines(change_summary(verdict="unknown_effect", gap=gap, backlash=None))[0]
     assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in motor_line

@@ -62,6 +62,10 @@ class GainError(ActuatorEffect):
     def actuate(self, state, torque, step):
         return state, (1.0 + self.relative) * torque
 
+    @classmethod
+    def find_fault(cls, numbers, period):
+        return "" if numbers["relative"] > -1.0 else "relative: at -1 no input acts on the drive; it should be above -1"
+
 
 @EFFECTS.add
 class Saturation(ActuatorEffect):
