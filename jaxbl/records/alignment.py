@@ -5,7 +5,7 @@ A skew or an offset is sure if neither friction, gap nor load torque can cause i
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class NominalDrive:
         gear_ratio: motor over load motion.
         stiffness: of the shaft, at the motor; infinite on a rigid drive, and if its law has none.
         half_gap: half of the free play, at the motor; 0 if there is none.
+        dead_time: whether u acts later than it is commanded: an effect that is sought, or that the model has.
     """
 
     motor_inertia: float
@@ -43,6 +44,7 @@ class NominalDrive:
     gear_ratio: float = 1.0
     stiffness: float = math.inf
     half_gap: float = 0.0
+    dead_time: Literal["no", "sought", "modelled"] = "no"
 
     def inertia_at(self, channel: str) -> float:
         """Return the torque on the motor that accelerates the drive, per acceleration of the encoder `channel`."""

@@ -1,7 +1,7 @@
 """Channels of a log: columns become SI values; wrong units, unsigned words and wrap-around are found and refused."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class RawChannel(NamedTuple):
         unit: rad, m, N m or N.
         saturated: share of rows at the saturation level that `[log]` gives.
         skew: delay of the stamps against the values, s; "estimate": to be estimated.
-        held: whether each value holds until the next stamp.
+        hold: `[log] hold` of a torque that acts on the drive; None for what is only measured.
         drift: growth of the skew, s/s.
     """
 
@@ -33,7 +33,7 @@ class RawChannel(NamedTuple):
     unit: str
     saturated: float
     skew: float | str
-    held: bool
+    hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
 
 
@@ -65,6 +65,9 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
         torques["transmitted"] = table.transmitted
     for name, torque in torques.items():
         channels[name] = _read_torque(file, name, torque, stamps, is_linear=is_linear)
+    # a test rig compares displacement and torque at the same instants
+    if "u" in channels and (table.kind == "drive" or table.hold != "sampled"):
+        channels["u"] = channels["u"]._replace(hold=table.hold or "zoh")
     return channels
 
 
@@ -150,7 +153,7 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
-    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
+    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, drift=table.drift or 0.0)
 
 
 def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
@@ -168,7 +171,7 @@ def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeSt
         f"{name} is the integral of the speed {channel}{step_text}: its errors add up over time. Even a complete model "
         "may leave more than noise, and effects that depend on the load's position are found only roughly."
     )
-    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0, held=False)
+    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0)
 
 
 def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, is_linear: bool) -> RawChannel:
@@ -193,7 +196,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     values = to_si(table, values)
     if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
         raise file.error(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
-    return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew, held=name == "u")
+    return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew or 0.0)
 
 
 # wrap-around
