@@ -26,6 +26,7 @@ from .plausibility import (
     check_torque_sign,
     flag_wrong_units,
     note_channel_faults,
+    note_host_stamps,
     note_lost_motion,
     note_skew,
     note_standstill,
@@ -177,6 +178,8 @@ def read_record(
     grid, gearing, regular, lateness = _resample_and_align(file, table, segmented, channels, gear_ratio, nominal, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
+    if not regular and table.resample is None and len(segmented.segments) == 1:
+        note_host_stamps(file, segmented, channels[encoders[0]].values, grid.values[encoders[0]])
     # the motion is compared with the drive
     if has_both_encoders:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, channels["theta_e"].unit, shaft)
