@@ -65,6 +65,30 @@ def simulate_log(
     return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load / GEAR_RATIO})
 
 
+LATE_PERIOD = 0.01
+
+
+def move(times: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """A multisine motion, rad, or a derivative of it."""
+    rate = 2.0 * np.pi * np.array([0.17, 0.31, 0.53, 0.94, 1.7, 2.9])
+    size, phase = np.array([8.0, 5.0, 3.0, 1.6, 0.8, 0.4]), np.arange(6.0) ** 2
+    return (size * rate**derivative * np.sin(rate * times[:, None] + phase + 0.5 * np.pi * derivative)).sum(axis=1)
+
+
+def drive_torque(times: np.ndarray) -> np.ndarray:
+    """Inertia 4e-4, viscous friction 8e-3, Coulomb friction 0.03."""
+    return 4e-4 * move(times, 2) + 8e-3 * move(times, 1) + 0.03 * np.sign(move(times, 1))
+
+
+def simulate_late_log(late: float, torque=drive_torque, motor=move, noise: float = 1e-4) -> pd.DataFrame:
+    """A log whose u lies `late` periods after a torque that is held from each stamp on, by the mean over a period."""
+    times = LATE_PERIOD * np.arange(3000)
+    offsets = (np.arange(20) + 0.5) / 20.0 - late
+    u = np.mean([torque(times + LATE_PERIOD * offset) for offset in offsets], axis=0)
+    position = motor(times) + noise * np.random.default_rng(5).standard_normal(3000)
+    return pd.DataFrame({"t": times, "u": u, "theta_e": position})
+
+
 NOMINAL = NominalDrive(
     gear_ratio=20.0, stiffness=50.0, half_gap=0.0, motor_inertia=1e-3, motor_viscous=2e-3, load_inertia=0.4, load_viscous=1.0
 )

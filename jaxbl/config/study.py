@@ -119,9 +119,12 @@ class Config(Table):
     def nominal_drive(self) -> NominalDrive:
         """Return the nominal numbers that a log of the drive is checked against."""
         drive, law = self.drive, None if self.transmission is None else self.transmission.build()
+        acts_late = any(effect.kind in ("actuator.delay", "actuator.lag") for effect in self.effects)
+        dead_time = "modelled" if acts_late else "no"
         if law is None or drive.kind != "two_inertia":
-            return NominalDrive(drive.motor_inertia, drive.motor_viscous)
+            return NominalDrive(drive.motor_inertia, drive.motor_viscous, dead_time=dead_time)
         return NominalDrive(
+            dead_time=dead_time,
             motor_inertia=drive.motor_inertia,
             motor_viscous=drive.motor_viscous,
             load_inertia=drive.load_inertia,

@@ -40,7 +40,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
         InputError: unfit log or study, or a hold-out log of another machine.
     """
     config, missing = read_model(model)
-    record, other = read_with_holdout(config, log, holdout)
+    record, other = read_with_holdout(config, log, holdout, seeks_delay=True)
     if other is None:
         record, other = split_off_last_quarter(record)
     else:

@@ -19,6 +19,7 @@ from jaxbl.drive.excitation import Sine
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
+from jaxbl.records.table import TorqueTable
 from jaxbl.simulate import Experiment
 
 from .free_parameters import PLANT_TABLES, is_positive
@@ -107,21 +108,22 @@ _NEAR = 1e-2
 """Relative difference of the sampling periods of a log and what is held out that changes no result."""
 
 
-def read_logs(config: Config, logs: Logs, like: Record | None = None) -> Record:
+def read_logs(config: Config, logs: Logs, like: Record | None = None, *, seeks_delay: bool = False) -> Record:
     """Read logs as a study says, with the channels that its drive needs.
 
-    A skew and an offset between the encoders that one log of a machine is sure of hold for those that are not: that of
-    the first such log, or of the record that they are to be `like`. Logs are read at the longest of their sampling periods,
-    the finest that all of them have; a finer log than the record they are to be `like` at the record's.
+    A skew of u, and a skew and an offset between the encoders, that one log of a machine is sure of hold for those that are
+    not: that of the first such log, or of the record that they are to be `like`. Logs are read at the longest of their
+    sampling periods, the finest that all of them have; a finer log than the record they are to be `like` at the record's. An
+    input that is earlier than the motion is corrected, too, unless the command `seeks_delay`.
     """
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    records = [_checked(config, one) if isinstance(one, Record) else _read_one(config, one) for one in several]
+    records = [_checked(config, one) if isinstance(one, Record) else _read_one(config, one, seeks_delay) for one in several]
     config = _at_one_period(config, records, like)
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
         if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
-            records[i] = _read_one(config, log)
+            records[i] = _read_one(config, log, seeks_delay)
     known: dict[str, float] = {}
     for one in [*reversed(records)] if like is None else [like]:
         known |= one.corrections
@@ -135,7 +137,7 @@ def read_logs(config: Config, logs: Logs, like: Record | None = None) -> Record:
             if key in given and (key in record.corrections or key != "offset")
         }
         if not isinstance(log, Record) and given != record.corrections:
-            again = _read_one(_corrected(config, given), log)
+            again = _read_one(_corrected(config, given), log, seeks_delay)
             # the reader counts what [log] gives as no correction of its own
             records[i] = replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
@@ -159,16 +161,18 @@ def _at_one_period(config: Config, records: Sequence[Record], like: Record | Non
     return config.with_keys("log", resample=longest)
 
 
-def read_with_holdout(config: Config, logs: Logs, holdout: Logs | None) -> tuple[Record, Record | None]:
+def read_with_holdout(
+    config: Config, logs: Logs, holdout: Logs | None, *, seeks_delay: bool = False
+) -> tuple[Record, Record | None]:
     """Logs and what is held out, both at the longest of their sampling periods; as :func:`read_logs`."""
-    record = read_logs(config, logs)
+    record = read_logs(config, logs, seeks_delay=seeks_delay)
     if holdout is None:
         return record, None
-    other = read_logs(config, holdout, like=record)
+    other = read_logs(config, holdout, record, seeks_delay=seeks_delay)
     if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
         config = config.with_keys("log", resample=other.sample_period)
-        record = read_logs(config, logs)
-        other = read_logs(config, holdout, like=record)
+        record = read_logs(config, logs, seeks_delay=seeks_delay)
+        other = read_logs(config, holdout, record, seeks_delay=seeks_delay)
     check_positions(record, other)
     return record, other
 
@@ -203,8 +207,11 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
 
 
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:
-    """The study with a skew of theta_s and an offset of theta_e in `[log]`, as they are given."""
+    """The study with skews of theta_s and u and an offset of theta_e in `[log]`, as they are given."""
     table = config.log
+    if "u.skew" in given:
+        u = (table.u or TorqueTable()).model_copy(update={"skew": given["u.skew"]})
+        table = table.model_copy(update={"u": u, "hold": "sampled" if given["u.sampled"] else "zoh"})
     for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
         # a speed in place of a position has no key for some of them, and then no need
         name, channel = table.position_source(position)
@@ -213,9 +220,11 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     return config.model_copy(update={"log": table})
 
 
-def _read_one(config: Config, log: str | Path) -> Record:
+def _read_one(config: Config, log: str | Path, seeks_delay: bool) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
+    if seeks_delay and nominal.dead_time == "no":
+        nominal = replace(nominal, dead_time="sought")
     return _checked(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal))
 
 

@@ -5,7 +5,7 @@ A skew or an offset is sure if neither friction, gap nor load torque can cause i
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class NominalDrive:
         gear_ratio: motor over load motion.
         stiffness: of the shaft, at the motor; infinite on a rigid drive, and if its law has none.
         half_gap: half of the free play, at the motor; 0 if there is none.
+        dead_time: whether u acts later than it is commanded: an effect that is sought, or that the model has.
     """
 
     motor_inertia: float
@@ -43,6 +44,7 @@ class NominalDrive:
     gear_ratio: float = 1.0
     stiffness: float = math.inf
     half_gap: float = 0.0
+    dead_time: Literal["no", "sought", "modelled"] = "no"
 
     def inertia_at(self, channel: str) -> float:
         """Return the torque on the motor that accelerates the drive, per acceleration of the encoder `channel`."""
@@ -161,9 +163,7 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     if abs(value) < (1.0 if has_both_flanks else 0.5) * constant / nominal.stiffness:
         return None
     is_sure = (
-        has_both_flanks
-        and regression.lacks_harmonics
-        and abs(value) > _SURE_ERRORS * float(errors[0]) + _NOMINAL_FACTOR * constant / nominal.stiffness
+        has_both_flanks and abs(value) > _SURE_ERRORS * float(errors[0]) + _NOMINAL_FACTOR * constant / nominal.stiffness
     )
     return Offset(value, error, has_both_flanks, is_sure)
 
@@ -171,12 +171,13 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
 class _Regression(NamedTuple):
     """Regression of the twist, less the nominal wind-up, on 1, flank, load velocity and acceleration.
 
+    Errors that repeat with the load's turn are regressed along if they improve the fit much.
+
     Attributes:
         values, errors: coefficients of 1, flank, velocity, acceleration; 0 for the flank if there is only one.
         torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration: low-passed, shape (samples,).
         has_both_flanks: True if torque, velocity or acceleration of both signs occur.
         twist_range: of the twist without the wind-up, without a hundredth at each end, rad (m).
-        lacks_harmonics: True if errors that repeat with the load's turn do not improve the fit much.
     """
 
     values: np.ndarray
@@ -188,7 +189,6 @@ class _Regression(NamedTuple):
     motor_acceleration: np.ndarray
     has_both_flanks: bool
     twist_range: float
-    lacks_harmonics: bool
 
 
 def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regression | None:
@@ -223,9 +223,9 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     mean_square, is_clear, rows = best
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
     harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
-    lacks_harmonics = (
-        _residual_mean_square(target[is_clear], np.column_stack([rows, *harmonics])) > _MIN_HARMONIC_RESIDUAL * mean_square
-    )
+    with_harmonics = np.column_stack([rows, *harmonics])
+    if _residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
+        rows = with_harmonics
     values, errors = fit_with_jackknife(target[is_clear], rows)
     if not np.isfinite(values).all():
         return None
@@ -233,7 +233,7 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
         values, errors = np.insert(values, 1, 0.0), np.insert(errors, 1, 0.0)
     twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
     motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
-    return _Regression(values, errors, *motion, flanks, twist_range, lacks_harmonics)
+    return _Regression(values, errors, *motion, flanks, twist_range)
 
 
 def _low_pass_motion(

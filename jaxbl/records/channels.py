@@ -1,7 +1,7 @@
 """Channels of a log: columns become SI values; wrong units, unsigned words and wrap-around are found and refused."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class RawChannel(NamedTuple):
         unit: rad, m, N m or N.
         saturated: share of rows at the saturation level that `[log]` gives.
         skew: delay of the stamps against the values, s; "estimate": to be estimated.
-        held: whether each value holds until the next stamp.
+        hold: `[log] hold` of a torque that acts on the drive; None for what is only measured.
         drift: growth of the skew, s/s.
     """
 
@@ -33,7 +33,7 @@ class RawChannel(NamedTuple):
     unit: str
     saturated: float
     skew: float | str
-    held: bool
+    hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
 
 
@@ -65,6 +65,9 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
         torques["transmitted"] = table.transmitted
     for name, torque in torques.items():
         channels[name] = _read_torque(file, name, torque, stamps, is_linear=is_linear)
+    # a test rig compares displacement and torque at the same instants
+    if "u" in channels and (table.kind == "drive" or table.hold != "sampled"):
+        channels["u"] = channels["u"]._replace(hold=table.hold or "zoh")
     return channels
 
 
@@ -146,11 +149,14 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
         _check_wrap(file, name, table, values, stamps)
     else:
         values = _unwrap(file, name, table, values)
+    step = 1.0 / table.factor if table.unit == "counts" else find_resolution(values)
+    if step:
+        values = _undo_counter_jumps(file, name, values, step, stamps)
     _check_unit(file, name, table, values)
     values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
-    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
+    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, drift=table.drift or 0.0)
 
 
 def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
@@ -168,7 +174,7 @@ def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeSt
         f"{name} is the integral of the speed {channel}{step_text}: its errors add up over time. Even a complete model "
         "may leave more than noise, and effects that depend on the load's position are found only roughly."
     )
-    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0, held=False)
+    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0)
 
 
 def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, is_linear: bool) -> RawChannel:
@@ -180,6 +186,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
         _check_unsigned(file, name, column, values)
     if name == "u" and np.ptp(values) == 0.0:
         file.notes.append(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
+    values = _replace_dropouts(file, name, values, stamps)
     saturated = 0.0
     if table.saturation is not None:
         # the margins are for the rounding of decimal numbers
@@ -193,7 +200,75 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     values = to_si(table, values)
     if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
         raise file.error(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
-    return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew, held=name == "u")
+    return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew or 0.0)
+
+
+_MAX_DROPOUT = 3
+"""Samples of a dropout at most: a bus that does not answer for longer stops the drive."""
+_MAX_DROPOUT_SHARE = 0.1
+"""Share of the samples beyond which a value is a part of the input, which is switched."""
+_CLEAR_JUMP = 5.0
+"""Size of a dropout or a jump, over what the samples beside it differ by: more than any smooth signal makes."""
+
+
+def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: TimeStamps) -> np.ndarray:
+    """Replace single samples that return to one value again and again, as of a bus that did not answer.
+
+    The value is 0, or the least or largest. Two samples on each side of a dropout lie on a line that is far from it.
+    """
+    for filler in (0.0, values.min(), values.max()):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], values == filler, [False]]).astype(int)))
+        starts, stops = edges[::2], edges[1::2]
+        is_inside = (stops - starts <= _MAX_DROPOUT) & (starts >= 2) & (stops <= len(values) - 2)
+        starts, stops = starts[is_inside], stops[is_inside]
+        beside = values[np.stack([starts - 2, starts - 1, stops, stops + 1])]
+        # two dropouts may be neighbours
+        beside = np.where(beside == filler, beside[[1, 0, 3, 2]], beside)
+        middle = 0.5 * (beside[1] + beside[2])
+        bend = np.abs(2.0 * beside[[1, 2]] - beside[[0, 3]] - middle).max(axis=0)
+        is_clear = np.abs(middle - filler) > _CLEAR_JUMP * bend
+        dropped = [np.arange(*pair) for pair in zip(starts[is_clear], stops[is_clear], strict=True)]
+        # levels of a stepping or random input look like dropouts now and then
+        if len(dropped) < max(3.0, 0.5 * len(starts)) or len(dropped) > _MAX_DROPOUT_SHARE * len(values):
+            continue
+        rows = np.concatenate(dropped)
+        is_kept = np.ones(len(values), bool)
+        is_kept[rows] = False
+        values = values.copy()
+        values[rows] = np.interp(stamps.times[rows], stamps.times[is_kept], values[is_kept])
+        file.warnings.append(
+            f"{name} is {filler:g} in {len(rows)} samples between others that are far from it (data row "
+            f"{stamps.rows[rows[0]] + 1} first): dropouts, which were left out."
+        )
+    return values
+
+
+_MIN_COUNTER, _MAX_COUNTER = 2.0**8, 2.0**32
+"""Powers of two by which a counter jumps: bytes and words. A few lost counts are other numbers."""
+
+
+def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: float, stamps: TimeStamps) -> np.ndarray:
+    """Undo jumps of a position by a power of two of its steps, between which it goes on as before."""
+    from scipy.ndimage import median_filter
+
+    differences = np.diff(values)
+    # without the motion, which hardly changes from sample to sample
+    sizes = (differences - median_filter(differences, 9, mode="nearest")) / step
+    jumps = np.zeros(len(sizes))
+    for row in np.flatnonzero(np.abs(sizes) > 0.9 * _MIN_COUNTER):
+        power = 2.0 ** round(math.log2(abs(sizes[row])))
+        tolerance = 2.0 + 3.0 * float(np.median(np.abs(sizes[max(row - 4, 0) : row + 5])))
+        if power <= _MAX_COUNTER and abs(abs(sizes[row]) - power) < tolerance < power / _CLEAR_JUMP:
+            jumps[row] = math.copysign(power, sizes[row])
+    rows = np.flatnonzero(jumps)
+    if not len(rows) or len(rows) > 0.01 * len(values):
+        return values
+    texts = [f"{jumps[row]:+.0f} (data row {stamps.rows[row + 1] + 1})" for row in rows[:6]]
+    file.warnings.append(
+        f"{name}: {len(rows)} counter jump{'s' * (len(rows) > 1)}, in steps of {step:.4g}: {', '.join(texts)}"
+        f"{', ...' * (len(rows) > 6)}. They were undone."
+    )
+    return values - step * np.cumsum(np.concatenate([[0.0], jumps]))
 
 
 # wrap-around

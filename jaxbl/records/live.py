@@ -120,6 +120,8 @@ def check_stream_table(table: LogTable, name: str) -> None:
     channels = _stream_channels(table)
     keys = [f"{channel}.{key}" for channel in channels for key in ("skew", "drift") if getattr(channels[channel], key, None)]
     keys += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
+    # a sampled torque is known only with the next sample
+    keys += ["hold"] if table.hold == "sampled" else []
     keys += [f"where.{key}" for key, required in (table.where or {}).items() if isinstance(required, str)]
     if keys:
         raise InputError(f"{name}: [log] {keys[0]} is for whole logs; remove it to read rows that arrive one at a time")

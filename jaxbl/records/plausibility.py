@@ -12,11 +12,12 @@ from .alignment import NominalDrive
 from .channels import RawChannel
 from .files import LogFile
 from .gearing import UNRELATED, Gearing, twist_noise
+from .least_squares import rms
 from .resampling import Grid
 from .rigid_body import RigidFit
 from .signal_quality import ChannelStatistics, find_resolution
 from .table import POSITION_CHANNELS, LogTable
-from .time_stamps import SegmentedStamps
+from .time_stamps import SegmentedStamps, fit_even_stamps
 
 
 def check_position_moves(file: LogFile, name: str, values: np.ndarray) -> None:
@@ -346,6 +347,22 @@ def note_channel_faults(file: LogFile, name: str, statistics: ChannelStatistics,
     if statistics.unit == "rad" and rate > 1e4:
         rpm = rate * 30.0 / math.pi
         file.warnings.append(f"{DOUBT}{name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
+
+
+_CLEAR_STAMP_FAULT = 5.0
+"""Factor by which even samples have to be smoother than their stamps make them: resampling changes noise by at most two."""
+
+
+def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.ndarray, resampled: np.ndarray) -> None:
+    """Warn of stamps that make a motion rougher than even samples do: a host's, with the delays of its bus and system."""
+    even_noise, stamped_noise = (rms(np.diff(values, n=4)) for values in (readings[segmented.segments[0]], resampled))
+    if stamped_noise > _CLEAR_STAMP_FAULT * even_noise:
+        period = fit_even_stamps(segmented.times[segmented.segments[0]]).period
+        times_better = stamped_noise / max(even_noise, 1e-300)
+        file.warnings.append(
+            f"{DOUBT}the samples fit even stamps {times_better:.2g} times better than their own: these are a host's, not "
+            f"the drive's. [log] t = {{ period = {period:.4g} }} reads them as even, if no row was lost."
+        )
 
 
 def note_skew(file: LogFile, gearing: Gearing, period: float) -> None:

@@ -218,21 +218,23 @@ def propose_study(
         guesses.append("u is reversed: with its sign in the file the drive would accelerate against it.")
         inspection = inspect(path, table)
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
-        rough = vars(_fit_nominal_drive(inspection, guesses, gear_ratio))
-        nominal = NominalDrive(
-            **{name: value if name == "gear_ratio" else _round_to_3_digits(value) for name, value in rough.items()}
-        )
+        rough = _fit_nominal_drive(inspection, guesses, gear_ratio)
+        numbers = {name: value for name, value in vars(rough).items() if name not in ("gear_ratio", "dead_time")}
+        nominal = replace(rough, **{name: _round_to_3_digits(value) for name, value in numbers.items()})
     else:
         guesses.append("The numbers of the drive are those of the model.")
-    if math.isfinite(nominal.stiffness):
-        inspection = inspect(path, table, gear_ratio=gear_ratio or nominal.gear_ratio, nominal=nominal)
-        for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
-            if key in inspection.record.corrections:
-                name, _ = inspection.log.position_source(channel)
-                channel_table = table.get(name, name)
-                if not isinstance(channel_table, dict):
-                    channel_table = {"column": channel_table}
-                table[name] = channel_table | {key: inspection.record.corrections[key]}
+    ratio = (gear_ratio or nominal.gear_ratio) if math.isfinite(nominal.stiffness) else None
+    inspection = inspect(path, table, gear_ratio=ratio, nominal=nominal)
+    corrections = inspection.record.corrections
+    for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset"), ("u", "u.skew")):
+        if key in corrections:
+            name = "u" if channel == "u" else inspection.log.position_source(channel)[0]
+            channel_table = table.get(name, name)
+            if not isinstance(channel_table, dict):
+                channel_table = {"column": channel_table}
+            table[name] = channel_table | {key.removeprefix("u."): corrections[key]}
+    if corrections.get("u.sampled"):
+        table["hold"] = "sampled"
     return _make_study(inspection, nominal, table), guesses, inspection
 
 

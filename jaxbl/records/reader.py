@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import ValidationError
@@ -18,6 +18,7 @@ from .alignment import NominalDrive, Skew, find_encoder_offset, judge_clock_skew
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
+from .lateness import Lateness, estimate_lateness
 from .plausibility import (
     check_channels_differ,
     check_gear_ratio,
@@ -25,6 +26,7 @@ from .plausibility import (
     check_torque_sign,
     flag_wrong_units,
     note_channel_faults,
+    note_host_stamps,
     note_lost_motion,
     note_skew,
     note_standstill,
@@ -79,7 +81,8 @@ class Record:
         segments: samples of each segment; between them the log has gaps.
         notes: sentences on changes to the log, and on its oddities.
         warnings: sentences to be said first: corrected clocks or zero points of encoders, doubtful units.
-        corrections: "skew" of theta_s, s, its "drift", s/s, and "offset" of theta_e, rad (m), if they were applied.
+        corrections: "skew" of theta_s, s, its "drift", s/s, "offset" of theta_e, rad (m), "u.skew", s, and "u.sampled" (1 if
+            u was sampled at its stamps, 0 if it is held from them on), if they were applied.
         contradiction: reason for which the nominal drive cannot be fitted, such as a wrong unit; "" if there is none.
         statistics: of its stamps, channels, gearing and torque.
         intervals: between the raw stamps that were used, s, shape (raw samples - 1,).
@@ -172,9 +175,11 @@ def read_record(
         note_standstill(file, segmented, channels)
     # these become evenly spaced samples
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
-    grid, gearing, regular = _resample_and_align(file, table, segmented, channels, gear_ratio, shaft)
+    grid, gearing, regular, lateness = _resample_and_align(file, table, segmented, channels, gear_ratio, nominal, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
+    if not regular and table.resample is None and len(segmented.segments) == 1:
+        note_host_stamps(file, segmented, channels[encoders[0]].values, grid.values[encoders[0]])
     # the motion is compared with the drive
     if has_both_encoders:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, channels["theta_e"].unit, shaft)
@@ -196,9 +201,8 @@ def read_record(
         statistics["theta_s"] = replace(statistics["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
         note_skew(file, gearing, grid.period)
         note_lost_motion(file, gearing, statistics)
-    # a delay of the torque shows only if the motion explains the torque, mostly by inertia
-    if dynamics is not None and dynamics.residual < 0.1 and dynamics.shares[0] > 0.3:
-        statistics["u"] = replace(statistics["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
+    if lateness is not None and lateness.is_known:
+        statistics["u"] = replace(statistics["u"], skew=lateness.value, skew_error=lateness.error)
     return Record(
         path=file.path,
         time=grid.time - grid.time[0],
@@ -226,12 +230,13 @@ def _resample_and_align(
     segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     gear_ratio: float | None,
+    nominal: NominalDrive | None,
     shaft: NominalDrive | None,
-) -> tuple[Grid, Gearing | None, bool]:
+) -> tuple[Grid, Gearing | None, bool, Lateness | None]:
     """Resample the channels to even spacing and remove skews.
 
     Returns:
-        The samples, the relation of both encoders, and True if the stamps had that spacing already.
+        The samples, the relation of both encoders, True if the stamps had that spacing already, and the lateness of u.
     """
     period = table.resample or segmented.period
     regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
@@ -246,6 +251,19 @@ def _resample_and_align(
         return grid, fit_gearing(grid.time, motor, load, grid.segments, period, expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()
+    lateness = None
+    if "u" in channels and table.kind == "drive":
+        encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
+        lateness = estimate_lateness(grid, encoders, segmented.period)
+        keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
+        if lateness is not None and keys is not None:
+            hold, skew = keys
+            channels = {**channels, "u": channels["u"]._replace(hold=hold)}
+            delays["u"] = Delay(skew)
+            file.corrections |= {"u.skew": skew, "u.sampled": float(hold == "sampled")}
+            late = skew + (0.5 * segmented.period if hold == "sampled" else 0.0)
+            lateness = lateness._replace(value=lateness.value - late)
+            grid, gearing = resample()
     is_estimated = any(raw.skew == "estimate" for raw in channels.values())
     may_correct = shaft is not None and _is_left_out(table, "skew")
     sentences = []
@@ -283,7 +301,40 @@ def _resample_and_align(
         if any(delay):
             growth = f", growing by {1e6 * delay.drift:.4g} us each second" if delay.drift else ""
             file.notes.append(f"{name}: shifted by its skew of {1e3 * delay.skew:.4g} ms{growth}.")
-    return grid, gearing, regular
+    return grid, gearing, regular, lateness
+
+
+def _find_torque_keys(
+    file: LogFile, table: LogTable, lateness: Lateness, nominal: NominalDrive | None, period: float
+) -> tuple[Literal["zoh", "sampled"], float] | None:
+    """Return hold and skew (s) of u that undo its lateness, and say so; None if it stays, which is said, too."""
+    is_left_out = table.hold is None and (table.u is None or table.u.skew is None)
+    size, half_periods = abs(lateness.value), lateness.half_periods
+    if not (lateness.is_known and is_left_out and size > 3.0 * lateness.error) or half_periods == 0:
+        return None
+    direction = "later" if lateness.value > 0.0 else "earlier"
+    text = f"u is {1e3 * size:.3g} ± {1e3 * lateness.error:.1g} ms {direction} than the motion that it causes"
+    if half_periods is None:
+        file.notes.append(
+            f"{text}, which is no multiple of half a period: a filter of u, a soft shaft or a lag may cause it. Nothing was "
+            f"corrected; [log] u.skew = {lateness.value:.3g} does so."
+        )
+        return None
+    # a command is late by whole periods; what samples a current may have another period, so that some of it is left
+    hold = "sampled" if half_periods % 2 else "zoh"
+    skew = lateness.value - 0.5 * period if half_periods % 2 else 0.5 * half_periods * period
+    keys = f'hold = "{hold}" and u.skew = {skew:.3g}'
+    cause = "late stamps" if half_periods > 1 else "it was measured at its stamps, not held from them on"
+    if half_periods < 0:
+        cause = "early stamps, or a dead time or lag of the actuator; this log cannot tell them apart"
+    dead_time = "modelled" if nominal is None else nominal.dead_time
+    if dead_time == "modelled" or (dead_time == "sought" and half_periods < 0):
+        file.warnings.append(f"{text}: {cause}. Nothing was corrected; [log] {keys} does so.")
+        return None
+    file.warnings.append(
+        f"{text}: {cause}. This was corrected. [log] {keys} corrects the same; u.skew = 0 corrects nothing."
+    )
+    return hold, skew
 
 
 def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:

@@ -51,14 +51,15 @@ def resample_channels(
     *,
     interpolate: bool,
 ) -> Grid:
-    """Resample all channels to one grid in each segment: positions by cubic splines, a held torque by means.
+    """Resample all channels to one grid in each segment: positions by cubic splines, a torque by what holds for a period.
 
-    Without `interpolate` the stamps lie on the grid already, and only delays move values.
+    Without `interpolate` the stamps lie on the grid already, and only delays move values. Segments that are then too short
+    are left out.
 
     Raises:
-        InputError: a segment is too short for the period and the skews.
+        InputError: all segments are too short for the period and the skews.
     """
-    times, values, segments, first_row = [], {name: [] for name in channels}, [], 0
+    times, values, segments, first_row, short = [], {name: [] for name in channels}, [], 0, []
     for segment in segmented.segments:
         stamps = segmented.times[segment]
         first = float(stamps[0])
@@ -66,17 +67,33 @@ def resample_channels(
             grid = first + period * np.arange(len(stamps), dtype=float)
         else:
             grid = _common_times(file, stamps, period, delays.values(), None if interpolate else first)
+        if len(grid) < MIN_SAMPLES // 2:
+            short.append((len(grid), first))
+            continue
         for name, raw in channels.items():
             reading_times = stamps - delays[name].at(stamps)
-            if not interpolate and not any(delays[name]) and len(grid) == len(stamps):
+            if raw.hold == "sampled":
+                values[name].append(_hold_sampled_torque(reading_times, raw.values[segment], grid, period))
+            elif not interpolate and not any(delays[name]) and len(grid) == len(stamps):
                 values[name].append(raw.values[segment])
-            elif raw.held:
+            elif raw.hold:
                 values[name].append(_mean_over_periods(reading_times, raw.values[segment], grid, period))
             else:
                 values[name].append(interpolate_spline(reading_times, raw.values[segment], grid))
         times.append(grid)
         segments.append(slice(first_row, first_row + len(grid)))
         first_row += len(grid)
+    if short:
+        count, first = max(short)
+        text = (
+            f"{len(short)} of {len(segmented.segments)} segments: less than {MIN_SAMPLES // 2} samples with these skews "
+            f"and this period; the longest of them, from {first:.4g} s on, has {count}"
+        )
+        if not segments:
+            raise file.error(f"{text}; a longer part is needed, or a shorter [log] resample")
+        # channels may be resampled more than once
+        if (note := f"Left out are {text}.") not in file.notes:
+            file.notes.append(note)
     return Grid(
         np.concatenate(times), {name: np.concatenate(pieces) for name, pieces in values.items()}, tuple(segments), period
     )
@@ -91,16 +108,29 @@ def _common_times(
     if first is not None:
         # the samples of channels without skew lie on this grid
         begin = first + period * math.ceil((begin - first) / period - 1e-6)
-    count = math.floor((end - begin) / period + 1e-6) + 1
+    count = max(math.floor((end - begin) / period + 1e-6) + 1, 0)
     if count > _MAX_OVERSAMPLING * len(stamps) + MIN_SAMPLES:
         raise file.error(
             f"a period of {period:g} s makes {count} samples of {len(stamps)}; at least a hundredth of the log's is needed"
         )
-    if count < MIN_SAMPLES // 2:
-        raise file.error(
-            f"with these skews and this period a segment has {max(count, 0)} samples; at least {MIN_SAMPLES // 2} are needed"
-        )
     return begin + period * np.arange(count, dtype=float)
+
+
+def _hold_sampled_torque(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
+    """Return torques to be held over each period of a grid, which move a drive as the torque sampled at `stamps` does.
+
+    A drive's current loop is much faster than its log, so that the torque between stamps is neither held nor a straight
+    line, but smooth: a cubic spline. Its means keep the velocity at the samples. Positions there, which is what encoders
+    read, need a twelfth of the second difference less: held values w_k move an inertia by (w_k + w_{k-1}) / 2, and a torque
+    of frequency f by sinc²(f T) times its value at t_k, which is the same up to the fourth order of f T.
+    """
+    from scipy.interpolate import CubicSpline
+
+    # the last value holds for one more period
+    knots = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period)
+    torque = CubicSpline(knots, np.append(values, values[-1]))
+    means = np.diff(torque.antiderivative()(np.append(grid, grid[-1] + period))) / period
+    return means - np.diff(means, n=2, prepend=means[0], append=means[-1]) / 12.0
 
 
 def _mean_over_periods(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:

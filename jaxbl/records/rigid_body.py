@@ -22,8 +22,6 @@ class RigidFit:
         errors: their standard errors, shape (terms,).
         inflation: variance inflation factors: 1 if a term is uncorrelated with all others, shape (terms,).
         shares: rms of each term over that of the torque, shape (terms,).
-        skew: delay of the stamps of u against the torque, s.
-        skew_error: standard error.
         residual: rms of the residual over the rms of the torque about its mean.
         torque: rms, N m (N).
         acceleration: rms of the low-passed motion, rad/s² (m/s²).
@@ -38,8 +36,6 @@ class RigidFit:
     errors: np.ndarray
     inflation: np.ndarray
     shares: np.ndarray
-    skew: float
-    skew_error: float
     residual: float
     torque: float
     acceleration: float
@@ -84,7 +80,8 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         direction = low_pass(smooth_sign(velocity), cutoff, period)
         smooth_torque = low_pass(torque[segment], cutoff, period)
         inner = trim_filter_ends(len(smooth), cutoff, period)
-        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(smooth_torque, period)]
+        # the last column takes a lateness of the torque
+        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), np.gradient(smooth_torque, period)]
         all_rows.append(np.stack(columns, axis=1)[inner])
         slowing += float(velocity[inner][0] ** 2 - velocity[inner][-1] ** 2)
         targets.append(smooth_torque[inner])
@@ -109,9 +106,6 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         errors=errors[:5],
         inflation=inflation,
         shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(target),
-        # a torque that is held for a period acts half a period after its stamp
-        skew=float(coefficients[5]) + 0.5 * period,
-        skew_error=float(errors[5]),
         residual=float(np.std(residuals) / np.std(target)),
         torque=rms(target),
         acceleration=rms(rows[:, 0]),

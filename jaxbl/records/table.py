@@ -165,8 +165,10 @@ class TorqueTable(_ChannelTable):
     saturation: Positive | None = Field(
         default=None, gt=0.0, description="magnitude, in numbers of the column, at which it saturates"
     )
-    skew: float = Field(
-        default=0.0, description="by how much the stamps are later than the torque, undone", json_schema_extra=_SECONDS
+    skew: float | None = Field(
+        default=None,
+        description="by how much the stamps are later than the torque, undone; left out: 0, of u a lateness that is sure",
+        json_schema_extra=_SECONDS,
     )
 
     @model_validator(mode="after")
@@ -200,7 +202,11 @@ class LogTable(StrictTable):
         description="drive: a machine in motion; element: a transmission alone on a test rig, theta_e the displacement of "
         "one side (against theta_s, the other's, if there is one), u the torque through it",
     )
-    hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
+    hold: Literal["zoh", "sampled"] | None = Field(
+        default=None,
+        description="u between stamps: zoh: each value holds until the next stamp, as a command does; sampled: a smooth "
+        "torque, measured at its stamps, as a drive reports its current; left out: zoh, or sampled where that is sure",
+    )
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
     t: TimeTable | None = Field(default=None, description="time stamps; left out: column t, in s")
     u: TorqueTable | None = Field(default=None, description="input torque on the motor shaft; left out: column u, in N m")

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 import pytest
-from measured import NOMINAL, simulate_axis
+from measured import NOMINAL, simulate_axis, simulate_late_log
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
@@ -49,6 +49,23 @@ def test_logs_with_other_zeros_are_turned_to_that_of_the_first(paths: list[Path]
     )
     holdout = read_logs(config, paths[2], like=record)
     np.testing.assert_allclose(turned_angles(holdout, paths[2:]), [-0.2], atol=0.02)
+
+
+def test_a_late_torque_of_one_log_is_late_in_the_others(tmp_path: Path):
+    config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": 4e-4, "motor_viscous": 8e-3}})
+    for name, frame in (("sure", simulate_late_log(1.5)), ("short", simulate_late_log(1.5).iloc[:150])):
+        frame.to_csv(tmp_path / f"{name}.csv")
+    assert read_logs(config, tmp_path / "short.csv").corrections == {}
+    record = read_logs(config, [tmp_path / "short.csv", tmp_path / "sure.csv"])
+    assert len(record.warnings) == 1 and record.warnings[0].startswith("sure.csv: u is 15")
+    rows = record.logs[0][1]
+    expected = simulate_late_log(0.0, noise=0.0)["u"][rows]
+    np.testing.assert_allclose(record.torque[rows][:140], expected[:140], atol=1e-2)
+    assert read_logs(config, tmp_path / "short.csv", like=record).corrections == record.corrections
+    early = simulate_late_log(-1.0)
+    early.to_csv(tmp_path / "early.csv")
+    assert read_logs(config, tmp_path / "early.csv", seeks_delay=True).corrections == {}
+    assert set(read_logs(config, tmp_path / "early.csv").corrections) == {"u.skew", "u.sampled"}
 
 
 def test_an_offset_that_is_given_stands(paths: list[Path]):

@@ -42,6 +42,17 @@ def test_both_are_found_and_corrected(read_frame, skew, offset, gap):
     assert record.statistics.gearing.lost_motion == pytest.approx(gap + 4e-3, abs=1e-3 + 0.02 * gap)
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.1])
+@pytest.mark.parametrize("offset", [0.0, 0.385])
+def test_an_eccentric_encoder_has_its_offset_too(read_frame, gap, offset):
+    frame = simulate_axis(offset=offset, gap=gap)
+    # over two thirds of a turn its mean is not 0
+    frame["theta_e"] += 0.05 * np.sin(frame["theta_s"] + 0.8)
+    record = read_frame(frame)
+    assert record.corrections.get("offset", 0.0) == pytest.approx(-offset, abs=5e-3)
+    assert len(record.warnings) == bool(offset)
+
+
 def test_corrections_of_the_log_table_hold(read_frame):
     log = {"theta_s": {"skew": 0.0}, "theta_e": {"offset": 0.0}}
     record = read_frame(simulate_axis(3.04e-3, 0.379), log)
