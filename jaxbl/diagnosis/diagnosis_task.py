@@ -40,7 +40,8 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
         InputError: unfit log or study, or a hold-out log of another machine.
     """
     config, missing = read_model(model)
-    record, other = read_with_holdout(config, log, holdout, seeks_delay=True)
+    share = 1.0 if holdout is not None else 1.0 - HELD_OUT
+    record, other = read_with_holdout(config, log, holdout, seeks_delay=True, share=share)
     if other is None:
         record, other = split_off_last_quarter(record)
     else:

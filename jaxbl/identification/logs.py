@@ -108,22 +108,27 @@ _NEAR = 1e-2
 """Relative difference of the sampling periods of a log and what is held out that changes no result."""
 
 
-def read_logs(config: Config, logs: Logs, like: Record | None = None, *, seeks_delay: bool = False) -> Record:
+def read_logs(
+    config: Config, logs: Logs, like: Record | None = None, *, seeks_delay: bool = False, share: float = 1.0
+) -> Record:
     """Read logs as a study says, with the channels that its drive needs.
 
     A skew of u, and a skew and an offset between the encoders, that one log of a machine is sure of hold for those that are
     not: that of the first such log, or of the record that they are to be `like`. Logs are read at the longest of their
     sampling periods, the finest that all of them have; a finer log than the record they are to be `like` at the record's. An
-    input that is earlier than the motion is corrected, too, unless the command `seeks_delay`.
+    input that is earlier than the motion is corrected, too, unless the command `seeks_delay`. Clocks and zero points are
+    found by a share of each log, from its beginning.
     """
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    records = [_checked(config, one) if isinstance(one, Record) else _read_one(config, one, seeks_delay) for one in several]
+    records = [
+        _checked(config, one) if isinstance(one, Record) else _read_one(config, one, seeks_delay, share) for one in several
+    ]
     config = _at_one_period(config, records, like)
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
         if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
-            records[i] = _read_one(config, log, seeks_delay)
+            records[i] = _read_one(config, log, seeks_delay, share)
     known: dict[str, float] = {}
     for one in [*reversed(records)] if like is None else [like]:
         known |= one.corrections
@@ -137,11 +142,11 @@ def read_logs(config: Config, logs: Logs, like: Record | None = None, *, seeks_d
             if key in given and (key in record.corrections or key != "offset")
         }
         if not isinstance(log, Record) and given != record.corrections:
-            again = _read_one(_corrected(config, given), log, seeks_delay)
+            again = _read_one(_corrected(config, given), log, seeks_delay, share)
             # the reader counts what [log] gives as no correction of its own
             records[i] = replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
-    others = [_from_zero_of(first, one, config) for one in others]
+    others = [_from_zero_of(first, one, config, share) for one in others]
     return join_records([first, *others] if like is None else others)
 
 
@@ -162,23 +167,41 @@ def _at_one_period(config: Config, records: Sequence[Record], like: Record | Non
 
 
 def read_with_holdout(
-    config: Config, logs: Logs, holdout: Logs | None, *, seeks_delay: bool = False
+    config: Config, logs: Logs, holdout: Logs | None, *, seeks_delay: bool = False, share: float = 1.0
 ) -> tuple[Record, Record | None]:
-    """Logs and what is held out, both at the longest of their sampling periods; as :func:`read_logs`."""
-    record = read_logs(config, logs, seeks_delay=seeks_delay)
+    """Logs and what is held out, both at the longest of their sampling periods; as :func:`read_logs`.
+
+    Clocks and zero points of logs that are held out are found by their first fifth, which then does not count.
+    """
+    record = read_logs(config, logs, seeks_delay=seeks_delay, share=share)
     if holdout is None:
         return record, None
-    other = read_logs(config, holdout, record, seeks_delay=seeks_delay)
+    other = _read_held_out(config, holdout, record, seeks_delay)
     if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
         config = config.with_keys("log", resample=other.sample_period)
         record = read_logs(config, logs, seeks_delay=seeks_delay)
-        other = read_logs(config, holdout, record, seeks_delay=seeks_delay)
+        other = _read_held_out(config, holdout, record, seeks_delay)
     check_positions(record, other)
     return record, other
 
 
-def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
-    """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it."""
+_FIRST_FIFTH = 0.2
+"""Share of a log that is held out by which its clocks and zero points are found."""
+
+
+def _read_held_out(config: Config, holdout: Logs, record: Record, seeks_delay: bool) -> Record:
+    """Logs that are held out from another record, without the part that their clocks and zero points are found by."""
+    other, parts = read_logs(config, holdout, record, seeks_delay=seeks_delay, share=_FIRST_FIFTH), []
+    for _, rows in other.logs:
+        first = rows.start + round(_FIRST_FIFTH * (rows.stop - rows.start))
+        parts += [slice(max(part.start, first), part.stop) for part in other.segments if first < part.stop <= rows.stop]
+    found = any(value and value != record.corrections.get(key) for key, value in other.corrections.items())
+    return replace(other, segments=tuple(parts)) if found else other
+
+
+def _from_zero_of(first: Record, record: Record, config: Config, share: float) -> Record:
+    """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it in a
+    share of it."""
     table, geared = config.log, config.drive.kind == "two_inertia"
     two = geared and all("load" in one.positions for one in (first, record))
     given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
@@ -189,7 +212,9 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     for one in (first, record):
         assert one.torque is not None
         load = ratio * one.positions["load"] if two else None
-        motions.append(TurningLog(one.torque, one.positions["motor"], load, one.segments, one.sample_period))
+        end = round(share * len(one.time)) if one is record else len(one.time)
+        segments = [slice(part.start, min(part.stop, end)) for part in one.segments if part.start < end]
+        motions.append(TurningLog(one.torque, one.positions["motor"], load, segments, one.sample_period))
     found = find_zero_shift(*motions)
     if found is None:
         return record
@@ -203,7 +228,8 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     positions = {
         side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
     }
-    return replace(record, positions=positions, warnings=(*record.warnings, warning))
+    corrections = record.corrections | {"zero": found.value}
+    return replace(record, positions=positions, warnings=(*record.warnings, warning), corrections=corrections)
 
 
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:
@@ -220,12 +246,12 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     return config.model_copy(update={"log": table})
 
 
-def _read_one(config: Config, log: str | Path, seeks_delay: bool) -> Record:
+def _read_one(config: Config, log: str | Path, seeks_delay: bool, share: float) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
     if seeks_delay and nominal.dead_time == "no":
         nominal = replace(nominal, dead_time="sought")
-    return _checked(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal))
+    return _checked(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal, share=share))
 
 
 def _checked(config: Config, record: Record) -> Record:

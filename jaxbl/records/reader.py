@@ -81,8 +81,8 @@ class Record:
         segments: samples of each segment; between them the log has gaps.
         notes: sentences on changes to the log, and on its oddities.
         warnings: sentences to be said first: corrected clocks or zero points of encoders, doubtful units.
-        corrections: "skew" of theta_s, s, its "drift", s/s, "offset" of theta_e, rad (m), "u.skew", s, and "u.sampled" (1 if
-            u was sampled at its stamps, 0 if it is held from them on), if they were applied.
+        corrections: "skew" of theta_s, s, its "drift", s/s, "offset" of theta_e, rad (m), "zero" of all positions, rad,
+            "u.skew", s, and "u.sampled" (1 if u was sampled at its stamps, 0 if it is held from them on), if applied.
         contradiction: reason for which the nominal drive cannot be fitted, such as a wrong unit; "" if there is none.
         statistics: of its stamps, channels, gearing and torque.
         intervals: between the raw stamps that were used, s, shape (raw samples - 1,).
@@ -139,6 +139,7 @@ def read_record(
     *,
     gear_ratio: float | None = None,
     nominal: NominalDrive | None = None,
+    share: float = 1.0,
 ) -> Record:
     """Read a measured log.
 
@@ -151,6 +152,7 @@ def read_record(
         gear_ratio: expected ratio of motor over load motion, which is compared with that of the log.
         nominal: nominal drive of the log. It is needed to correct a skew and an offset between the encoders that no
             friction or gap can cause, if the `[log]` table does not give them.
+        share: of the samples, from the first on, by which clocks and zero points are found; the rest is cleaned by these.
 
     Raises:
         InputError: the file or a column is missing or unfit, or the log contradicts the `[log]` table or `gear_ratio`.
@@ -175,9 +177,11 @@ def read_record(
         note_standstill(file, segmented, channels)
     # these become evenly spaced samples
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
-    grid, gearing, regular, lateness = _resample_and_align(file, table, segmented, channels, gear_ratio, nominal, shaft)
+    grid, gearing, regular, lateness = _resample_and_align(
+        file, table, segmented, channels, gear_ratio, nominal, shaft, share
+    )
     if shaft is not None:
-        _correct_offset(file, table, grid, channels, shaft)
+        _correct_offset(file, table, grid, channels, shaft, share)
     if not regular and table.resample is None and len(segmented.segments) == 1:
         note_host_stamps(file, segmented, channels[encoders[0]].values, grid.values[encoders[0]])
     # the motion is compared with the drive
@@ -232,8 +236,9 @@ def _resample_and_align(
     gear_ratio: float | None,
     nominal: NominalDrive | None,
     shaft: NominalDrive | None,
+    share: float,
 ) -> tuple[Grid, Gearing | None, bool, Lateness | None]:
-    """Resample the channels to even spacing and remove skews.
+    """Resample the channels to even spacing and remove skews, which are found by a share of the samples.
 
     Returns:
         The samples, the relation of both encoders, True if the stamps had that spacing already, and the lateness of u.
@@ -248,13 +253,14 @@ def _resample_and_align(
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
         motor, load = grid.values["theta_e"], grid.values["theta_s"]
-        return grid, fit_gearing(grid.time, motor, load, grid.segments, period, expected=gear_ratio, turn=turn)
+        segments = grid.first(share).segments
+        return grid, fit_gearing(grid.time, motor, load, segments, period, expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()
     lateness = None
     if "u" in channels and table.kind == "drive":
         encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
-        lateness = estimate_lateness(grid, encoders, segmented.period)
+        lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
         keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
         if lateness is not None and keys is not None:
             hold, skew = keys
@@ -268,7 +274,7 @@ def _resample_and_align(
     may_correct = shaft is not None and _is_left_out(table, "skew")
     sentences = []
     if gearing is not None and (is_estimated or may_correct) and _is_left_out(table, "drift"):
-        drift = _find_clock_drift(gearing, grid, shaft if may_correct else None)
+        drift = _find_clock_drift(gearing, grid.first(share), shaft if may_correct else None)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
@@ -282,7 +288,7 @@ def _resample_and_align(
         delays["theta_s"] = Delay(initial_delay.skew + _estimate_skew(file, gearing, period), initial_delay.drift)
         grid, gearing = resample()
     elif may_correct and shaft is not None and gearing is not None:
-        clock_skew = judge_clock_skew(gearing, grid, shaft)
+        clock_skew = judge_clock_skew(gearing, grid.first(share), shaft)
         if clock_skew is not None and clock_skew.is_sure:
             delays["theta_s"] = Delay(initial_delay.skew + clock_skew.value, initial_delay.drift)
             grid, gearing = resample()
@@ -387,13 +393,13 @@ def _describe_delay_keys(table: LogTable, delay: Delay) -> str:
 
 
 def _correct_offset(
-    file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive
+    file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive, share: float
 ) -> None:
     """Subtract a sure offset between the encoders from theta_e; warn of a possible one."""
     integrals = [name for name in POSITION_CHANNELS.values() if table.position_source(name)[0] != name]
     if not integrals and not _is_left_out(table, "offset"):
         return
-    offset = find_encoder_offset(grid, nominal)
+    offset = find_encoder_offset(grid.first(share), nominal)
     if offset is None:
         return
     if integrals:

@@ -30,6 +30,11 @@ class Grid(NamedTuple):
     segments: Sequence[slice]
     period: float
 
+    def first(self, share: float) -> "Grid":
+        """Return the grid with the segments of a share of its samples, from the first on."""
+        end = round(share * len(self.time))
+        return self._replace(segments=[slice(s.start, min(s.stop, end)) for s in self.segments if s.start < end])
+
 
 class Delay(NamedTuple):
     """Delay of a channel's stamps against its readings: `skew` (s) at time 0, which grows by `drift` (s/s)."""
