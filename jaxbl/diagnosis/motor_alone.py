@@ -32,6 +32,7 @@ from jaxbl.workers import announce
 from .diagnosis_summary import extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
 from .expected_errors import LEVEL
+from .history import Step
 from .neutral_effects import candidates, with_added
 
 _SMALL = 1e-6
@@ -139,7 +140,8 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     done()
     announce("comparing effects")
     out = [play] if gap is not None and play is not None and not gap.needed else []
-    point, gains = _needed(search, point, out)
+    history: list[Step] = []
+    point, gains = _needed(search, point, out, history)
     if gap is not None and gap.needed and play is not None:
         gains[play] = gap.gain
     point, width, slope = _seen(search, point, out)
@@ -153,7 +155,7 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
     held_out = task.holdout.open()
-    summary = _summary(task, held_out, search, alone, gains, out)
+    summary = _summary(task, held_out, search, alone, gains, out) | {"history": [step._asdict() for step in history]}
     numbers = {name: _numbers(alone, name) for name in search.effects if name not in out}
     own = {one.path: alone.values[one.path] for one in _own(search)}
     study = extended_study(task.config, numbers, own)
@@ -172,8 +174,9 @@ def _numbers(alone: Alone, name: str) -> Numbers:
     return {path.removeprefix(start): value for path, value in alone.values.items() if path.startswith(start)}
 
 
-def _needed(search: _Search, point: Point, out: list[str]) -> tuple[Point, Numbers]:
-    """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains."""
+def _needed(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
+    """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
+    tried goes into the history."""
     while True:
         tried = {}
         for name, i in search.effects.items():
@@ -184,7 +187,11 @@ def _needed(search: _Search, point: Point, out: list[str]) -> tuple[Point, Numbe
         worth = search.model.spread(point, search.held(out))[0].inflation
         gains = {name: _gain(search, name, one, point, worth) for name, one in tried.items()}
         least = min(gains, key=lambda name: gains[name], default=None)
-        if least is None or gains[least] >= SHOWN:
+        needless = least is not None and not gains[least] >= SHOWN
+        for name, gain in gains.items():
+            why = f"{0.5 * SHOWN:g} nats are asked"
+            history.append(Step(f"remove {name}", -0.5 * gain, None, needless and name == least, why))
+        if least is None or not needless:
             return point, gains
         out.append(least)
         point = tried[least]
@@ -290,7 +297,6 @@ def _summary(
         "rest": {},
         "withdrawn": [],
         "contradictions": [],
-        "history": [],
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing
         "explained_share": None if before <= limit**2 else 1.0 - min(max(after - noise**2, 0.0) / (before - noise**2), 1.0),
