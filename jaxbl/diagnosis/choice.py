@@ -21,7 +21,7 @@ from .candidates import EffectNumbers, are_possible
 from .confidence import exchanged, explained_share, is_little, weigh
 from .effect_search import FAR, EffectSearch, Explanation, Finding
 from .expected_errors import expected_errors, failed
-from .fitted_model import FittedModel, fit_model, special_case
+from .fitted_model import FittedModel, special_case
 from .history import Step, describe_change
 from .reference_log import Comparison
 from .residuals import SideResiduals
@@ -209,7 +209,7 @@ class Choice:
         """The best model with a wrong effect, whose numbers are fitted as well."""
         if found.wrong is None or not found.model.names:
             return None
-        fitted = fit_model(search, found.wrong.numbers, found.wrong.theta)
+        fitted = search.fit(found.wrong.numbers, found.wrong.theta)
         z = standard_errors_better(self.log, self.compare(fitted), compared)
         return Rival(found.wrong.names[-1], fitted.experiment, z)
 
@@ -242,7 +242,7 @@ class Choice:
         names, withdrawn = list(found.model.names), []
         fitted, compared, gains = None, self.before, {}
         while names:
-            fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
+            fitted = search.fit({name: found.model.numbers[name] for name in names}, found.model.theta)
             compared = self.compare(fitted)
             every = {name: self._gain(search, fitted, compared, name) for name in names}
             gains = {name: gain for name, (gain, _) in every.items()}
@@ -263,7 +263,7 @@ class Choice:
             withdrawn.append(gone)
             names.remove(gone)
         if not names:
-            fitted = fit_model(search, {}, found.nominal.theta)
+            fitted = search.fit({}, found.nominal.theta)
             compared, gains = self.compare(fitted), {}
             if is_worse(compared, self.before, self.noise) or not is_better(compared.errors, self.before.errors):
                 fitted, compared = self._as_given(fitted), self.before
@@ -287,7 +287,7 @@ class Choice:
         """
         own, prior = len(self.setup.prior), self.setup.prior
         numbers = {other: values for other, values in fitted.numbers.items() if other != name}
-        fewer = fit_model(search, numbers, fitted.theta[:own])
+        fewer = search.fit(numbers, fitted.theta[:own])
         without, by = (float(np.sum((each.theta[:own] / prior) ** 2)) for each in (fewer, fitted))
         # what two deviations would explain is no sign of anything
         z = standard_errors_better(self.log, self.compare(fewer), compared) + np.sqrt(max(without - by - SURE**2, 0.0))
@@ -305,7 +305,7 @@ class Choice:
             (plain if other == name else other): reduced(values) if other == name else values
             for other, values in fitted.numbers.items()
         }
-        less = fit_model(search, numbers, fitted.theta[: len(self.setup.prior)])
+        less = search.fit(numbers, fitted.theta[: len(self.setup.prior)])
         compared = self.compare(less)
         z = standard_errors_better(self.log, chosen.compared, compared)
         kept = z >= -SEEN and not is_worse(compared, self.before, self.noise)

@@ -23,7 +23,6 @@ from .candidates import EffectNumbers
 from .choice import Chosen
 from .diagnosis_task import input_rms
 from .effect_search import Finding, Model
-from .expected_errors import LEVEL
 from .fitted_model import FittedModel, free_values
 from .history import Step
 from .judgement import Judgement
@@ -66,10 +65,12 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
             )
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     if (noise := setup.input_noise.unfelt) > 0.0:
+        # a command is felt whole, if not as a torque
+        measured = task.config.log.hold == "sampled" or record.corrections.get("u.sampled")
+        not_felt = "that the drive does not feel" if measured else "that this motion does not show"
         notes.append(
             f"The channel u carries noise of {noise:.2g} {record.unit_of('motor.torque', 'N m')} rms "
-            f"({noise / input_rms(record):.1%} of the input) that the drive does not feel: models are driven by u smoothed "
-            "between its jumps."
+            f"({noise / input_rms(record):.1%} of the input) {not_felt}: models are driven by u smoothed between its jumps."
         )
     return {
         **task.heading,
@@ -132,20 +133,7 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
             for name, one in expected.items()
             if " below " in name
         },
-        "test": {
-            "level": LEVEL,
-            "failed": judgement.failed,
-            "far": judgement.far,
-            "chance": judgement.chance,
-            "remainder": judgement.remainder,
-            "worse": judgement.worse,
-            "little": judgement.little,
-            "contradicting": judgement.contradicting,
-            "weak": proof.weak,
-            "untested": {
-                name: proof.untested[name]._asdict() if name in proof.untested else {} for name in judgement.untested
-            },
-        },
+        "test": judgement.test,
         "controls": {
             one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {})
             for one in proof.controls

@@ -24,11 +24,12 @@ from jaxbl.workers import announce
 from .blocks import FLOOR, mean_squares, standard_errors_between
 from .candidates import SHARE, Candidate, EffectNumbers, Numbers, are_possible, variants_of
 from .evidence import Evidence, evidence_of
+from .fitted_model import FittedModel
 from .free_functions import functions_of
 from .history import Step, describe_change
 from .linearised_model import DIVERGED, Linear, Predictor
 from .neutral_effects import candidates, complete, corrected
-from .refit import Refined, refined
+from .refit import refined
 from .whittle import Spectrum, spectrum_of
 
 VerdictName = Literal["explained", "no_discrepancy", "unknown_effect", "not_tested"]
@@ -214,9 +215,9 @@ class EffectSearch:
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
         self._models: dict[tuple, Model] = {}
-        self._refitted: tuple[tuple, Refined] | None = None
+        self._refitted: tuple[tuple, FittedModel] | None = None
 
-    def refitted(self, values: EffectNumbers, theta: np.ndarray) -> Refined:
+    def fit(self, values: EffectNumbers, theta: np.ndarray) -> FittedModel:
         """The model with some effects, with the numbers of least prediction errors (:mod:`.refit`), its own first."""
         key = _key(values, theta)
         if self._refitted is None or self._refitted[0] != key:
@@ -224,12 +225,13 @@ class EffectSearch:
             added = make_free_parameters(experiment, paths_of(values), self._torque)
             width = np.concatenate([self.prior, np.full(len(added), PRIOR_DEVIATION)])
             start = np.concatenate([theta, np.zeros(len(added))])
-            self._refitted = key, refined(experiment, (*self.free, *added), start, width, self.segments)
+            fitted = refined(experiment, (*self.free, *added), start, width, self.segments)
+            self._refitted = key, fitted._replace(names=tuple(values))
         return self._refitted[1]
 
     def plausible(self, found: Explanation) -> bool:
         """Whether the model's own numbers, fitted to the last digit, are where they may be by what is known of them."""
-        theta = self.refitted(found.model.numbers, found.model.theta).theta[: len(self.free)]
+        theta = self.fit(found.model.numbers, found.model.theta).theta[: len(self.free)]
         return bool(np.all(np.abs(theta) < FAR * self.prior))
 
     @property
@@ -408,7 +410,7 @@ class EffectSearch:
     def _heat(self, model: Model) -> float:
         """By how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it were
         without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12 (2017))."""
-        best, own = self.refitted(model.numbers, model.theta), len(self.free)
+        best, own = self.fit(model.numbers, model.theta), len(self.free)
         variance, white = (np.diag(one)[own:] for one in (best.covariance, best.white))
         return max(float(np.max(variance / np.maximum(white, 1e-300), initial=1.0)), 1.0)
 
@@ -472,7 +474,7 @@ class EffectSearch:
     def _settled(self, model: Model) -> Model:
         """A model without effects that are needless once all numbers are those of least prediction errors: one may only have
         compensated for an error of the fit along the smoothed motion."""
-        best, count = self.refitted(model.numbers, model.theta), len(self.free)
+        best, count = self.fit(model.numbers, model.theta), len(self.free)
         numbers = {name: dict(one) for name, one in model.numbers.items()}
         weak: set[str] = set()
         for one, at, by in zip(best.linear.free[count:], best.theta[count:], best.deviation[count:], strict=True):
@@ -567,7 +569,7 @@ class EffectSearch:
         rest = self._remainder(model.linear)
         if _most(rest) > CLEAR:
             # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
-            rest = self._remainder(self.refitted(model.numbers, model.theta).linear)
+            rest = self._remainder(self.fit(model.numbers, model.theta).linear)
         return rest
 
     def _remainder(self, linear: Linear) -> dict[str, tuple[float, float]]:

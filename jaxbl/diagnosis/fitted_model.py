@@ -11,8 +11,6 @@ from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.identification.logs import arrays
 from jaxbl.simulate import Experiment
 
-from .candidates import EffectNumbers
-from .effect_search import EffectSearch
 from .linearised_model import Linear
 
 _LEAST_LEFT = 0.05
@@ -57,10 +55,14 @@ class FittedModel(NamedTuple):
             name: {leaf: float(get_leaf(effect, leaf)) for leaf in leaf_paths(effect)} for name, effect in effects.items()
         }
 
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of theta."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
     def errors(self) -> Numbers:
         """Standard errors of the values."""
-        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return {number.path: float(number.slope(self.theta[i])) * deviation[i] for i, number in enumerate(self.free)}
+        return {number.path: float(number.slope(self.theta[i])) * self.deviation[i] for i, number in enumerate(self.free)}
 
     def move_by(self, change: np.ndarray) -> Experiment:
         """The model with a change of theta, to first order: a number that the log hardly shows may change by several times
@@ -70,15 +72,6 @@ class FittedModel(NamedTuple):
             value, slope = float(number.value(at)), float(number.slope(at))
             values[number.path] = max(value + slope * by, _LEAST_LEFT * value) if number.positive else value + slope * by
         return set_leaves(self.experiment, arrays(values))
-
-
-def fit_model(search: EffectSearch, numbers: EffectNumbers, theta: np.ndarray) -> FittedModel:
-    """A model with some effects, its own numbers and theirs fitted from given ones."""
-    fit = search.refitted({name: dict(values) for name, values in numbers.items()}, theta)
-    return FittedModel(
-        tuple(numbers), fit.experiment, fit.linear.free, fit.theta, fit.covariance, fit.white, fit.linear, fit.left_out,
-        fit.log_likelihood,
-    )  # fmt: skip
 
 
 def special_case(fitted: FittedModel, name: str, noise: Mapping[str, float] | None = None) -> str | None:

@@ -4,10 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.json_types import JsonObject
+
 from .blocks import SURE
 from .choice import Chosen
 from .confidence import is_little
 from .effect_search import FAR, VerdictName
+from .expected_errors import LEVEL
 from .proof import Proof
 
 
@@ -16,25 +19,16 @@ class Judgement(NamedTuple):
 
     Attributes:
         verdict: as in `diagnosis.json`.
-        failed: channels in which the model leaves more than a complete one would.
-        far: the model's own numbers that had to leave what is known of them, and by how many of its standard deviations.
-        chance: whether the added torque does as well shuffled in time.
-        remainder: whether the search found that something else is missing.
-        worse: whether the model as given predicts the proof better.
-        little: whether the effects take away less than half of the torque that is missing on the proof.
-        contradicting: whether the logs do not agree on the model's numbers.
-        untested: effects that the proof says nothing of; all of them, and the model itself, where it has no power.
+        test: what was asked, and the answers, as in `diagnosis.json`: `failed`, the channels in which the model leaves more
+            than a complete one would; `far`, its own numbers that had to leave what is known of them, and by how many
+            standard deviations; whether the added torque does as well shuffled in time (`chance`), the search found that
+            something else is missing (`remainder`), the model as given predicts the proof better (`worse`), the effects take away less
+            than half of what is missing there (`little`), the logs do not agree (`contradicting`); `weak`, the channels that
+            test nothing, and `untested`, the effects that the proof says nothing of.
     """
 
     verdict: VerdictName
-    failed: list[str]
-    far: dict[str, float]
-    chance: bool
-    remainder: bool
-    worse: bool
-    little: bool
-    contradicting: bool
-    untested: list[str]
+    test: JsonObject
 
 
 def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, contradicting: bool = False) -> Judgement:
@@ -57,4 +51,7 @@ def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, 
     against = proof.failed or far or chance or proof.worse or little or contradicting or remainder
     open_ = untested or not proof.has_power
     verdict = "unknown_effect" if against else "not_tested" if open_ else chosen.found.verdict
-    return Judgement(verdict, proof.failed, far, chance, remainder, proof.worse, little, contradicting, untested)
+    torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
+    reasons = {"chance": chance, "remainder": remainder, "worse": proof.worse, "little": little}
+    tested_by = {"level": LEVEL, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}
+    return Judgement(verdict, tested_by | reasons | {"contradicting": contradicting})

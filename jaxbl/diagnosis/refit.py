@@ -22,6 +22,7 @@ from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
+from .fitted_model import FittedModel
 from .linearised_model import Linear, Predictor
 from .neutral_effects import lean
 
@@ -33,37 +34,6 @@ _ROUNDS = 2
 """Choices of the predictor, each followed by a fit."""
 _QUARTERS = 4
 """Parts of a log of which each is left out once: as much as is held out."""
-
-
-class Refined(NamedTuple):
-    """A model with the numbers of largest likelihood.
-
-    Attributes:
-        experiment: with these numbers.
-        theta: of the free ones.
-        covariance: of theta, of data and prior together; the errors may be correlated.
-        white: the same if they are not, as those of a complete model.
-        smoothness: of the predictor, by side.
-        start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
-        linear: the model along the path of its predictor, with the numbers that were free.
-        left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
-        log_likelihood: nats, with the numbers' prior; only differences count.
-    """
-
-    experiment: Experiment
-    theta: np.ndarray
-    covariance: np.ndarray
-    white: np.ndarray
-    smoothness: list[float]
-    start: Arrays
-    linear: Linear
-    left_out: np.ndarray
-    log_likelihood: float
-
-    @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviation of theta."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
 class _Point(NamedTuple):
@@ -201,11 +171,10 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
 
 def refined(
     experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
-) -> Refined:
+) -> FittedModel:
     """Refine the numbers of a model from theta; arguments as of :class:`.linearised_model.Linear` (`width`: its `prior`)."""
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
     model = set_free_parameters(experiment, free, best.theta)
     covariance, white, left_out = refiner.covariance(best)
-    smoothness = best.predictor.smoothness
-    return Refined(model, best.theta, covariance, white, smoothness, best.start, best.linear, left_out, -0.5 * best.cost)
+    return FittedModel((), model, tuple(free), best.theta, covariance, white, best.linear, left_out, -0.5 * best.cost)

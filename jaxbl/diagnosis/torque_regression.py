@@ -19,7 +19,7 @@ from jaxbl.identification.segments import Segment
 from .blocks import SEEN, standard_errors_better
 from .candidates import Candidate, Forces, Numbers, are_possible, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
-from .fitted_model import FittedModel, fit_model
+from .fitted_model import FittedModel
 from .history import Step, describe_change
 from .reference_log import Comparison, ReferenceLog
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
@@ -85,7 +85,7 @@ def _with_one_more(
     proposed += [one for one in _proposals(search, model, compared.torques, log) if one.name not in general][:_TRIED]
     for one in proposed:
         kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
-        fitted = fit_model(search, kept | {one.name: one.numbers}, now.theta[: len(search.free)])
+        fitted = search.fit(kept | {one.name: one.numbers}, now.theta[: len(search.free)])
         if not are_possible(fitted.numbers, search.period):
             continue
         after = log.compare(fitted.experiment)

@@ -80,13 +80,12 @@ def choose_effects(monkeypatch, errors, shares, gain):
         [],
     )
     compared = compare_errors(errors(1.0), errors(1.0))
-    fit = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
-    monkeypatch.setattr("jaxbl.diagnosis.choice.fit_model", fit)
+    fit = lambda numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get, numbers={})  # noqa: E731
     monkeypatch.setattr(Choice, "compare", lambda self, fitted: compared)
     monkeypatch.setattr(Choice, "_rival", lambda *_: None)
     monkeypatch.setattr(Choice, "_gain", lambda self, search, model, after, name: (gain(name, model.names), 7.0))
     result = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
-    search = SimpleNamespace(without=lambda found, names: found)
+    search = SimpleNamespace(without=lambda found, names: found, fit=fit, period=1e-3)
     return choice._withdraw(search, result), choice.history  # type: ignore[arg-type]
 
 
@@ -157,8 +156,8 @@ def test_a_special_case_is_named_where_blocks_do_not_part_it_either(z, named, mo
         names=(general,), numbers={general: {"torque": 0.1, "length": 0.1}}, theta=np.zeros(1), log_likelihood=0.0,
         experiment=SimpleNamespace(effects=(effect,)), errors=lambda: {f"effects.{general}.length": 0.2},
     )  # fmt: skip
-    less = lambda _, numbers, theta: SimpleNamespace(numbers=numbers, experiment=0, log_likelihood=-1.0)  # noqa: E731
-    for name, value in (("fit_model", less), ("standard_errors_better", lambda *_: z), ("_rename", lambda *_: None)):
+    less = lambda numbers, theta: SimpleNamespace(numbers=numbers, experiment=0, log_likelihood=-1.0)  # noqa: E731
+    for name, value in (("standard_errors_better", lambda *_: z), ("_rename", lambda *_: None)):
         monkeypatch.setattr(f"jaxbl.diagnosis.choice.{name}", value)
     monkeypatch.setattr("jaxbl.diagnosis.choice.is_worse", lambda *_: False)
     choice = Choice.__new__(Choice)
@@ -167,7 +166,7 @@ def test_a_special_case_is_named_where_blocks_do_not_part_it_either(z, named, mo
     monkeypatch.setattr(Choice, "compare", lambda *_: "compared")
     monkeypatch.setattr(Choice, "_gain", lambda *_: (7.0, 1.0))
     monkeypatch.setattr(Choice, "_rival", lambda *_: None)
-    before = Chosen(SimpleNamespace(lacking=[plain]), None, fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
+    before = Chosen(SimpleNamespace(lacking=[plain], fit=less), None, fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
     chosen = choice._simplify(before, general)
     assert (chosen is not before) == named and [step.kept for step in choice.history] == [named]
     if named:

@@ -68,7 +68,7 @@ def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path)
     (finding,) = diagnosis.summary["findings"]
     assert finding["effect"] == "motor.coulomb_friction"
     assert finding["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
-    (note,) = (note for note in diagnosis.summary["notes"] if "does not feel" in note)
+    (note,) = (note for note in diagnosis.summary["notes"] if "does not show" in note)
     assert note.startswith("The channel u carries noise of 0.02")
     np.testing.assert_allclose(diagnosis.trace["u"], log.u, rtol=1e-9)
 

@@ -11,7 +11,6 @@ from scipy import stats
 from jaxbl.diagnosis.choice import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.expected_errors import LEVEL, _quantile, expected_errors, failed
-from jaxbl.diagnosis.fitted_model import fit_model
 from jaxbl.diagnosis.proof import open_held_out
 from jaxbl.diagnosis.setup import set_up
 
@@ -23,7 +22,7 @@ def compare_with_expected(folder, log, effects, noise=None):
     task = read_diagnosis_task(folder / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = fit_model(new_search(setup), effects, np.zeros(len(setup.own)))
+        fitted = new_search(setup).fit(effects, np.zeros(len(setup.own)))
         _, holdout = open_held_out(setup)
         if noise is not None:
             segments = []

@@ -10,21 +10,20 @@ from jaxbl.diagnosis.judgement import judge
 from jaxbl.diagnosis.proof import Control, Untested
 
 NAME, OTHER = "motor.coulomb_friction", "motor.cogging"
-CHANNELS = {"theta_e": None, "torque_motor": None}
 
 
 def judge_model(names=(NAME,), theta=0.0, verdict="explained", share=1.0, contradicting=False, controls=(), **proof):
     fitted = SimpleNamespace(names=names, theta=np.array([theta]), free=[SimpleNamespace(path="drive.motor_inertia")])
     chosen = SimpleNamespace(fitted=fitted, found=SimpleNamespace(verdict=verdict))
-    test = {"failed": [], "worse": False, "untested": {}, "has_power": True} | proof
-    held_out = SimpleNamespace(controls=controls, expected=CHANNELS, **test)
+    test = {"failed": [], "worse": False, "untested": {}, "has_power": True, "weak": []} | proof
+    held_out = SimpleNamespace(controls=controls, **test)
     return judge(chosen, held_out, np.array([0.02]), share, contradicting)  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_the_proof_supports_stays():
     judgement = judge_model(controls=[Control("wrong", {}, 9.0, "motor.viscous_friction"), Control("permuted", {}, 4.0)])
     assert judgement.verdict == "explained"
-    assert not any(getattr(judgement, reason) for reason in PASSED if reason not in ("level", "weak"))
+    assert judgement.test == PASSED
     assert judge_model((), verdict="no_discrepancy", share=None).verdict == "no_discrepancy"
 
 
@@ -44,20 +43,20 @@ def test_a_verdict_that_the_proof_supports_stays():
 def test_one_reason_is_enough_against_it(changes, reason):
     judgement = judge_model(**changes)
     assert judgement.verdict == "unknown_effect"
-    passed = {key: value for key, value in PASSED.items() if key not in ("level", "weak", "untested")}
-    assert {key: getattr(judgement, key) for key in passed} == passed | reason
+    assert judgement.test == PASSED | reason
 
 
 def test_what_the_proof_cannot_test_is_not_said_to_be_explained():
     untested = {NAME: Untested(1e-3, 0.3)}
     # the shuffled torque, and the share, say nothing of what is not there
     judgement = judge_model(untested=untested, share=0.0, controls=[Control("permuted", {}, 0.1)])
-    assert judgement.verdict == "not_tested" and judgement.untested == [NAME] and not judgement.chance
+    assert judgement.verdict == "not_tested" and not judgement.test["chance"]
+    assert judgement.test["untested"] == {NAME: {"torque": 1e-3, "on_log": 0.3}}
     assert judge_model((NAME, OTHER), untested=untested).verdict == "not_tested"
     # of the other effect the proof speaks
     assert judge_model((NAME, OTHER), untested=untested, share=0.2).verdict == "unknown_effect"
     # without power nothing is: neither an effect nor that none is missing
-    assert judge_model(has_power=False).untested == [NAME]
+    assert judge_model(has_power=False).test["untested"] == {NAME: {}}
     assert judge_model((), verdict="no_discrepancy", share=None, has_power=False).verdict == "not_tested"
     # what contradicts the model does so whatever is not tested
     assert judge_model(untested=untested, failed=["theta_e"]).verdict == "unknown_effect"

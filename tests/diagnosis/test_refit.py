@@ -10,7 +10,7 @@ from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.effect_search import paths_of, with_numbers
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.neutral_effects import complete
-from jaxbl.diagnosis.refit import _Refiner, refined
+from jaxbl.diagnosis.refit import _Refiner, leave_quarters_out, refined
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
@@ -42,8 +42,8 @@ def test_prediction_errors_are_least(refit_inputs):
     (segment,) = segments
     # without the effects that do nothing
     plain = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.name == NAME))
-    fit = refined(experiment, free, np.zeros(len(free)), width, segments)
-    gain = {"motor": Linear.gain_of(fit.smoothness, segment.period)[0]}
+    fit = _Refiner(experiment, free, width, segments).run(np.zeros(len(free)))
+    gain = {"motor": Linear.gain_of(fit.predictor.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
@@ -94,3 +94,22 @@ def test_numbers_under_which_the_predictor_diverges_are_not_taken(refit_inputs):
     (path,) = refiner._path(theta, refiner.start(), [1e-11])
     assert not np.isfinite(path.smoothed["motor"].state[:, :2]).all()
     assert refiner.at(theta, refiner.start(), [1e-11]).cost == np.inf
+
+
+def test_numbers_without_a_quarter_are_those_of_a_fit_to_the_rest():
+    """Least squares in closed form: a first order is exact where errors are linear in the numbers."""
+    random = np.random.default_rng(3)
+    slopes, prior = random.standard_normal((400, 2, 3)), np.diag([0.0, 5.0, 50.0])
+    truth = np.array([0.2, -0.1, 0.05])
+    data = slopes @ truth + 0.3 * random.standard_normal((400, 2))
+
+    def fit(rows):
+        flat = slopes[rows].reshape(-1, 3)
+        return np.linalg.solve(flat.T @ flat + prior, flat.T @ data[rows].ravel())
+
+    best = fit(np.arange(400))
+    # errors grow with the numbers
+    changes = leave_quarters_out(slopes @ best - data, slopes, prior)
+    for quarter, change in enumerate(changes):
+        rest = np.delete(np.arange(400), slice(100 * quarter, 100 * (quarter + 1)))
+        np.testing.assert_allclose(best + change, fit(rest), rtol=1e-9)

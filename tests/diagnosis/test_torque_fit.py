@@ -7,7 +7,6 @@ from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 
 from jaxbl.diagnosis.choice import new_search
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.fitted_model import fit_model
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.torque_fit import fit_to_torque
 from jaxbl.identification.free_parameters import set_free_parameters
@@ -21,7 +20,7 @@ def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins
     with jax.enable_x64(True):
         setup = set_up(task)
         search = new_search(setup)
-        fitted = fit_model(search, {KIND: {"torque": TORQUE}}, np.zeros(len(setup.own)))
+        fitted = search.fit({KIND: {"torque": TORQUE}}, np.zeros(len(setup.own)))
         by_torque = fit_to_torque(search, fitted, setup.fitted)
         assert by_torque.numbers[KIND]["torque"] == pytest.approx(TORQUE, rel=0.05)
         deviation = np.sqrt(np.diag(by_torque.covariance))
