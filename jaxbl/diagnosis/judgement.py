@@ -21,8 +21,8 @@ class Judgement(NamedTuple):
         verdict: as in `diagnosis.json`.
         test: what was asked, and the answers, as in `diagnosis.json`: `failed`, the channels in which the model leaves more
             than a complete one would; `far`, its own numbers that had to leave what is known of them, and by how many
-            standard deviations; whether the added torque does as well shuffled in time (`chance`), the search found that
-            something else is missing (`remainder`), the model as given predicts the proof better (`worse`), the effects take away less
+            standard deviations; whether the added torque does as well shuffled in time (`chance`), something else is missing
+            by the search (`remainder`), the model as given predicts the proof better (`worse`), the effects take away less
             than half of what is missing there (`little`), the logs do not agree (`contradicting`); `weak`, the channels that
             test nothing, and `untested`, the effects that the proof says nothing of.
     """
