@@ -2,10 +2,10 @@
 
 import json
 import math
-import subprocess
 import sys
 import tomllib
 
+import hidden_effects
 import numpy as np
 import pytest
 from hidden import contest
@@ -288,7 +288,7 @@ def test_cases_that_are_there_are_not_made_again(tmp_path):
     assert tomllib.loads((folder / "model.toml").read_text())["title"] == folder.name
 
 
-def test_final_runs_are_logged_and_finished_once(tmp_path):
+def test_final_runs_are_logged_and_finished_once(tmp_path, monkeypatch, capsys):
     path = tmp_path / "final_runs.csv"
     assert contest.final_seed("abc") == contest.final_seed("abc") != contest.final_seed("abd")
     contest.log_final_run("started", "abc", 1, 120, path=path)
@@ -298,5 +298,7 @@ def test_final_runs_are_logged_and_finished_once(tmp_path):
         contest.log_final_run("started", "abc", 1, 120, path=path)
     contest.log_final_run("started", "abd", 2, 120, path=path)
     assert len(path.read_text().splitlines()) == 5
-    call = [sys.executable, str(contest.ROOT / "benchmarks" / "hidden_effects.py"), "--kind", "workshop"]
-    assert "--seed is missing" in subprocess.run(call, capture_output=True, text=True, check=False).stderr
+    monkeypatch.setattr(sys, "argv", ["hidden_effects.py", "--kind", "workshop"])
+    with pytest.raises(SystemExit):
+        hidden_effects.main()
+    assert "--seed is missing" in capsys.readouterr().err
