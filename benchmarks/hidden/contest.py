@@ -52,11 +52,21 @@ def _git(tree: Path, *words: str) -> str:
 
 
 def commit_of(tree: Path) -> str:
-    """Short hash of a tree's commit; with what its package differs from it, hashed, where it does."""
+    """Short hash of the commit that changed a tree's package last, and a hash of what differs from it."""
     change = _git(tree, "diff", "HEAD", "--", "jaxbl")
-    return _git(tree, "rev-parse", "--short", "HEAD") + (
-        f"+{hashlib.sha256(change.encode()).hexdigest()[:6]}" if change else ""
-    )
+    digest = f"+{hashlib.sha256(change.encode()).hexdigest()[:6]}" if change else ""
+    return _git(tree, "log", "-1", "--format=%h", "--", "jaxbl") + digest
+
+
+def final_commit(tree: Path) -> str:
+    """Hash of a tree's commit, for final cases.
+
+    Raises:
+        SystemExit: the package differs from it.
+    """
+    if "+" in commit_of(tree):
+        raise SystemExit(f"{tree}: final cases are of a commit; commit what the package differs from it")
+    return _git(tree, "rev-parse", "HEAD")
 
 
 # ---- trees ----
