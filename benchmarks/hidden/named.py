@@ -5,7 +5,8 @@ answer names the main effect if the one with the largest rms torque is named, an
 the truth allows, and that the truth does not list as `optional`, is wrong; surely wrong above `SURE`.
 
 Friction that bends before it slides contains dry friction, and the bench's does bend: both names are right. A Stribeck
-friction is right where the friction falls with speed, and wrong where it does not. Friction under load is dry friction to a
+friction is right where the friction falls with speed; where it does not, dry friction is named, and more besides, which is
+wrong: it counts as both. Friction under load is dry friction to a
 model with one inertia. Cogging may be named by its multiples. One wave a turn is the weight of an unbalanced wheel.
 
 Of numbers alone an answer is right if it names no effect, or says that numbers are further off than stated.
@@ -70,6 +71,12 @@ def is_named(effect: Mapping[str, Any], finding: Mapping[str, Any]) -> bool:
     return any(base * k in effect["waves"] for k in multiples)
 
 
+def overstates(effect: Mapping[str, Any], finding: Mapping[str, Any]) -> bool:
+    """Return True if a finding names an effect of the truth, and says besides that it falls with speed, which it does not."""
+    name = finding["effect"]
+    return name not in effect["names"] and name.replace("stribeck", "coulomb") in effect["names"]
+
+
 def score(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
     """What an answer is worth: `main`, `all` (bool), `wrong` (name -> confidence), `bets` (confidence, right), `missed`.
 
@@ -79,7 +86,7 @@ def score(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]
     """
     findings, effects = answer.get("findings", []), truth["effects"]
     hits = [(finding, any(is_named(effect, finding) for effect in effects)) for finding in findings]
-    named = [any(is_named(effect, finding) for finding in findings) for effect in effects]
+    named = [any(is_named(effect, finding) or overstates(effect, finding) for finding in findings) for effect in effects]
     optional = truth["optional"]
     wrong = {
         finding["effect"]: finding["confidence"] for finding, hit in hits if not hit and finding["effect"] not in optional

@@ -208,6 +208,8 @@ def test_answers_are_scored():
     half = score(TRUTH, {"findings": [finding("motor.coulomb_friction"), finding("motor.cogging", 0.6, harmonic=24)]})
     assert half["main"] and not half["all"] and half["wrong"] == {"motor.cogging": 0.6} and half["missed"] == ["cogging"]
     assert half["bets"] == [(0.99, True), (0.6, False)]
+    falling = score(TRUTH, {"findings": [finding("motor.stribeck_friction")]})
+    assert falling["main"] and falling["wrong"] == {"motor.stribeck_friction": 0.99} and falling["bets"] == [(0.99, False)]
     optional = score(TRUTH, {"findings": [finding("motor.viscous_friction")]})
     assert not optional["wrong"] and not optional["bets"] and not optional["main"]
     assert not score(TRUTH, {"failure": "refused", "error": "no"})["main"]
