@@ -72,7 +72,7 @@ def is_named(effect: Mapping[str, Any], finding: Mapping[str, Any]) -> bool:
 
 
 def overstates(effect: Mapping[str, Any], finding: Mapping[str, Any]) -> bool:
-    """Return True if a finding names an effect of the truth, and says besides that it falls with speed, which it does not."""
+    """Return True if a finding names a friction of the truth, and says that it falls with speed, which it does not."""
     name = finding["effect"]
     return name not in effect["names"] and name.replace("stribeck", "coulomb") in effect["names"]
 
