@@ -234,9 +234,9 @@ def hold_contest(
             said = _read(path)
             left[folder.name] |= {tool: said[tool]["rms"] for tool in RIVALS}
             for tool in NAMING:
-                findings = findings_of_terms(
-                    said[tool]["names"], said["base"], truths[folder.name]["axis"]["stiffness"] > 0.0
-                )
+                truth = truths[folder.name]
+                geared = truth["axis"]["stiffness"] > 0.0
+                findings = findings_of_terms(said[tool]["names"], said["base"], geared, truth["known"])
                 tools[tool][folder.name] = {"findings": findings, "seconds": said[tool]["seconds"]}
                 if note := said[tool]["note"]:
                     tools[tool][folder.name] |= {"error": note, "failure": "traceback"}

@@ -78,7 +78,7 @@ def overstates(effect: Mapping[str, Any], finding: Mapping[str, Any]) -> bool:
 
 
 def score(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
-    """What an answer is worth: `main`, `all` (bool), `wrong` (name -> confidence), `bets` (confidence, right), `missed`.
+    """What an answer is worth: `main`, `all` (bool), `wrong` (indices of findings), `bets` (confidence, right), `missed`.
 
     Args:
         truth: `effects` (largest first, with their `names`), `optional`, as in truth.json.
@@ -88,16 +88,14 @@ def score(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]
     hits = [(finding, any(is_named(effect, finding) for effect in effects)) for finding in findings]
     named = [any(is_named(effect, finding) or overstates(effect, finding) for finding in findings) for effect in effects]
     optional = truth["optional"]
-    wrong = {
-        finding["effect"]: finding["confidence"] for finding, hit in hits if not hit and finding["effect"] not in optional
-    }
+    wrong = [i for i, (finding, hit) in enumerate(hits) if not hit and finding["effect"] not in optional]
     says_rough = NUMBERS_FURTHER_OFF in " ".join(answer.get("lines", []))
     alone = not effects
     right_alone = not answer.get("error") and (not wrong or says_rough)
     return {
         "main": right_alone if alone else named[0],
         "all": right_alone if alone else all(named),
-        "wrong": {} if alone and says_rough else wrong,
+        "wrong": [] if alone and says_rough else wrong,
         "bets": [
             (finding["confidence"], hit) for finding, hit in hits
             if finding["effect"] not in optional and not (alone and says_rough) and math.isfinite(finding["confidence"])
@@ -118,9 +116,11 @@ _TERMS = {
 }
 
 
-def findings_of_terms(names: Sequence[str], base: Sequence[str], geared: bool) -> list[dict[str, Any]]:
-    """The terms that a regression added to those of the nominal model, as findings without a confidence."""
-    findings = []
+def findings_of_terms(
+    names: Sequence[str], base: Sequence[str], geared: bool, known: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """The terms that a regression added to a nominal model, which has the `known` effects, as findings with no confidence."""
+    findings, of_model = [], [name for effect in known for name in NAMES[effect]]
     for name in names:
         if name in base:
             continue
@@ -134,7 +134,8 @@ def findings_of_terms(names: Sequence[str], base: Sequence[str], geared: bool) -
             finding |= {"effect": "motor.cogging", "parameters": {"harmonic": int(waves[1])}}
         else:
             finding["effect"] = _TERMS.get(name, "motor.stribeck_friction" if name.startswith("Stribeck") else name)
-        findings.append(finding)
+        if finding["effect"] not in of_model:
+            findings.append(finding)
     return findings
 
 
@@ -151,22 +152,27 @@ Answers = Mapping[str, Mapping[str, Any]]
 """Case -> answer of a tool, with the `score` of :func:`score`."""
 
 
+def _left_text(tool: str, names: Sequence[str], left: Mapping[str, Mapping[str, Any]], rivals: Sequence[str]) -> str:
+    """Median over cases of the torque that a tool leaves over the least of the other rivals."""
+    ratios = []
+    for name in names:
+        torques = left.get(name, {})
+        others = [value for rival in rivals if rival != tool and (value := torques.get(rival)) is not None]
+        if others and torques.get(tool) is not None:
+            ratios.append(torques[tool] / min(others))
+    return f"{np.median(ratios):.2f} ({sum(ratio < 1.0 for ratio in ratios)} of {len(ratios)} less)" if ratios else "-"
+
+
 def _tool_row(
     tool: str, truths: Answers, answers: Answers, left: Mapping[str, Mapping[str, float]], rivals: Sequence[str]
 ) -> str:
     scores = {name: score(truths[name], answer) for name, answer in answers.items()}
     with_effects = [name for name in answers if truths[name]["effects"]]
     alone = [name for name in answers if not truths[name]["effects"]]
-    wrong = [confidence for result in scores.values() for confidence in result["wrong"].values()]
+    wrong = [answers[name]["findings"][i]["confidence"] for name, result in scores.items() for i in result["wrong"]]
     sure = sum(confidence > SURE for confidence in wrong)
     with_wrong = sum(bool(result["wrong"]) for result in scores.values())
     error = calibration_error(bets_calibration([bet for result in scores.values() for bet in result["bets"]]))
-    ratios = []
-    for name in answers:
-        torques = left.get(name, {})
-        others = [value for rival in rivals if rival != tool and (value := torques.get(rival)) is not None]
-        if others and torques.get(tool) is not None:
-            ratios.append(torques[tool] / min(others))
     seconds = [answer["seconds"] for answer in answers.values() if answer.get("seconds")]
     failures = [answer["failure"] for answer in answers.values() if answer.get("failure")]
     cells = [
@@ -177,7 +183,7 @@ def _tool_row(
         str(sure) if any(math.isfinite(confidence) for confidence in wrong) or not wrong else "-",
         f"{failures.count('refused')} + {failures.count('traceback')}",
         f"{np.median(seconds):.0f}" if seconds else "-",
-        f"{np.median(ratios):.2f} ({sum(ratio < 1.0 for ratio in ratios)} of {len(ratios)} less)" if ratios else "-",
+        _left_text(tool, list(answers), left, rivals),
         "-" if error is None else f"{error:.3f}",
     ]
     return f"| {tool} | {' | '.join(cells)} |"
@@ -213,6 +219,9 @@ def tables(
     lines[-1] += "torque left, over the best rival's | calibration error |"
     lines.append("|---|---|---|---|---|---:|---:|---:|---|---:|")
     lines += [_tool_row(tool, truths, answers, left, rivals) for tool, answers in tools.items()]
+    # the others name nothing
+    nameless = [tool for tool in rivals if tool not in tools]
+    lines += [f"| {tool} |{' - |' * 7} {_left_text(tool, names, left, rivals)} | - |" for tool in nameless]
     scores = {
         tool: {name: score(truths[name], answer) for name, answer in answers.items()} for tool, answers in tools.items()
     }
@@ -251,15 +260,20 @@ def _waves_text(effect: Mapping[str, Any]) -> str:
     return f" ({effect['waves'][0]} waves)" if effect["effect"] == "cogging" else ""
 
 
+_SHOWN = 10
+"""Findings of an answer that a table shows."""
+
+
 def _answer_text(answer: Mapping[str, Any], result: Mapping[str, Any]) -> str:
     if answer.get("error"):
         return f"{answer.get('failure', 'failed')}: {answer['error'].splitlines()[-1][:90]}".replace("|", "/")
     mark = "all" if result["all"] else "main" if result["main"] else "**missed**"
     found = []
-    for finding in answer.get("findings", []):
+    for i, finding in enumerate(answer.get("findings", [])):
         harmonic = finding["parameters"].get("harmonic", "")
         harmonic = harmonic["value"] if isinstance(harmonic, Mapping) else harmonic
         text = finding["effect"].split(".", 1)[-1] + (f" {harmonic:.4g}" if harmonic else "")
         text += f" {finding['confidence']:.2f}" if math.isfinite(finding["confidence"]) else ""
-        found.append(f"_{text}_" if finding["effect"] in result["wrong"] else text)
-    return f"{mark}: {', '.join(found) or 'nothing'}"
+        found.append(f"_{text}_" if i in result["wrong"] else text)
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    return f"{mark}: {', '.join([*found[:_SHOWN], *more]) or 'nothing'}"
