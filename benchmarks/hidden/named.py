@@ -119,7 +119,7 @@ _TERMS = {
 def findings_of_terms(
     names: Sequence[str], base: Sequence[str], geared: bool, known: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
-    """The terms that a regression added to a nominal model, which has the `known` effects, as findings with no confidence."""
+    """The terms that a regression added to a nominal model with some `known` effects, as findings without confidence."""
     findings, of_model = [], [name for effect in known for name in NAMES[effect]]
     for name in names:
         if name in base:
