@@ -7,6 +7,7 @@ a case that has one is left out. Nothing of the bench is imported, so that an ol
 import json
 import sys
 import time
+import tomllib
 import traceback
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ def answer_case(folder: Path) -> dict[str, Any]:
             {key: finding.get(key) for key in ("effect", "confidence", "parameters", "alternatives")}
             for finding in summary["findings"]
         ]
-        answer |= {"lines": list(diagnosis_lines(summary)), "model": diagnosis.model.to_dict()}
+        answer |= {"lines": list(diagnosis_lines(summary)), "model": tomllib.loads(diagnosis.model.to_toml())}
     except InputError as error:
         answer = {"failure": "refused", "error": str(error).replace(f"{folder}/", "")}
     except Exception:

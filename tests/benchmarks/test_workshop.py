@@ -258,7 +258,7 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, monkeypatch):
         "    if os.environ.get('DIES') == model.parent.name: os._exit(3)\n"
         "    if model.parent.name == 'second': raise ZeroDivisionError('here')\n"
         "    summary = {'verdict': 'explained', 'findings': [{'effect': 'motor.inertia', 'confidence': 1.0}]}\n"
-        "    return SimpleNamespace(summary=summary, model=SimpleNamespace(to_dict=dict))\n"
+        "    return SimpleNamespace(summary=summary, model=SimpleNamespace(to_toml=str))\n"
     )
     (tree / "jaxbl" / "errors.py").write_text("class InputError(Exception): pass\n")
     (tree / "jaxbl" / "report" / "__init__.py").touch()
