@@ -10,6 +10,14 @@ extra `bench`) 100 cases take a quarter of a CPU minute to draw; without it, in 
     python benchmarks/hidden_effects.py --seed 1 --count 20 --kind rough --out results/rough   # nothing is missing
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --save results/cases    # logs and models as files
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --results results/diagnosed   # what a batch left
+
+The kind `workshop` has logs as people record them (hidden/workshop.py), several effects together, a table of names that are
+right for each (hidden/named.py), and other tools beside (real/rivals.py). It goes on where it was stopped. Needs numba:
+
+    python benchmarks/hidden_effects.py --seed 1 --count 120 --kind workshop --rivals --out results/workshop
+    python benchmarks/hidden_effects.py --seed 1 --first 24 --count 12 --kind workshop --out results/workshop   # 24 to 35
+    python benchmarks/hidden_effects.py --seed 1 --count 120 --kind workshop --out results/workshop --tree . --tree ../older
+    python benchmarks/hidden_effects.py --final --count 120 --kind workshop --rivals --out results/final   # once a commit
 """
 
 import argparse
@@ -22,6 +30,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hidden import contest
 from hidden.cases import ALONE, KINDS, Case, Log, cases, plant_numbers, save
 from hidden.scoring import Diagnose, Oracle, Outcome, markdown, outcome, prove, run, write
 from hidden.simulator import engine
@@ -124,11 +133,32 @@ def read_outcomes(hidden_cases: Sequence[Case], folder: Path) -> list[Outcome]:
     return outcomes
 
 
+def run_workshop(asked: argparse.Namespace) -> None:
+    """Make, answer and compare cases of `workshop`, or make them alone (`--save`)."""
+    numbers = range(asked.first, asked.first + asked.count)
+    trees = asked.tree or [contest.ROOT]
+    commit, seed = "", asked.seed
+    if asked.final:
+        commit = contest.final_commit(trees[0])
+        seed = contest.final_seed(commit)
+        contest.log_final_run("started", commit, seed, asked.count)
+    if asked.save is not None:
+        contest.make_cases(seed, numbers, asked.save)
+        print(f"written to {asked.save}")
+        return
+    out = asked.out or Path("results") / f"workshop_{seed}"
+    text, counts = contest.hold_contest(seed, numbers, out, trees, asked.rivals, asked.jobs)
+    (out / "scores.md").write_text(text, encoding="utf-8")
+    print(text)
+    if asked.final:
+        contest.log_final_run("finished", commit, seed, asked.count, json.dumps(counts))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, required=True, help="of the cases; take one that development has not seen")
+    parser.add_argument("--seed", type=int, help="of the cases; take one that development has not seen")
     parser.add_argument("--count", type=int, default=66, help="number of cases")
-    parser.add_argument("--kind", choices=(*KINDS, *ALONE, "all"), default="single")
+    parser.add_argument("--kind", choices=(*KINDS, *ALONE, "all", "workshop"), default="single")
     parser.add_argument(
         "--save", type=Path, metavar="FOLDER", help="write logs, models and truth there, and diagnose nothing"
     )
@@ -138,10 +168,22 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes that share the work")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there")
+    workshop = parser.add_argument_group("workshop")
+    workshop.add_argument("--first", type=int, default=0, metavar="N", help="number of the first case")
+    workshop.add_argument(
+        "--tree", type=Path, action="append", metavar="FOLDER", help="checkout of the package; several are compared"
+    )
+    workshop.add_argument("--rivals", action="store_true", help="ask the other tools as well")
+    workshop.add_argument("--final", action="store_true", help="the seed is the commit's; the run is logged, and run once")
     asked = parser.parse_args()
+    if asked.seed is None and not (asked.final and asked.kind == "workshop"):
+        parser.error("--seed is missing")
+    if asked.kind == "workshop":
+        run_workshop(asked)
+        return
 
-    start = time.perf_counter()
-    hidden_cases = cases(asked.seed, asked.count, asked.kind)
+    start, seed = time.perf_counter(), int(asked.seed)
+    hidden_cases = cases(seed, asked.count, asked.kind)
     print(f"{len(hidden_cases)} cases of seed {asked.seed} in {time.perf_counter() - start:.0f} s ({engine()[1]})")
     if asked.save is not None:
         save(hidden_cases, asked.save)

@@ -13,9 +13,9 @@ from .effects import EFFECTS, NEW, UNKNOWN
 BINS = 10
 """Bins of the calibration curve, over confidences from 0 to 1."""
 
-_ROUGH_NUMBERS = "numbers are further off than stated"
-FIRST_LINE = f"The {_ROUGH_NUMBERS}; no effect is needed."
-"""First line that a case of `rough` should get; scored by the words of `_ROUGH_NUMBERS`."""
+NUMBERS_FURTHER_OFF = "numbers are further off than stated"
+FIRST_LINE = f"The {NUMBERS_FURTHER_OFF}; no effect is needed."
+"""First line that a case of `rough` should get; scored by the words of `NUMBERS_FURTHER_OFF`."""
 NEXT_STEP = "jaxbl identify LOG --model TOML"
 """First of the next steps that a case of `rough` should get; scored by its first two words."""
 
@@ -116,7 +116,7 @@ class Outcome:
     @property
     def says_rough(self) -> bool:
         """True if the first line says that the numbers, and no effect, are the reason."""
-        return _ROUGH_NUMBERS in self.first_line
+        return NUMBERS_FURTHER_OFF in self.first_line
 
     @property
     def sends_to_identify(self) -> bool:
@@ -144,12 +144,18 @@ def wilson_interval(hits: int, count: int) -> tuple[float, float]:
 
 def calibration(outcomes: Iterable[Outcome]) -> list[dict[str, float]]:
     """Calibration curve in `BINS` bins of equal width: mean `confidence`, share that is `right`, `count` of findings."""
-    bets = [
-        (confidence, effect in (*outcome.hidden, *outcome.clutter))
-        for outcome in outcomes
-        for effect, confidence, _ in outcome.findings
-        if outcome.named_effects
-    ]
+    return bets_calibration(
+        [
+            (confidence, effect in (*outcome.hidden, *outcome.clutter))
+            for outcome in outcomes
+            for effect, confidence, _ in outcome.findings
+            if outcome.named_effects
+        ]
+    )
+
+
+def bets_calibration(bets: Sequence[tuple[float, bool]]) -> list[dict[str, float]]:
+    """The same of confidences, and whether each was right."""
     rows = []
     for i in range(BINS):
         inside = [(c, r) for c, r in bets if min(int(c * BINS), BINS - 1) == i]

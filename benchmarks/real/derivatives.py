@@ -141,7 +141,9 @@ class Terms:
         return np.array([i for i, name in enumerate(self.names) if name in names], dtype=int)
 
 
-def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[float, float]) -> Terms:
+def terms_of(
+    parts: Sequence[Part], model: Config, linear: bool, spans: tuple[float, float], harmonics: int = _HARMONICS
+) -> Terms:
     """Terms of a log.
 
     Args:
@@ -149,6 +151,7 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
         model: nominal; says which terms are there from the beginning, and which inertia is known.
         linear: whether positions are in m: a place then has no angle.
         spans: largest speed and travel of the log that is fitted, which say what is tried.
+        harmonics: most periods a turn; with more than those of small drives, what a gear has besides is tried, too.
     """
     drive = model.drive
     exact_inertia = drive.motor_inertia if "drive.motor_inertia" in model.uncertainty.exact else None
@@ -158,7 +161,7 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
     for part in parts:
         k = part.kinematics
         q, v, a = (np.asarray(column["motor"]) for column in (k.position, k.velocity, k.acceleration))
-        columns = _columns(q, v, a, linear, spans)
+        columns = _columns(q, v, a, linear, spans, harmonics)
         if not rigid:
             twist = q - np.asarray(k.position["load"]) * float(drive.gear_ratio)
             rate = v - np.asarray(k.velocity["load"]) * float(drive.gear_ratio)
@@ -167,6 +170,11 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
                 ("twist rate", "N m s/rad", rate),
                 ("twist cubed", "N m/rad³", twist**3),
             ]
+            if harmonics > _HARMONICS:
+                load = np.asarray(k.position["load"])
+                columns.append(("friction under load", "1", np.sign(v) * np.abs(twist)))
+                for n in (1, 2):
+                    columns += [(f"{n} a load turn", "N m", wave(n * load)) for wave in (np.sin, np.cos)]
         if exact_inertia is not None:
             columns = columns[1:]
         torque = np.asarray(k.torque) - (exact_inertia or 0.0) * a
@@ -180,7 +188,7 @@ def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[fl
 
 
 def _columns(
-    q: np.ndarray, v: np.ndarray, a: np.ndarray, linear: bool, spans: tuple[float, float]
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, linear: bool, spans: tuple[float, float], harmonics: int
 ) -> list[tuple[str, str, np.ndarray]]:
     fastest, travel = spans
     columns = [
@@ -194,7 +202,7 @@ def _columns(
     for share in _SLOW:
         columns.append((f"Stribeck at {share * fastest:.2g}", "N m", np.sign(v) * np.exp(-((v / (share * fastest)) ** 2))))
     if not linear:
-        for n in range(1, _HARMONICS + 1):
+        for n in range(1, harmonics + 1):
             # one whole wave, or it cannot be told from the slower terms; of gravity a pendulum shows less
             if n == 1 or travel >= 2.0 * np.pi / n:
                 columns += [(f"{n} a turn", "N m", np.sin(n * q)), (f"{n} a turn", "N m", np.cos(n * q))]
