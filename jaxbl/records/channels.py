@@ -245,6 +245,8 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
 
 _MIN_COUNTER, _MAX_COUNTER = 2.0**8, 2.0**32
 """Powers of two by which a counter jumps: bytes and words. A few lost counts are other numbers."""
+_MAX_TOLERANCE = 0.02
+"""Uncertainty of a jump, over its size, by the motion about it: a jump of any size meets a power of two in 1 of 25 cases."""
 
 
 def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: float, stamps: TimeStamps) -> np.ndarray:
@@ -258,8 +260,10 @@ def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: floa
     for row in np.flatnonzero(np.abs(sizes) > 0.9 * _MIN_COUNTER):
         power = 2.0 ** round(math.log2(abs(sizes[row])))
         tolerance = 2.0 + 3.0 * float(np.median(np.abs(sizes[max(row - 4, 0) : row + 5])))
-        if power <= _MAX_COUNTER and abs(abs(sizes[row]) - power) < tolerance < power / _CLEAR_JUMP:
-            jumps[row] = math.copysign(power, sizes[row])
+        # one of another size, and all are of another cause
+        if not (power <= _MAX_COUNTER and abs(abs(sizes[row]) - power) < tolerance < _MAX_TOLERANCE * power):
+            return values
+        jumps[row] = math.copysign(power, sizes[row])
     rows = np.flatnonzero(jumps)
     if not len(rows) or len(rows) > 0.01 * len(values):
         return values

@@ -61,7 +61,7 @@ class ZeroShift(NamedTuple):
 
 
 class _MovingRows(NamedTuple):
-    """Low-passed rows in motion: torque, columns of the motion, and cos(n position) and sin(n position), n = 1, 2, ..."""
+    """Low-passed rows in motion: torque, acceleration and other columns, cos(n position), sin(n position), n = 1, 2, ..."""
 
     torque: np.ndarray
     columns: np.ndarray
@@ -78,6 +78,17 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     first_rows, rows = (_select_moving_rows(log, cutoff) for log in (first, second))
     if first_rows is None or rows is None:
         return None
+    return _find_shift(first_rows, rows) or _find_shift(*map(_exchange_acceleration, (first_rows, rows)))
+
+
+def _exchange_acceleration(rows: "_MovingRows") -> "_MovingRows":
+    """Exchange torque and acceleration: under a constant torque the acceleration shows what repeats with the turn."""
+    # a constant torque is the column of ones once more
+    varying_torque = rows.torque[:, None][:, : int(np.ptp(rows.torque) > 1e-6 * rms(rows.torque))]
+    return rows._replace(torque=rows.columns[:, 0], columns=np.hstack([varying_torque, rows.columns[:, 1:]]))
+
+
+def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows") -> ZeroShift | None:
     regressors = np.hstack([first_rows.columns, first_rows.cosine, first_rows.sine])
     values, errors = fit_with_jackknife(first_rows.torque, regressors)
     if not np.isfinite(values).all():
@@ -149,6 +160,9 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     speed = np.abs(rows_in_segments.columns[:, 1])
     rows = speed > _MIN_SPEED_SHARE * rms(speed)
     moving_rows = _MovingRows(*(columns_of_rows[rows] for columns_of_rows in rows_in_segments))
+    if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
+        # in one direction the sign of the velocity is the column of ones once more
+        moving_rows = moving_rows._replace(columns=np.delete(moving_rows.columns, 2, axis=1))
     return moving_rows if len(moving_rows.torque) > BLOCKS * 2 * _MAX_HARMONIC else None
 
 

@@ -205,7 +205,7 @@ def read_record(
         statistics["theta_s"] = replace(statistics["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
         note_skew(file, gearing, grid.period)
         note_lost_motion(file, gearing, statistics)
-    if lateness is not None and lateness.is_known:
+    if lateness is not None and lateness.error < segmented.period:
         statistics["u"] = replace(statistics["u"], skew=lateness.value, skew_error=lateness.error)
     return Record(
         path=file.path,

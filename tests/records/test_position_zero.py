@@ -31,6 +31,28 @@ def test_the_difference_of_the_zeros_is_found(gear: bool):
     assert abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
 
 
+def simulate_torque_step(zero: float, torque: float, cogging: float = 2e-3) -> TurningLog:
+    """A motor under a constant torque; cogging of 7 a turn makes its speed ripple."""
+    period, speed, position = 2e-3, torque / 1e-3, 0.0
+    positions = np.empty(4000)
+    for i in range(len(positions)):
+        positions[i] = position
+        for _ in range(10):
+            position += 0.05 * period * speed
+            speed += 0.1 * period * (torque - 1e-3 * speed + cogging * np.sin(7.0 * position)) / 1e-4
+            position += 0.05 * period * speed
+    counts = np.round((positions - zero) * 16384 / (2.0 * np.pi))
+    return TurningLog(np.full(4000, torque), counts * 2.0 * np.pi / 16384, None, [slice(0, 4000)], period)
+
+
+def test_the_difference_of_the_zeros_is_found_under_constant_torques():
+    shift = find_zero_shift(simulate_torque_step(0.0, 0.02), simulate_torque_step(0.3, 0.025))
+    assert shift is not None and 7 in shift.waves
+    # a hundredth of a period of the wave: its ripple of the speed is fitted along
+    assert shift.value == pytest.approx(0.3, abs=0.015)
+    assert find_zero_shift(simulate_torque_step(0.0, 0.02, 0.0), simulate_torque_step(0.3, 0.025, 0.0)) is None
+
+
 def test_the_smallest_of_equal_places_is_taken():
     # 5 and 10 a turn repeat every 72 degrees
     shift = find_zero_shift(simulate_turning_log(1, 0.0), simulate_turning_log(2, 3.0))
