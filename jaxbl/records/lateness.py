@@ -84,22 +84,22 @@ def _fit_lateness(
     period, encoder_count = grid.period, len(encoders)
     columns, moving_rows, torques = [], [], []
     for segment in segments:
-        count = segment.stop - segment.start
-        inner, is_moving = np.zeros(count, bool), np.ones(count, bool)
-        inner[trim_filter_ends(count, cutoff, period)] = True
-        accelerations, others = [], [np.ones(count)]
+        sample_count = segment.stop - segment.start
+        inner, is_moving = np.zeros(sample_count, bool), np.ones(sample_count, bool)
+        inner[trim_filter_ends(sample_count, cutoff, period)] = True
+        accelerations, other_columns = [], [np.ones(sample_count)]
         for name in encoders:
             position = low_pass(grid.values[name][segment], cutoff, period)
             velocity = _differentiate(position, period)
             accelerations.append(_differentiate(velocity, period))
-            others += [velocity, np.sign(velocity), position]
+            other_columns += [velocity, np.sign(velocity), position]
             is_moving &= np.abs(velocity) > _SLOW_SHARE * rms(velocity)
         # the low-pass smears a reversal over half a period of its cutoff
         reach = math.ceil(0.5 / (cutoff * period))
         near_reversal = np.convolve(~is_moving, np.ones(2 * reach + 1), "same") > 0.5
         # a soft shaft shows in the second derivative of the acceleration
         snap = _differentiate(_differentiate(accelerations[0], period), period)
-        columns.append(np.stack([*accelerations, snap, *others], axis=1))
+        columns.append(np.stack([*accelerations, snap, *other_columns], axis=1))
         moving_rows.append(inner & ~near_reversal)
         torques.append(low_pass(grid.values["u"][segment], cutoff, period))
     motion, rows = np.concatenate(columns), np.concatenate(moving_rows)
@@ -125,9 +125,9 @@ def _fit_lateness(
     scaled = scale_columns(regressors)
     own_slope = slope + scaled[:, :-1] @ np.linalg.lstsq(scaled[:, :-1], -slope, rcond=1e-12)[0]
     densities = []
-    for part in (target - regressors @ values, own_slope):
+    for signal_part in (target - regressors @ values, own_slope):
         signal = np.zeros(len(rows))
-        signal[rows] = part
+        signal[rows] = signal_part
         densities.append(welch_spectrum(signal, min(2048, len(signal) // 4))[1])
     # a torque that the columns lack hides in the slope at most what it leaves at the slope's frequencies
     missing_error = float(np.sum(np.sqrt(densities[0] * densities[1])) / np.sum(densities[1]))
