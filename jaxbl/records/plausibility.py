@@ -360,7 +360,7 @@ def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.nda
         period = fit_even_stamps(segmented.times[segmented.segments[0]]).period
         times_better = stamped_noise / max(even_noise, 1e-300)
         file.warnings.append(
-            f"{DOUBT}the samples fit even stamps {times_better:.2g} times better than their own: these are a host's, not "
+            f"The samples fit even stamps {times_better:.2g} times better than their own: these are a host's, not "
             f"the drive's. [log] t = {{ period = {period:.4g} }} reads them as even, if no row was lost."
         )
 

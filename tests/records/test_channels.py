@@ -81,13 +81,13 @@ def test_lost_counts_are_no_counter_jumps(read_frame):
 
 
 @pytest.mark.parametrize("jitter", [0.05, 0.3])
-def test_stamps_of_a_host_are_doubted(read_frame, jitter):
+def test_stamps_of_a_host_are_named(read_frame, jitter):
     frame = simulate_log(resolution=STEP)
     times = frame["t"].to_numpy()
     delay = 1e-3 * jitter * np.random.default_rng(2).random(4000)
     record = read_frame(frame.assign(t=times + delay))
     (warning,) = record.warnings
-    assert warning.startswith("Doubtful: the samples fit even stamps ") and "[log] t = { period = 0.001 }" in warning
+    assert warning.startswith("The samples fit even stamps ") and "[log] t = { period = 0.001 }" in warning
     assert read_frame(frame.assign(t=times + delay), {"t": {"period": 1e-3}}).warnings == ()
     # stamps that the readings follow
     assert read_frame(simulate_log(times + delay, resolution=STEP)).warnings == ()
