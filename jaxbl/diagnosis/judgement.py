@@ -38,7 +38,7 @@ def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, 
         chosen: the model.
         proof: what was held out.
         prior: standard deviations of its own numbers, which are the first of the fitted ones.
-        share: of the missing torque that it explains (:func:`explained_share`).
+        share: of the missing torque that it explains (:func:`.confidence.explained_share`).
         contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
     """
     fitted = chosen.fitted
