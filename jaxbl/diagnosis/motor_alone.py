@@ -21,7 +21,7 @@ from jaxbl.identification.free_parameters import FreeParameter, make_free_parame
 from jaxbl.identification.intervals import UNSEEN, Spread
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
-from jaxbl.identification.segments import reading_noise, segments_of
+from jaxbl.identification.segments import reading_noise, segments_of, signal_sizes
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
@@ -110,14 +110,15 @@ def _set_up(task: DiagnosisTask) -> _Search:
     model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
     own = default_paths(config, bare)
     paths = {name: f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()}
-    free = make_free_parameters(model, [*own, *paths.values()], size)
+    rest = config.log.initial_state == "rest"
+    segments = segments_of(record, ["motor"], rest)
+    free = make_free_parameters(model, [*own, *paths.values()], signal_sizes(bare, segments))
     width = widths(free, np.e)
     width[: len(own)] = config.uncertainty.relative
     effects = {name: len(own) + i for i, name in enumerate(names)}
     # what the model as given has: its own numbers, and next to none of the effects
     none = np.array([0.0 if i < len(own) else np.log(_SMALL) for i in range(len(free))])
-    rest = config.log.initial_state == "rest"
-    return _Search(UnseenLoad(model, free, width, segments_of(record, ["motor"], rest), rest), effects, none)
+    return _Search(UnseenLoad(model, free, width, segments, rest), effects, none)
 
 
 def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:

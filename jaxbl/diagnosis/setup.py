@@ -9,7 +9,7 @@ import numpy as np
 from jaxbl.errors import InputError
 from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import Segment, segments_of
+from jaxbl.identification.segments import Segment, segments_of, signal_sizes
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
@@ -89,10 +89,10 @@ def set_up(task: DiagnosisTask) -> Setup:
     # one structure for all models, so that they share their compiled programs
     nominal = complete(bare)
     _check_order(bare)
-    own = make_free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
-    prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
     recorded = segments_of(record, nominal.sides, rest)
+    own = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
+    prior = np.full(len(own), config.uncertainty.relative)
     _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
     noise = _input_noise(input_rms(record), nominal, own, recorded)
     segments = quiet(recorded, noise.unfelt)

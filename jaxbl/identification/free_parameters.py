@@ -19,18 +19,21 @@ PRIOR_DEVIATION = 3.0
 
 
 class FreeParameter(NamedTuple):
-    """A number to be fitted. It is scale exp(theta) if it must stay positive, otherwise nominal + scale theta.
+    """A number to be fitted. It is scale exp(theta) if it stays positive, otherwise nominal + scale theta.
 
-    theta is 0 at the nominal value. A change of theta is a relative change of the number, or of an angle one in rad.
+    theta is 0 at the nominal value. A change of theta is a relative change of the number, or of an angle one in rad; of a
+    number that is nominally 0 it is a share of the size that the log gives it (:func:`make_free_parameters`).
 
     Attributes:
         path: dotted path of the number in the experiment.
         unit: of the number.
         nominal: value before the fit.
         scale: change of the number per change of theta, at theta = 0.
-        positive: True if the number must stay positive.
+        positive: True if the number stays positive in a fit.
         role: its part in an effect (:class:`jaxbl.drive.effects.Role`); "" for other numbers.
         maximum: largest value that a study may give it, or None.
+        minimum: 0 if a study may not make it negative, or None. A fit goes through 0, so that what is 0 is found without bias;
+            what it tells is not below.
     """
 
     path: str
@@ -40,13 +43,18 @@ class FreeParameter(NamedTuple):
     positive: bool
     role: str = ""
     maximum: float | None = None
+    minimum: float | None = None
 
     def value(self, theta: Any) -> Any:
         """The number at a theta, an array or a float."""
         value = self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
-        if self.maximum is None:
-            return value
-        return jnp.minimum(value, self.maximum) if isinstance(value, jax.Array) else np.minimum(value, self.maximum)
+        if not isinstance(value, jax.Array):
+            return np.clip(value, self.minimum, self.maximum)
+        return value if self.maximum is None else jnp.minimum(value, self.maximum)
+
+    def theta(self, value: float) -> float:
+        """Theta at a value."""
+        return float(np.log(value / self.scale) if self.positive else (value - self.nominal) / self.scale)
 
     def slope(self, theta: Any) -> Any:
         """Derivative of the number by theta."""
@@ -58,17 +66,51 @@ def _exp(theta: Any) -> Any:
     return jnp.exp(theta) if isinstance(theta, jax.Array) else np.exp(theta)
 
 
-def make_free_parameters(experiment: Experiment, paths: Sequence[str], torque: float) -> tuple[FreeParameter, ...]:
+class SignalSizes(NamedTuple):
+    """Sizes of a log's signals, from which a number that is nominally 0 gets its scale.
+
+    Attributes:
+        torque: of the input, N m.
+        speed: of the motor, rad/s.
+        twist: of the transmission, rad.
+    """
+
+    torque: float
+    speed: float = 0.0
+    twist: float = 0.0
+
+    def scale_number(self, experiment: Experiment, path: str, unit: str) -> float:
+        """Size of a number at which its torque is that of the input, by its unit; 1 where the log gives none."""
+        side = "load" if path.split(".")[1].startswith("load") and "load" in experiment.sides else "motor"
+        ratio = float(experiment.drive.ratio(side))
+        torque, speed = self.torque * ratio, self.speed / ratio
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = {
+                "N m": torque,
+                "N m s/rad": np.divide(torque, speed),
+                "N m s²/rad²": np.divide(torque, speed**2),
+                "N m/rad³": np.divide(torque, self.twist**3),
+                "kg m²": float(experiment.drive.inertia(side)),
+                "rad": self.twist,
+                "s": float(experiment.run.sample_period),
+            }.get(unit, 1.0)
+        return float(size) if np.isfinite(size) and size > 0.0 else 1.0
+
+
+def make_free_parameters(
+    experiment: Experiment, paths: Sequence[str], sizes: SignalSizes | float
+) -> tuple[FreeParameter, ...]:
     """Make free parameters of the numbers at some paths.
 
     Args:
         experiment: has the nominal values.
         paths: dotted paths of numbers of the plant.
-        torque: size of the input, N m: the scale of torques whose nominal value is 0.
+        sizes: of the log's signals, or of its input alone (N m): they scale what is nominally 0.
 
     Raises:
-        InputError: a path that is unknown or named twice, or a positive number without a nominal value.
+        InputError: a path that is unknown or named twice.
     """
+    sizes = sizes if isinstance(sizes, SignalSizes) else SignalSizes(sizes)
     parameters = {path: leaf for path, leaf in leaf_paths(experiment).items() if path.split(".")[0] in PLANT_TABLES}
     free: list[FreeParameter] = []
     for path in paths:
@@ -77,13 +119,11 @@ def make_free_parameters(experiment: Experiment, paths: Sequence[str], torque: f
         if path in paths[: len(free)]:
             raise InputError(f"'{path}' is named twice; once is enough")
         nominal, parameter = float(get_leaf(experiment, path)), parameters[path]
-        positive = is_positive(parameter)
-        if positive and nominal <= 0.0:
-            raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
-        role = parameter.role.kind if parameter.role else ""
+        role, minimum = parameter.role.kind if parameter.role else "", 0.0 if is_positive(parameter) else None
         # an angle has no relative size
-        scale = 1.0 if role == "angle" else abs(nominal) or (torque if parameter.unit == "N m" else 0.0) or 1.0
-        free.append(FreeParameter(path, parameter.unit, nominal, scale, positive, role, parameter.maximum))
+        scale = 1.0 if role == "angle" else abs(nominal) or sizes.scale_number(experiment, path, parameter.unit)
+        positive = minimum is not None and nominal > 0.0
+        free.append(FreeParameter(path, parameter.unit, nominal, scale, positive, role, parameter.maximum, minimum))
     return tuple(free)
 
 

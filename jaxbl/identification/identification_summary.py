@@ -123,6 +123,7 @@ def by_trajectories(found: Found, record: Record) -> JsonObject:
         "kind": "prediction_error" if found.smoothness else "output_error",
         "window": found.samples * record.sample_period,
         "windows": len(found.firsts),
+        "steps": found.steps,
         "converged": found.fit.converged,
         "starts": len(found.starts),
         "starts_agreeing": sum(start["agrees"] for start in found.starts),

@@ -29,7 +29,7 @@ from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .regression import remembers_input
 from .search import ParameterSearch
-from .segments import Segment, led_in, long_enough, segments_of
+from .segments import Segment, led_in, long_enough, segments_of, signal_sizes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,10 +122,10 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
         if not paths:
-            raise InputError("model: no number to identify: all are exact or 0; give one a value to start from")
-        free = make_free_parameters(nominal, paths, float(np.std(record.torque)))
+            raise InputError("model: no number to identify: all are in [uncertainty] exact; take one out")
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
         segments = segments_of(record, sides, rest)
+        free = make_free_parameters(nominal, paths, signal_sizes(nominal, segments))
         done()
         if alone:
             return _from_motor(task, nominal, free, segments, done)

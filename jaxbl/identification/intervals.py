@@ -45,6 +45,13 @@ class Spread(NamedTuple):
     variance: float | np.floating
     inflation: Float[np.ndarray, " parameters"]
 
+    def with_error(self, *changes: np.ndarray) -> "Spread":
+        """Count changes of theta, each of shape (parameters,), as further errors."""
+        covariance = np.asarray(self.covariance)
+        wide = covariance + sum(np.outer(change, change) for change in changes)
+        more = np.sqrt(np.diag(wide) / np.diag(covariance))
+        return self._replace(covariance=wide, inflation=self.inflation * more)
+
 
 def spread(fit: Fit) -> Spread:
     """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth."""
@@ -190,7 +197,7 @@ def _gathered(
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
     low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
     values = np.array([float(one.value(centre + step)) for step, _ in points])
-    return Profile((max(low, 0.0) if one.positive else low, high), values, np.array([d for _, d in points]))
+    return Profile((low if one.minimum is None else max(low, one.minimum), high), values, np.array([d for _, d in points]))
 
 
 def _end(points: list[tuple[float, float]], limit: float) -> float:

@@ -22,7 +22,7 @@ from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions
 from jaxbl.records.table import TorqueTable
 from jaxbl.simulate import Experiment
 
-from .free_parameters import PLANT_TABLES, is_positive
+from .free_parameters import PLANT_TABLES
 from .observer_gains import ChosenGains, choose_gains
 from .segments import Segment
 
@@ -321,14 +321,16 @@ def on_record(config: Config, record: Record) -> Experiment:
 
 
 def default_paths(config: Config, experiment: Experiment) -> list[str]:
-    """All numbers of the plant that are not known exactly and have a value to start from."""
+    """All numbers of the plant that are not known exactly, but for frequencies of 0 and what a fit leaves as it is."""
     return [
         path
         for path, about in leaf_paths(experiment).items()
         if path.split(".")[0] in PLANT_TABLES
         and path not in config.uncertainty.exact
-        and not (is_positive(about) and float(get_leaf(experiment, path)) <= 0.0)
-        and not (about.role and about.role.kind == "held" and float(get_leaf(experiment, path)) == about.role.neutral)
+        and not (
+            about.role
+            and float(get_leaf(experiment, path)) == {"held": about.role.neutral, "frequency": 0.0}.get(about.role.kind)
+        )
     ]
 
 

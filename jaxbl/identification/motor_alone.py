@@ -176,13 +176,14 @@ def _found(model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, he
         for each in ([one.torque for one in model.segments], [one.readings["motor"] for one in model.segments])
     )
     windows = Windows(
-        torque, {"motor": readings}, jnp.zeros(1), fit.start, {"motor": jnp.asarray(noise)}, jnp.asarray([model.rest])
-    )
+        torque, {"motor": readings}, jnp.zeros(1), fit.start, {"motor": jnp.asarray(noise)}, jnp.asarray([model.rest]),
+        jnp.zeros(fit.residual.shape),
+    )  # fmt: skip
     return Found(
         free=tuple(model.free[i] for i in seen), fit=fit,
         spread=_only(width, seen)._replace(variance=size**2),
         windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
-        refused=refused, held=[], condition=condition, starts=[],
+        refused=refused, held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
     )  # fmt: skip
 
 

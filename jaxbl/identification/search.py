@@ -13,7 +13,8 @@ from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment
 
 from .free_parameters import FreeParameter, set_free_parameters
-from .intervals import Refusal, Spread, refusals, spread
+from .intervals import Refusal, Spread, refusals
+from .plant_steps import refine_steps
 from .prediction import predictor
 from .segments import Segment, windows_of
 from .trajectory import Fit, Windows, fits
@@ -48,6 +49,7 @@ class Fitted:
         windows: the record as it was fitted.
         firsts: row that each window begins with.
         smoothness: of each side's predictor; empty for output error.
+        steps: plant steps in a sample.
         between: by how much theta differs between the window lengths that were tried; None if there was one.
     """
 
@@ -57,6 +59,7 @@ class Fitted:
     windows: Windows
     firsts: np.ndarray
     smoothness: dict[str, float]
+    steps: int
     between: np.ndarray | None = None
 
     @property
@@ -176,8 +179,13 @@ class ParameterSearch:
     def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, kept: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
 
-        def fitted(windows: Windows) -> Fit:
-            return fits(self.experiment, free, windows, theta[None], held=~kept[None])[0]
+        def fit_again(windows: Windows, fit: Fit) -> Fit:
+            start = theta.copy()
+            start[kept] = fit.theta
+            return fit_from(windows, start).only(np.flatnonzero(kept))
+
+        def fit_from(windows: Windows, start: np.ndarray) -> Fit:
+            return fits(self.experiment, free, windows, start[None], held=~kept[None])[0]
 
         left = tuple(itertools.compress(free, kept))
         tried: list[tuple[float, Fitted]] = []
@@ -187,12 +195,12 @@ class ParameterSearch:
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
                     windows, smoothness = predictor(set_free_parameters(self.experiment, free, jnp.asarray(theta)), windows)
-                    theta = np.asarray(fitted(windows).theta)
-            found = fitted(windows).only(np.flatnonzero(kept))
-            width = spread(found)
+                    theta = np.asarray(fit_from(windows, theta).theta)
+            found = fit_from(windows, theta).only(np.flatnonzero(kept))
+            windows, found, width, steps = refine_steps(self.experiment, left, windows, found, fit_again)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size):
-                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness)))
+                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness, steps)))
         if not tried:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
         best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
@@ -207,7 +215,5 @@ def _between(best: Fitted, other: Fitted) -> Fitted:
     change = np.asarray(other.fit.theta - best.fit.theta)
     width = best.spread
     if float(width.variance) > NOISE_ALONE**2:
-        wide = width.covariance + jnp.asarray(np.outer(change, change))
-        more = jnp.sqrt(jnp.diag(wide) / jnp.diag(width.covariance))
-        width = width._replace(covariance=wide, inflation=width.inflation * more)
+        width = width.with_error(change)
     return replace(best, spread=width, between=change)

@@ -15,9 +15,11 @@ import numpy as np
 from jaxbl.drive.effects import DELAY_SAMPLES, AbstractEffect, Motion
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.records import Record
+from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
+from .free_parameters import SignalSizes
 from .regression import Kinematics, Path, effect_states, kinematics_from, shortest
 from .smoother import Smoothed, smooth
 from .trajectory import Windows, cut
@@ -122,6 +124,16 @@ def segments_of(record: Record, sides: Sequence[str], rest: bool = False) -> lis
 def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
     """Standard deviation of the readings' noise of each side, rad: the mean over the segments."""
     return {side: float(np.mean([float(one.smoothed[side].noise) for one in segments])) for side in segments[0].smoothed}
+
+
+def signal_sizes(experiment: Experiment, segments: Sequence[Segment]) -> SignalSizes:
+    """Standard deviation of the input, rms speed of the motor, and standard deviation of the twist."""
+    motion = [one.kinematics for one in segments]
+    speed = rms(np.concatenate([part.velocity["motor"] for part in motion]))
+    twist = [part.position["motor"] - experiment.drive.ratio("load") * part.position.get("load", 0.0) for part in motion]
+    geared = "load" in motion[0].position
+    torque = float(np.std(np.concatenate([one.torque for one in segments])))
+    return SignalSizes(torque, speed, float(np.std(np.concatenate(twist))) if geared else 0.0)
 
 
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:

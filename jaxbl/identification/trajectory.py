@@ -53,9 +53,10 @@ class Windows(eqx.Module):
         start: a guess of the state at each window's first sample, leaves of shape (windows,).
         noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
         rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
+        finer: what finer plant steps than the experiment's add to the simulated positions, over the noise
+            (:mod:`.plant_steps`).
         gain: of the predictor (:func:`jaxbl.simulate.plant_trajectory`) of each side, shape (2,);
             None: free runs, output error.
-        weight: of each window's residuals, shape (windows,); 0 where a window only fills up; None: 1.
     """
 
     torque: Float[Array, "windows samples"]
@@ -64,32 +65,30 @@ class Windows(eqx.Module):
     start: PlantState
     noise: dict[str, Float[Array, ""]]
     rest: Bool[Array, " windows"]
+    finer: Float[Array, "windows samples sides"]
     gain: dict[str, Float[Array, " 2"]] | None = None
-    weight: Float[Array, " windows"] | None = None
 
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
-        per_window = self.torque, self.measured, self.time, self.start, self.rest
         # by NumPy: without a compiled program for each length
-        torque, measured, time, start, rest = jax.tree.map(lambda x: np.asarray(x)[which], per_window)
-        weight = None if self.weight is None else self.weight[which]
-        return Windows(torque, measured, time, start, self.noise, rest, self.gain, weight)
-
-    def padded(self, count: int) -> "Windows":
-        """With windows of no weight at the end, so that compiled programs serve records of several lengths."""
-        own = len(self.time)
-        which = np.minimum(np.arange(count), own - 1)
-        return replace(self.only(which), weight=(np.arange(count) < own).astype(float))
+        return self._of(jax.tree.map(lambda x: np.asarray(x)[which], self._columns))
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
         """Windows of several parts of a record, with the noise and gain of the first."""
-        per_window = [(one.torque, one.measured, one.time, one.start, one.rest) for one in parts]
-        torque, measured, time, start, rest = jax.tree.map(lambda *x: np.concatenate(x), *per_window)
-        return Windows(torque, measured, time, start, parts[0].noise, rest, parts[0].gain)
+        return parts[0]._of(jax.tree.map(lambda *x: np.concatenate(x), *(part._columns for part in parts)))
+
+    @property
+    def _columns(self) -> tuple[Any, ...]:
+        """What has a row a window."""
+        return self.torque, self.measured, self.time, self.start, self.rest, self.finer
+
+    def _of(self, columns: tuple[Any, ...]) -> "Windows":
+        torque, measured, time, start, rest, finer = columns
+        return Windows(torque, measured, time, start, self.noise, rest, finer, self.gain)
 
 
-_MAPPED = Windows(0, 0, 0, 0, None, 0, None, 0)  # type: ignore[arg-type]
+_MAPPED = Windows(0, 0, 0, 0, None, 0, 0, None)  # type: ignore[arg-type]
 
 
 class Fit(eqx.Module):
@@ -122,7 +121,7 @@ class Fit(eqx.Module):
 def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
     simulated = plant_trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
-    return jnp.stack(sides, axis=-1) * (1.0 if window.weight is None else window.weight)
+    return jnp.stack(sides, axis=-1) - window.finer
 
 
 class _Eliminated(NamedTuple):
@@ -479,4 +478,5 @@ def cut(
         start=PlantState(start.position, still, start.effects),
         noise={side: np.asarray(value, float) for side, value in noise.items()},  # pyright: ignore[reportArgumentType]
         rest=standing,
+        finer=np.zeros((count, samples, len(measured))),  # pyright: ignore[reportArgumentType]
     )

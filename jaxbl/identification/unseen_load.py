@@ -129,7 +129,9 @@ class UnseenLoad:
         segments: Sequence[Segment],
         rest: bool,
     ):
-        self.experiment, self.free, self.width, self.rest = experiment, tuple(free), np.asarray(width), rest
+        # half gaps are sought over decades
+        self.free = tuple(one._replace(positive=True) if is_gap(one) else one for one in free)
+        self.experiment, self.width, self.rest = experiment, np.asarray(width), rest
         self.segments = segments
         self.period = float(experiment.run.sample_period)
         self.skipped = [int(_SKIPPED * len(one)) for one in segments]
@@ -181,7 +183,7 @@ class UnseenLoad:
             for size, places in zip(total, self.frictions(), strict=True):
                 parts = [1.0] if len(places) == 1 else [1.0 - share, share]
                 for (i, factor), part in zip(places, parts, strict=False):
-                    theta[i] = np.log(part * size / factor / self.free[i].scale)
+                    theta[i] = self.free[i].theta(part * size / factor)
             begun.append(theta)
         return begun
 
@@ -201,9 +203,7 @@ class UnseenLoad:
     def numbers(self, theta: np.ndarray) -> dict[str, float]:
         """Values by path."""
         with np.errstate(over="ignore"):
-            values = [one.scale * np.exp(x) if one.positive else one.nominal + one.scale * x
-                      for one, x in zip(self.free, theta, strict=True)]  # fmt: skip
-        return {one.path: float(value) for one, value in zip(self.free, values, strict=True)}
+            return {one.path: float(one.value(float(x))) for one, x in zip(self.free, theta, strict=True)}
 
     def states(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> list[PlantState]:
         """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
@@ -393,11 +393,8 @@ class UnseenLoad:
         best = min([point, *again], key=lambda one: one.deviance)
         width, slope = self.spread(best, held)
         others += self._noisier(best, held)
-        changes = np.array([one.theta - best.theta for one in others if np.isfinite(one.deviance)])
         # not their mean: some end in the valley that they came from, and say nothing
-        wide = np.asarray(width.covariance) + changes.T @ changes
-        more = np.sqrt(np.diag(wide) / np.diag(np.asarray(width.covariance)))
-        return best, width._replace(covariance=wide, inflation=width.inflation * more), slope
+        return best, width.with_error(*(one.theta - best.theta for one in others if np.isfinite(one.deviance))), slope
 
     def _noisier(self, point: Point, held: np.ndarray | None) -> list[Point]:
         """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
@@ -568,10 +565,10 @@ class _Search:
 
     def theta(self, half: float) -> float:
         """Of the gap's number, at a half gap in rad."""
-        return float(np.log(half / self.factor / self.one.scale))
+        return self.one.theta(half / self.factor)
 
     def half(self, theta: float) -> float:
-        return float(self.factor * self.one.scale * np.exp(theta))
+        return self.factor * float(self.one.value(theta))
 
     def run(self) -> Gap:
         announce("trying half gaps")

@@ -17,7 +17,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
+from jaxbl.identification.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit
@@ -199,13 +199,32 @@ def test_residual_correlation_widens_intervals():
         (["drive.motor_mass"], r"'drive\.motor_mass' is no number of the plant; fitted can be: drive\.motor_inertia, "),
         (["observer.motor.alpha"], r"'observer\.motor\.alpha' is no number of the plant"),
         (["drive.motor_inertia"] * 2, "'drive.motor_inertia' is named twice"),
-        (["transmission.half_gap"], "'transmission.half_gap' must stay positive, and its nominal value is 0; give one"),
     ],
 )
 def test_what_cannot_be_fitted(paths, message):
-    law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
     with pytest.raises(InputError, match=message):
-        make_free_parameters(read_config(small_study(transmission=law)).build(), paths, 1.0)
+        make_free_parameters(read_config(small_study()).build(), paths, 1.0)
+
+
+def test_what_is_nominally_0_gets_its_size_from_the_log():
+    law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
+    effects = [{"kind": "load.coulomb_friction", "torque": 0.0}, {"kind": "load.gravity", "torque": 0.0}]
+    changes = {"drive.motor_viscous": 0.0, "drive.load_viscous": 0.0, "drive.gear_ratio": 5.0}
+    expected = {
+        "drive.motor_viscous": 0.2 / 4.0,
+        "drive.load_viscous": 25.0 * 0.2 / 4.0,
+        "effects.load.coulomb_friction.torque": 5.0 * 0.2,
+        "effects.load.gravity.torque": 5.0 * 0.2,
+        "transmission.half_gap": 0.03,
+    }
+    experiment = read_config(small_study(changes, transmission=law, effects=effects)).build()
+    free = make_free_parameters(experiment, list(expected), SignalSizes(torque=0.2, speed=4.0, twist=0.03))
+    np.testing.assert_allclose([one.scale for one in free], list(expected.values()))
+    # a fit goes through 0; what it tells does not, where a study may not
+    np.testing.assert_array_equal([one.value(0.0) for one in free], 0.0)
+    assert [float(one.value(-0.1)) < 0.0 for one in free] == [one.path.startswith("effects.load.gravity") for one in free]
+    assert all(float(one.value(jnp.asarray(-0.1))) < 0.0 for one in free)
+    assert [one.theta(float(one.value(0.3))) for one in free] == pytest.approx([0.3] * len(free))
 
 
 def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
