@@ -10,6 +10,7 @@ friction:
     noise        Gaussian noise of both encoders
     impacts      drives with a gap that is crossed some hundred times, driven by steps
     torque       a torque beside the recorded one, 0.3 to 3 % of it, correlated over 2 to 30 ms
+    lacking      noise, and a model without the dry friction (on request: `--kinds lacking`)
 
 Each log is a line of `--out`; what is there already is not computed again.
 
@@ -23,7 +24,6 @@ import math
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ from hidden.simulator import Machine, Run, Trace, simulate  # noqa: E402
 from jaxbl.identification.identify import identify  # noqa: E402
 
 KINDS = "quantised", "jitter", "noise", "impacts", "torque"
+LACKING = "lacking"
 DRIVES = "rigid", "elastic", "gap"
 SAMPLES = 2500
 STEPS = 50
@@ -120,7 +121,7 @@ def make_input(rng: np.random.Generator, kind: str, period: float) -> np.ndarray
 
 def make_log(seed: int, number: int, kind: str) -> tuple[pd.DataFrame, dict[str, Any], dict[str, float], dict[str, Any]]:
     """A log, its study, the truth by path, and what was drawn; the same arguments give the same ones."""
-    rng = np.random.default_rng([seed, number, KINDS.index(kind)])
+    rng = np.random.default_rng([seed, number, (*KINDS, LACKING).index(kind)])
     drive = "gap" if kind == "impacts" else DRIVES[number % 3]
     period, ratio = draw_factor(rng, 1e-3, 4e-3), float(rng.choice([1.0, 5.0, 20.0]))
     size = draw_factor(rng, 0.1, 2.0)
@@ -173,6 +174,9 @@ def make_log(seed: int, number: int, kind: str) -> tuple[pd.DataFrame, dict[str,
         "uncertainty": {"exact": ["drive.gear_ratio"]},
         "log": {"absent": ["theta_s"]} if drive == "rigid" else {},
     }
+    if kind == LACKING:
+        truth.pop(dry := next(path for path in truth if "coulomb" in path))
+        study["effects"] = [effect for effect in study["effects"] if effect["kind"] not in dry]
     return log, study, truth, drawn
 
 
@@ -202,7 +206,8 @@ def identify_log(seed: int, number: int, kind: str, changes: dict[str, Any]) -> 
         if path in summary["parameters"]:
             estimate = summary["parameters"][path]
             rows[path] = {
-                "true": true, "value": estimate["value"], "error": estimate["standard_error"], "interval": estimate["interval"]
+                "true": true, "value": estimate["value"], "error": estimate["standard_error"],
+                "interval": estimate["interval"],
             }  # fmt: skip
     trajectory = summary["method"]["trajectory"]
     return {
@@ -210,49 +215,49 @@ def identify_log(seed: int, number: int, kind: str, changes: dict[str, Any]) -> 
         "missing": [path for path in truth if path not in rows], "warnings": summary["warnings"],
         "residual": {side: one["rms"] / one["noise"] for side, one in summary["residual"].items()},
         "variance": trajectory["variance_over_noise"], "inflation": trajectory["inflation"],
-        "window": trajectory["window"], "steps": trajectory.get("steps"), "rejected": summary.get("rejected"),
+        "window": trajectory["window"], "steps": summary.get("steps"), "rejected": summary.get("rejected"),
     }  # fmt: skip
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
     """95 % interval of a share."""
-    z = 1.959964
-    middle, reach = hits / total + z**2 / (2 * total), z * math.sqrt(hits * (total - hits) / total**3 + z**2 / (4 * total**2))
-    return (middle - reach) / (1 + z**2 / total), (middle + reach) / (1 + z**2 / total)
+    z, share = 1.959964, hits / total
+    reach = z * math.sqrt(share * (1.0 - share) / total + z**2 / (4.0 * total**2))
+    middle, size = share + z**2 / (2.0 * total), 1.0 + z**2 / total
+    return (middle - reach) / size, (middle + reach) / size
 
 
 def print_report(lines: list[dict[str, Any]]) -> None:
     """How many intervals hold the truth, by kind, by drive and in all."""
-    for key in ("kind", "drive"):
-        counts: dict[str, list[bool]] = defaultdict(list)
-        away: dict[str, list[float]] = defaultdict(list)
-        missing: dict[str, int] = defaultdict(int)
-        for line in lines:
-            missing[line[key]] += len(line["missing"])
-            for row in line["numbers"].values():
-                low, high = row["interval"]
-                if None in (row["value"], row["error"], low, high):
-                    missing[line[key]] += 1
-                    continue
-                counts[line[key]].append(low <= row["true"] <= high)
-                away[line[key]].append((row["value"] - row["true"]) / row["error"])
-        print(f"{key:12} intervals  hold    %  (95 %)          no interval  rms error / standard error")
-        for name, hits in [*counts.items(), ("all", sum(counts.values(), []))]:
-            low, high = wilson(sum(hits), len(hits))
-            values = np.array(sum(away.values(), []) if name == "all" else away[name])
-            size = float(np.sqrt(np.mean(values**2)))
-            none = sum(missing.values()) if name == "all" else missing[name]
-            print(
-                f"{name:12} {len(hits):9} {sum(hits):5} {100 * sum(hits) / len(hits):5.1f}  ({100 * low:.1f} to "
-                f"{100 * high:.1f}) {none:12} {size:12.2f}"
-            )
+    rows = []
+    for line in lines:
+        rows += [(line["kind"], line["drive"], None, 0.0)] * len(line["missing"])
+        for number in line["numbers"].values():
+            low, high = number["interval"]
+            held = None if None in (low, high) else low <= number["true"] <= high
+            away = 0.0 if held is None else (number["value"] - number["true"]) / number["error"]
+            rows.append((line["kind"], line["drive"], held, away))
+    frame = pd.DataFrame(rows, columns=["kind", "drive", "held", "away"])
+    print(f"{'':12} intervals  hold    %  (95 %)          no interval  rms error / standard error")
+    groups = [*frame.groupby("kind", sort=False), *frame.groupby("drive", sort=False), ("all", frame)]
+    for name, group in groups:
+        bounded = group[group["held"].notna()]
+        total, hits = len(bounded), int(bounded["held"].sum())
+        if not total:
+            print(f"{name:12} {0:9} {'':27} {len(group):12}")
+            continue
+        low, high = wilson(hits, total)
+        print(
+            f"{name:12} {total:9} {hits:5} {100 * hits / total:5.1f}  ({100 * low:.1f} to {100 * high:.1f}) "
+            f"{len(group) - total:12} {np.sqrt(np.mean(bounded['away'] ** 2)):12.2f}"
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=12, help="logs of each kind")
-    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=[*KINDS, LACKING])
     parser.add_argument("--substeps", type=int, default=10, help="plant steps a sample of the study")
     parser.add_argument("--out", type=Path, default=Path("coverage.jsonl"), help="a line a log")
     parser.add_argument("--report", type=Path, help="print the figures of such a file alone")

@@ -32,8 +32,8 @@ class FreeParameter(NamedTuple):
         positive: True if the number stays positive in a fit.
         role: its part in an effect (:class:`jaxbl.drive.effects.Role`); "" for other numbers.
         maximum: largest value that a study may give it, or None.
-        minimum: 0 if a study may not make it negative, or None. A fit goes through 0, so that what is 0 is found without bias;
-            what it tells is not below.
+        minimum: 0 if a study may not make it negative, or None. Fits go through 0, so that what is 0 is found without bias;
+            what they tell is not below.
     """
 
     path: str

@@ -18,8 +18,8 @@ from .compilation import jit
 from .free_parameters import FreeParameter
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
-from .regression import Kinematics, errors, regress
-from .search import Found
+from .regression import Kinematics, MotionShare, errors, regress
+from .search import Found, is_noise
 from .segments import long_enough, reading_noise, segments_of, windows_of
 from .trajectory import Fit, projected_residual
 
@@ -123,7 +123,6 @@ def by_trajectories(found: Found, record: Record) -> JsonObject:
         "kind": "prediction_error" if found.smoothness else "output_error",
         "window": found.samples * record.sample_period,
         "windows": len(found.firsts),
-        "steps": found.steps,
         "converged": found.fit.converged,
         "starts": len(found.starts),
         "starts_agreeing": sum(start["agrees"] for start in found.starts),
@@ -168,8 +167,30 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         "held": found.held,
         "condition": found.condition,
         "residual": residual,
-        "notes": list(record.notes),
+        "steps": found.steps,
+        "rejected": None if all(map(is_noise, residual.values())) else {"lacks": None},
+        "notes": [*record.notes, *_step_note(found, fitted.run.substeps)],
     }
+
+
+def _step_note(found: Found, study_steps: int) -> list[str]:
+    """A sentence about plant steps that are finer than the study's."""
+    if found.steps == study_steps:
+        return []
+    return [
+        f"The fit has {found.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would be off by "
+        "more than a tenth of their standard errors."
+    ]
+
+
+def mark_lacking(summary: JsonObject, lacking: MotionShare | None) -> None:
+    """Mark a fit that left a torque that goes with the motion: no interval counts what a missing effect does to numbers."""
+    if summary["rejected"] is None or lacking is None:
+        return
+    summary["rejected"] = {"lacks": lacking._asdict()}
+    for parameter in summary["parameters"].values():
+        parameter["interval"] = [None, None]
+        parameter.pop("profile_interval", None)
 
 
 _SHOWN_BY = {

@@ -22,12 +22,12 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
 from .free_parameters import FreeParameter, make_free_parameters
-from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
+from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
 from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
-from .regression import remembers_input
+from .regression import find_motion_share, remembers_input
 from .search import ParameterSearch
 from .segments import Segment, led_in, long_enough, segments_of, signal_sizes
 
@@ -151,6 +151,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         done()
         summary = summary_of(task, fitted, found, profiles) | {"method": method}
         summary["torque"] = torque_errors(record, fitted, parts, factor)
+        if summary["rejected"]:
+            mark_lacking(summary, find_motion_share(fitted, parts, factor))
         if gains:
             summary["gains"] = {side: one._asdict() for side, one in gains.items()}
         if task.holdout is not None:

@@ -53,12 +53,15 @@ class Spread(NamedTuple):
         return self._replace(covariance=wide, inflation=self.inflation * more)
 
 
-def spread(fit: Fit) -> Spread:
-    """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth."""
-    return spread_of(np.asarray(fit.residual, float), np.asarray(fit.jacobian, float), 2 * len(fit.start.position))
+def spread(fit: Fit, least: int = 1) -> Spread:
+    """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth.
+
+    `least`: samples over which residuals may be correlated, at least.
+    """
+    return spread_of(np.asarray(fit.residual, float), np.asarray(fit.jacobian, float), 2 * len(fit.start.position), least)
 
 
-def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int) -> Spread:
+def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: int = 1) -> Spread:
     """The same of residuals, their derivatives (shapes as of a fit), and the number of a window's initial states."""
     windows, samples, _, parameters = jacobian.shape
     freedom = residual.size - parameters - windows * states
@@ -70,7 +73,7 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int) -> Spread
     # of what diverges nothing is finite
     with np.errstate(all="ignore"):
         variance = np.sum(residual**2) / freedom
-        middle = long_run(scores) * residual.size / freedom
+        middle = long_run(scores, least) * residual.size / freedom
         inverse = _pseudo_inverse(normal / np.outer(size, size))
         plain = variance * inverse / np.outer(size, size)
         sandwich = inverse @ middle @ inverse / np.outer(size, size)
@@ -88,8 +91,8 @@ def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(matrix, 10.0 * len(matrix) * np.finfo(float).eps, hermitian=True)
 
 
-def long_run(scores: np.ndarray) -> np.ndarray:
-    """Sum of the autocovariances of a series under Bartlett's weights, times its length."""
+def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
+    """Sum of a series' autocovariances under Bartlett's weights, which reach over `least` samples or more, times its length."""
     count = len(scores)
     square = np.sum(scores**2, axis=0)
     rho = np.sum(scores[1:] * scores[:-1], axis=0) / np.where(square > 0.0, square, 1.0)
@@ -99,7 +102,7 @@ def long_run(scores: np.ndarray) -> np.ndarray:
     bottom = np.sum(weight / (1.0 - rho) ** 4)
     wide = 1.1447 * (top / np.where(bottom > 0.0, bottom, 1.0) * count) ** (1.0 / 3.0)
     # nothing is known where the fit diverged
-    length = int(np.clip(np.ceil(wide), 1, count // 10)) if np.isfinite(wide) else 1
+    length = int(np.clip(np.ceil(wide), least, count // 10)) if np.isfinite(wide) else 1
     # Bartlett's weights are those of all sums over `length` neighbours
     total = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
     last = np.arange(2 * count)

@@ -17,7 +17,7 @@ from jaxbl.fused.single_plant import simulate_plants
 from jaxbl.simulate import Experiment
 
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
-from .intervals import Spread, spread
+from .intervals import spread
 from .trajectory import Fit, Windows
 
 _SHARE = 0.1
@@ -36,7 +36,7 @@ def refine_steps(
     windows: Windows,
     fit: Fit,
     fit_again: Callable[[Windows, Fit], Fit],
-) -> tuple[Windows, Fit, Spread, int]:
+) -> tuple[Windows, Fit, list[np.ndarray], int]:
     """Refine the plant steps of a fit until twice as many change no number by a tenth of its standard error.
 
     Args:
@@ -47,13 +47,12 @@ def refine_steps(
         fit_again: fits to changed windows, from where a fit ended.
 
     Returns:
-        Windows and fit with finer steps, its spread, and plant steps in a sample. What :data:`_MOST` leave open, and fits
-        that do not settle, counts as an error in the spread.
+        Windows and fit with finer steps, errors of theta that even :data:`_MOST` or the last fit leave, and plant steps in a
+        sample.
     """
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
-        width, theta = spread(fit), np.asarray(fit.theta)
-        deviation = np.sqrt(np.diag(width.covariance))
+        theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(spread(fit).covariance))
         model = set_leaves(experiment, {one.path: np.asarray(one.value(theta[i])) for i, one in enumerate(free)})
         jacobian = np.asarray(fit.jacobian).reshape(-1, len(free))
         normal = jacobian.T @ jacobian + np.eye(len(free)) / PRIOR_DEVIATION**2
@@ -70,7 +69,7 @@ def refine_steps(
                 steps = min(steps * 2 ** int(np.ceil(0.5 * np.log2(excess) + 1e-9)), _MOST)
                 fine = _simulate(model, windows, fit, steps)
         if steps == study_steps:
-            return windows, fit, width, steps
+            return windows, fit, [], steps
         finer = half - own
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
@@ -79,7 +78,7 @@ def refine_steps(
             break
         if fits_left:
             fit = fit_again(windows, fit)
-    return windows, fit, width.with_error(change, *([left] if excess > 1.0 else [])), steps
+    return windows, fit, [change, left] if excess > 1.0 else [change], steps
 
 
 def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:

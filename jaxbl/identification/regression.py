@@ -253,6 +253,68 @@ def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> 
     return figures
 
 
+class MotionShare(NamedTuple):
+    """Torque that an equation leaves over, and that goes with the motion.
+
+    Attributes:
+        equation: name of the side.
+        channel: what it goes with.
+        share: of its power, in parts of the log that did not choose.
+    """
+
+    equation: str
+    channel: str
+    share: float
+
+
+_BLOCKS, _BINS, _SURE = 10, 8, 3.0
+"""Parts of a log, ranges of a channel, and standard errors by which a torque surely goes with it: as for the terms of a
+transmission on a rig."""
+
+
+def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> MotionShare | None:
+    """Find whether torque that is left over goes with speed, position, twist or input: an effect does, a disturbance not.
+
+    The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in eight
+    ranges in the other tenths; None if there is none.
+    """
+    ratio = float(experiment.drive.ratio("load")) if "load" in experiment.sides else None
+    torques: dict[str, list[np.ndarray]] = {}
+    channels: dict[tuple[str, str], list[np.ndarray]] = {}
+    for part in parts:
+        for side, left in jit(balance)(experiment, part).items():
+            if side not in experiment.sides:
+                continue
+            seen = {"velocity": part.velocity[side], "position": part.position[side], "input": part.torque}
+            if ratio is not None:
+                seen["twist"] = part.position["motor"] - ratio * part.position["load"]
+            torques.setdefault(side, []).append(np.asarray(decimate(left.residual, factor)))
+            for name, values in seen.items():
+                channels.setdefault((side, name), []).append(np.asarray(decimate(jnp.asarray(values), factor)))
+    found = []
+    # in each range and block some samples
+    if sum(map(len, torques.get("motor", []))) < 2 * _BLOCKS * _BINS:
+        return None
+    for (side, name), pieces in channels.items():
+        torque, values = np.concatenate(torques[side]), np.concatenate(pieces)
+        gains = _gains_by_ranges(torque - np.mean(torque), values)
+        if np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
+            found.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
+    return max(found, key=lambda one: one.share, default=None)
+
+
+def _gains_by_ranges(torque: Samples, values: Samples) -> Float[np.ndarray, " blocks"]:
+    """Power of a torque that its means over ranges of a channel predict, in each block of the log from the other blocks."""
+    block = np.arange(len(torque)) * _BLOCKS // len(torque)
+    label = np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)
+    sums, counts = np.zeros((_BLOCKS, _BINS)), np.full((_BLOCKS, _BINS), 1e-9)
+    np.add.at(sums, (block, label), torque)
+    np.add.at(counts, (block, label), 1.0)
+    mean = (np.sum(sums, axis=0) - sums) / (np.sum(counts, axis=0) - counts + 1.0)
+    gain = torque**2 - (torque - mean[block, label]) ** 2
+    return np.bincount(block, gain, _BLOCKS) / np.maximum(np.bincount(block, minlength=_BLOCKS), 1)
+
+
 def shortest(factor: int) -> int:
     """Samples that a part must have to be decimated."""
     return 1 if factor == 1 else 20 * factor + 1

@@ -13,7 +13,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment
 
 from .free_parameters import FreeParameter, set_free_parameters
-from .intervals import Refusal, Spread, refusals
+from .intervals import Refusal, Spread, refusals, spread
 from .plant_steps import refine_steps
 from .prediction import predictor
 from .segments import Segment, windows_of
@@ -29,6 +29,8 @@ _FEWEST = 20
 """Samples of a window at least: ten times the states that are fitted to it."""
 _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
+_SURE = 3.0
+"""Standard errors by which residuals' variances differ surely."""
 NOISE_ALONE = 1.1
 """Residuals over the noise, rms, up to which a model counts as explaining a record."""
 
@@ -50,6 +52,7 @@ class Fitted:
         firsts: row that each window begins with.
         smoothness: of each side's predictor; empty for output error.
         steps: plant steps in a sample.
+        errors: of theta, that finer steps or windows of another length show, each of shape (parameters,).
         between: by how much theta differs between the window lengths that were tried; None if there was one.
     """
 
@@ -60,6 +63,7 @@ class Fitted:
     firsts: np.ndarray
     smoothness: dict[str, float]
     steps: int
+    errors: Sequence[np.ndarray] = ()
     between: np.ndarray | None = None
 
     @property
@@ -197,23 +201,28 @@ class ParameterSearch:
                     windows, smoothness = predictor(set_free_parameters(self.experiment, free, jnp.asarray(theta)), windows)
                     theta = np.asarray(fit_from(windows, theta).theta)
             found = fit_from(windows, theta).only(np.flatnonzero(kept))
-            windows, found, width, steps = refine_steps(self.experiment, left, windows, found, fit_again)
+            windows, found, errors, steps = refine_steps(self.experiment, left, windows, found, fit_again)
+            width = spread(found).with_error(*errors)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size):
-                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness, steps)))
+                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness, steps, errors)))
         if not tried:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
+        growth = tried[-1][1].spread.variance / tried[0][1].spread.variance - 1.0
         best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
-        return _between(best, others[0]) if others else best
+        grows = growth > _SURE * np.sqrt(2.0 / best.fit.residual.size)
+        return _between(best, others[0], grows) if others else best
 
 
-def _between(best: Fitted, other: Fitted) -> Fitted:
-    """Count what another window length would have said, where the model leaves more than noise.
+def _between(best: Fitted, other: Fitted, grows: bool) -> Fitted:
+    """Count what another window length would have said, where the model leaves more than noise, or the longer windows leave
+    more than the shorter ones (`grows`).
 
-    Then each length finds other numbers, by more than noise does: free runs weigh what is missing by its duration.
+    Then each length finds other numbers, by more than noise does: free runs weigh what is missing by its duration; and what
+    a disturbance leaves is alike for as long as a window lasts.
     """
     change = np.asarray(other.fit.theta - best.fit.theta)
     width = best.spread
-    if float(width.variance) > NOISE_ALONE**2:
-        width = width.with_error(change)
+    if grows or float(width.variance) > NOISE_ALONE**2:
+        width = spread(best.fit, best.samples).with_error(change, *best.errors)
     return replace(best, spread=width, between=change)

@@ -57,14 +57,29 @@ def _headline(summary: JsonObject) -> Lines:
         *(line for complete, line in _residuals(summary) if not complete),
         *_backlash(summary),
     ]
+    rejected = summary["rejected"]
+    if rejected and rejected["lacks"]:
+        lines.append(_lacking(**rejected["lacks"]))
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
-        if None in (one["value"], one["standard_error"], low, high):
+        if None in (one["value"], one["standard_error"]):
             lines.append(f"{path}: not identifiable from this log.")
             continue
         unit = f" {one['unit']}" if one.get("unit") else ""
-        lines.append(f"{path} = {one['value']:.5g} ± {one['standard_error']:.2g}{unit}, 95 %: {low:.5g} to {high:.5g}.")
+        reach = "for noise alone" if low is None else f"95 %: {low:.5g} to {high:.5g}"
+        if rejected and low is not None:
+            reach += ", if only a disturbance is missing"
+        lines.append(f"{path} = {one['value']:.5g} ± {one['standard_error']:.2g}{unit}, {reach}.")
     return lines
+
+
+def _lacking(equation: str, channel: str, share: float) -> str:
+    """What goes with the motion beyond the model."""
+    channel = channel if channel in ("twist", "input") else f"{equation}'s {channel}"
+    return (
+        f"{DOUBT}{100.0 * share:.0f} % of the torque that the model leaves over on the {equation} goes with the {channel}: "
+        "an effect is missing. What it does to the numbers is not known: they have no 95 % intervals."
+    )
 
 
 def _backlash(summary: JsonObject) -> Lines:
@@ -167,7 +182,8 @@ def _parameter_table(summary: JsonObject) -> PageTable:
     if any("profile_interval" in one for one in parameters.values()):
         columns += ["by profile from", "to"]
         rows = [row + one.get("profile_interval", [None, None]) for row, one in zip(rows, parameters.values(), strict=True)]
-    return PageTable("Parameters", columns, rows)
+    title = "Parameters of a fit that leaves more than noise" if summary["rejected"] else "Parameters"
+    return PageTable(title, columns, rows)
 
 
 def _regression_table(regression: JsonObject) -> PageTable:

@@ -59,14 +59,15 @@ def _with_error(value: float, error: float, unit: str) -> str:
     known = value and error and np.isfinite(error)
     digits = int(np.clip(np.ceil(np.log10(abs(value) / error)) + 1, 1, 9)) if known else 4
     share = f" ({100.0 * error / abs(value):.2g} %)" if known else ""
-    return f"{value:.{digits}g} ± {error:.1g}{f' {unit}' if unit else ''}{share}"
+    width = f" ± {error:.1g}" if error else ""
+    return f"{value:.{digits}g}{width}{f' {unit}' if unit else ''}{share}"
 
 
 def _intervals(found: Identification) -> Drawn:
     fitted = {
         path: one
         for path, one in found.summary["parameters"].items()
-        if one.get("nominal") is not None and None not in (one["value"], *one["interval"])
+        if None not in (one.get("nominal"), one["value"], one["standard_error"])
     }
     held = [path for path in found.summary["held"] if path not in fitted]
     names = [*fitted, *held]
@@ -75,14 +76,14 @@ def _intervals(found: Identification) -> Drawn:
     shown, drawn = [0.0], []
     for i, one in enumerate(fitted.values()):
         size = abs(one["nominal"]) or abs(one["value"]) or 1.0
-        ends = one["interval"][0], one["value"], one["interval"][1]
-        low, middle, high = (100.0 * (end - one["nominal"]) / size for end in ends)
+        ends = [one["value"] if end is None else end for end in one["interval"]]
+        low, middle, high = (100.0 * (end - one["nominal"]) / size for end in (ends[0], one["value"], ends[1]))
         ax.plot([low, high], [i, i], color=COLOURS[0], lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=COLOURS[0], ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=COLOURS[0], ms=5)
         drawn.append((low, high))
         shown += [max(low, middle - 100.0), min(high, middle + 100.0)]
-        half = 0.5 * abs(one["interval"][1] - one["interval"][0])
+        half = 0.5 * abs(ends[1] - ends[0])
         ax.annotate(_with_error(one["value"], half, one.get("unit", "")), (1.01, i), **beside)
     for i in range(len(fitted), len(names)):
         ax.plot(0.0, i, "o", mfc="white", mec=FAINT, ms=6)
@@ -354,9 +355,10 @@ def _path(log: LogSignals) -> Drawn:
         path = f"transmission.{name}"
         fitted = found.summary["parameters"].get(path)
         if fitted is not None:
-            ax.axhspan(*fitted["interval"], color=_MODEL, alpha=0.15, lw=0.0)
+            interval = [fitted["value"] if end is None else end for end in fitted["interval"]]
+            ax.axhspan(*interval, color=_MODEL, alpha=0.15, lw=0.0)
             ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
-            ends.append(np.array(fitted["interval"]))
+            ends.append(np.array(interval))
             lines.append(fitted["value"])
         label = with_unit(name.replace("_", " "), found.record.unit_of(path, units.get(name, "rad")))
         ax.set(ylabel=label, ylim=limits(*ends, share=0.02, room=0.25, shown=lines))
