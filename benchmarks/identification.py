@@ -158,7 +158,7 @@ def by_derivatives(experiment, paths, record):
 def by_trajectories(study, record):
     estimates = identify_module.identify(record, study).summary["parameters"]
     return {
-        path: (estimate["value"], 0.5 * (estimate["interval"][1] - estimate["interval"][0]))
+        path: (estimate["value"], 1.96 * estimate["standard_error"])
         for path, estimate in estimates.items()
     }
 

@@ -10,7 +10,8 @@ friction:
     noise        Gaussian noise of both encoders
     impacts      drives with a gap that is crossed some hundred times, driven by steps
     torque       a torque beside the recorded one, 0.3 to 3 % of it, correlated over 2 to 30 ms
-    lacking      noise, and a model without the dry friction (on request: `--kinds lacking`)
+    lacking      noise, and a model without the dry friction (on request: `--kinds lacking zero`)
+    zero         noise, and half of the frictions, damping and gap nominally 0, some of them in truth, too
 
 Each log is a line of `--out`; what is there already is not computed again.
 
@@ -41,7 +42,7 @@ from hidden.simulator import Machine, Run, Trace, simulate  # noqa: E402
 from jaxbl.identification.identify import identify  # noqa: E402
 
 KINDS = "quantised", "jitter", "noise", "impacts", "torque"
-LACKING = "lacking"
+LACKING, ZERO = "lacking", "zero"
 DRIVES = "rigid", "elastic", "gap"
 SAMPLES = 2500
 STEPS = 50
@@ -121,15 +122,18 @@ def make_input(rng: np.random.Generator, kind: str, period: float) -> np.ndarray
 
 def make_log(seed: int, number: int, kind: str) -> tuple[pd.DataFrame, dict[str, Any], dict[str, float], dict[str, Any]]:
     """A log, its study, the truth by path, and what was drawn; the same arguments give the same ones."""
-    rng = np.random.default_rng([seed, number, (*KINDS, LACKING).index(kind)])
+    rng = np.random.default_rng([seed, number, (*KINDS, LACKING, ZERO).index(kind)])
     drive = "gap" if kind == "impacts" else DRIVES[number % 3]
     period, ratio = draw_factor(rng, 1e-3, 4e-3), float(rng.choice([1.0, 5.0, 20.0]))
     size = draw_factor(rng, 0.1, 2.0)
     at_motor = draw_truth(rng, drive, size, period)
+    may_be_zero = [path for path in at_motor if not path.endswith(("inertia", "stiffness"))]
+    zeros = [path for path in may_be_zero if rng.uniform() < 0.5] if kind == ZERO else []
+    at_motor |= {path: 0.0 for path in zeros if rng.uniform() < 0.3}
     truth = at_load(at_motor, ratio)
     tables = tables_of(truth, ratio)
     effects = list(tables["effects"])
-    drawn: dict[str, Any] = {"drive": drive, "period": period}
+    drawn: dict[str, Any] = {"drive": drive, "period": period, "zeros": zeros}
     disturbance = None
     if kind == "torque":
         share, memory = draw_factor(rng, 0.003, 0.03), draw_factor(rng, 2e-3, 3e-2)
@@ -167,7 +171,7 @@ def make_log(seed: int, number: int, kind: str) -> tuple[pd.DataFrame, dict[str,
             t = t + late - late[0]
     drawn["noise"] = count if kind == "quantised" else noise
     log = pd.DataFrame({"t": t, "u": trace.u} | {name: one for name, one in readings.items() if one is not None})
-    nominal = {path: value * math.exp(rng.uniform(-0.22, 0.22)) for path, value in truth.items()}
+    nominal = {path: value * math.exp(rng.uniform(-0.22, 0.22)) for path, value in truth.items()} | dict.fromkeys(zeros, 0.0)
     study = tables_of(nominal, ratio) | {
         "title": f"{kind} {number}",
         "run": {"sample_period": period, "substeps": 10, "duration": 1.0},
@@ -257,7 +261,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=12, help="logs of each kind")
-    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=[*KINDS, LACKING])
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=[*KINDS, LACKING, ZERO])
     parser.add_argument("--substeps", type=int, default=10, help="plant steps a sample of the study")
     parser.add_argument("--out", type=Path, default=Path("coverage.jsonl"), help="a line a log")
     parser.add_argument("--report", type=Path, help="print the figures of such a file alone")

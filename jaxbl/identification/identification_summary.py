@@ -178,8 +178,8 @@ def _step_note(found: Found, study_steps: int) -> list[str]:
     if found.steps == study_steps:
         return []
     return [
-        f"The fit has {found.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would be off by "
-        "more than a tenth of their standard errors."
+        f"The fit has {found.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would be off "
+        "by more than a tenth of their standard errors."
     ]
 
 

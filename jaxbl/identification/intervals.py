@@ -92,7 +92,7 @@ def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
 
 
 def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
-    """Sum of a series' autocovariances under Bartlett's weights, which reach over `least` samples or more, times its length."""
+    """Sum of a series' autocovariances under Bartlett's weights over `least` samples or more, times its length."""
     count = len(scores)
     square = np.sum(scores**2, axis=0)
     rho = np.sum(scores[1:] * scores[:-1], axis=0) / np.where(square > 0.0, square, 1.0)

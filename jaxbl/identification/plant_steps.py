@@ -24,7 +24,9 @@ _SHARE = 0.1
 """Of a standard error that twice as many steps may change a number: coverage of 95 % falls by 0.1 % then."""
 _LINEAR = 1.0
 """Standard errors by which a number may move without a new fit: the derivatives hold there to a few percent."""
-_MOST = 1280
+_LESS_LIKELY = 2.0
+"""Loss of log-likelihood with finer steps from which on the study's are right: the log is a simulation with them."""
+_MOST = 640
 """Plant steps in a sample."""
 _FITS = 3
 """Fits with the positions of finer steps, at most."""
@@ -47,9 +49,10 @@ def refine_steps(
         fit_again: fits to changed windows, from where a fit ended.
 
     Returns:
-        Windows and fit with finer steps, errors of theta that even :data:`_MOST` or the last fit leave, and plant steps in a
-        sample.
+        Windows and fit with finer steps, or as they were if these make the log less likely; errors of theta that remain,
+        each of shape (parameters,); and plant steps in a sample.
     """
+    given, first = windows, fit
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
         theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(spread(fit).covariance))
@@ -78,7 +81,10 @@ def refine_steps(
             break
         if fits_left:
             fit = fit_again(windows, fit)
-    return windows, fit, [change, left] if excess > 1.0 else [change], steps
+            if not float(fit.cost - first.cost) < _LESS_LIKELY * spread(first).variance:
+                return given, first, [change], study_steps
+    # by the order of the steps, a third of the last change is left
+    return windows, fit, [change, left / 3.0] if excess > 1.0 else [change], 2 * steps
 
 
 def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:

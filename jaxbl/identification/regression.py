@@ -273,10 +273,10 @@ transmission on a rig."""
 
 
 def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> MotionShare | None:
-    """Find whether torque that is left over goes with speed, position, twist or input: an effect does, a disturbance not.
+    """Find whether torque that is left over goes with speed, position, twist or input: an effect's does, noise does not.
 
-    The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in eight
-    ranges in the other tenths; None if there is none.
+    The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in
+    eight ranges in the other tenths; None if there is none.
     """
     ratio = float(experiment.drive.ratio("load")) if "load" in experiment.sides else None
     torques: dict[str, list[np.ndarray]] = {}
