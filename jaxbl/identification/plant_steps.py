@@ -6,6 +6,9 @@ than a tenth of their standard errors, what finer steps add to the positions is 
 Reference: H. Stetter, The defect correction principle and discretization methods, Numer. Math. 29 (1978).
 """
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -38,7 +41,7 @@ def refine_steps(
     windows: Windows,
     fit: Fit,
     fit_again: Callable[[Windows, Fit], Fit],
-) -> tuple[Windows, Fit, list[np.ndarray], int]:
+) -> tuple[Windows, Fit, Sequence[np.ndarray], int]:
     """Refine the plant steps of a fit until twice as many change no number by a tenth of its standard error.
 
     Args:
@@ -52,7 +55,7 @@ def refine_steps(
         Windows and fit with finer steps, or as they were if these make the log less likely; errors of theta that remain,
         each of shape (parameters,); and plant steps in a sample.
     """
-    given, first = windows, fit
+    given, first, change, left, excess = windows, fit, np.zeros(len(free)), np.zeros(len(free)), 0.0
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
         theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(spread(fit).covariance))
@@ -77,7 +80,7 @@ def refine_steps(
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
         if np.all(np.abs(change) < _LINEAR * deviation):
-            fit, change = replace(fit, theta=jnp.asarray(theta + change)), 0.0 * change
+            fit, change = replace(fit, theta=jnp.asarray(theta + change)), np.zeros(len(free))
             break
         if fits_left:
             fit = fit_again(windows, fit)

@@ -303,7 +303,7 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
     return max(found, key=lambda one: one.share, default=None)
 
 
-def _gains_by_ranges(torque: Samples, values: Samples) -> Float[np.ndarray, " blocks"]:
+def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " blocks"]:
     """Power of a torque that its means over ranges of a channel predict, in each block of the log from the other blocks."""
     block = np.arange(len(torque)) * _BLOCKS // len(torque)
     label = np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)

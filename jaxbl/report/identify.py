@@ -57,7 +57,7 @@ def _headline(summary: JsonObject) -> Lines:
         *(line for complete, line in _residuals(summary) if not complete),
         *_backlash(summary),
     ]
-    rejected = summary["rejected"]
+    rejected = summary.get("rejected")
     if rejected and rejected["lacks"]:
         lines.append(_lacking(**rejected["lacks"]))
     for path, one in summary["parameters"].items():
@@ -74,7 +74,7 @@ def _headline(summary: JsonObject) -> Lines:
 
 
 def _lacking(equation: str, channel: str, share: float) -> str:
-    """What goes with the motion beyond the model."""
+    """Say with what motion the torque goes that a model lacks."""
     channel = channel if channel in ("twist", "input") else f"{equation}'s {channel}"
     return (
         f"{DOUBT}{100.0 * share:.0f} % of the torque that the model leaves over on the {equation} goes with the {channel}: "
@@ -182,7 +182,7 @@ def _parameter_table(summary: JsonObject) -> PageTable:
     if any("profile_interval" in one for one in parameters.values()):
         columns += ["by profile from", "to"]
         rows = [row + one.get("profile_interval", [None, None]) for row, one in zip(rows, parameters.values(), strict=True)]
-    title = "Parameters of a fit that leaves more than noise" if summary["rejected"] else "Parameters"
+    title = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
     return PageTable(title, columns, rows)
 
 
