@@ -273,23 +273,19 @@ transmission on a rig."""
 
 
 def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> MotionShare | None:
-    """Find whether torque that is left over goes with speed, position, twist or input: an effect's does, noise does not.
+    """Find whether torque that is left over goes with speed or position: that of frictions and loads does, noise does not.
 
-    The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in
+    What goes with acceleration, twist or input is no sign: smoothed motion lacks some of it, too. The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in
     eight ranges in the other tenths; None if there is none.
     """
-    ratio = float(experiment.drive.ratio("load")) if "load" in experiment.sides else None
     torques: dict[str, list[np.ndarray]] = {}
     channels: dict[tuple[str, str], list[np.ndarray]] = {}
     for part in parts:
         for side, left in jit(balance)(experiment, part).items():
             if side not in experiment.sides:
                 continue
-            seen = {"velocity": part.velocity[side], "position": part.position[side], "input": part.torque}
-            if ratio is not None:
-                seen["twist"] = part.position["motor"] - ratio * part.position["load"]
             torques.setdefault(side, []).append(np.asarray(decimate(left.residual, factor)))
-            for name, values in seen.items():
+            for name, values in (("velocity", part.velocity[side]), ("position", part.position[side])):
                 channels.setdefault((side, name), []).append(np.asarray(decimate(jnp.asarray(values), factor)))
     found = []
     # in each range and block some samples

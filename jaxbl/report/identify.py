@@ -75,9 +75,8 @@ def _headline(summary: JsonObject) -> Lines:
 
 def _lacking(equation: str, channel: str, share: float) -> str:
     """Say with what motion the torque goes that a model lacks."""
-    channel = channel if channel in ("twist", "input") else f"{equation}'s {channel}"
     return (
-        f"{DOUBT}{100.0 * share:.0f} % of the torque that the model leaves over on the {equation} goes with the {channel}: "
+        f"{DOUBT}{100.0 * share:.0f} % of the torque that the model leaves over on the {equation} goes with its {channel}: "
         "an effect is missing. What it does to the numbers is not known: they have no 95 % intervals."
     )
 
