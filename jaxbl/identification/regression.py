@@ -275,8 +275,9 @@ transmission on a rig."""
 def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> MotionShare | None:
     """Find whether torque that is left over goes with speed or position: that of frictions and loads does, noise does not.
 
-    What goes with acceleration, twist or input is no sign: smoothed motion lacks some of it, too. The channel with the largest share, of those that surely predict the torque in each tenth of the log by its means in
-    eight ranges in the other tenths; None if there is none.
+    What goes with acceleration, twist or input is no sign: smoothed motion lacks some of it, too. The channel with the
+    largest share, of those that surely predict the torque in each tenth of the log by its means in eight ranges in the other
+    tenths; None if there is none.
     """
     torques: dict[str, list[np.ndarray]] = {}
     channels: dict[tuple[str, str], list[np.ndarray]] = {}
