@@ -157,10 +157,7 @@ def by_derivatives(experiment, paths, record):
 
 def by_trajectories(study, record):
     estimates = identify_module.identify(record, study).summary["parameters"]
-    return {
-        path: (estimate["value"], 1.96 * estimate["standard_error"])
-        for path, estimate in estimates.items()
-    }
+    return {path: (estimate["value"], 1.96 * estimate["standard_error"]) for path, estimate in estimates.items()}
 
 
 def by_observers(study, record):
