@@ -120,21 +120,23 @@ def _not_tested(summary: JsonObject) -> str:
     gap = summary["gap"]
     names, units = [one["effect"] for one in summary["findings"]], gap["units"]
     found = f"by the log the model lacks {_listed(names)}" if names else "the log shows nothing that the model lacks"
+    effects = {name: torque for name, torque in gap["test"]["untested"].items() if torque}
     torques = [
-        f"{name} is {rms_text(one['torque'])} {units['torque_motor']} rms there, {rms_text(one['on_log'])} on the log"
-        for name, one in gap["test"]["untested"].items()
-        if one
+        f"{name} is {rms_text(torque['torque'])} {units['torque_motor']} rms there, {rms_text(torque['on_log'])} on the log"
+        for name, torque in effects.items()
     ]
+    found = f"Not tested: {found}; data not used for the fit cannot show it"
+    # it acts there, but less than a complete model may leave
+    if effects and all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
+        more = "Hold out a motion in which it is a larger part of the torque, or one that is read with less noise"
+        return f"{found} (a model without it would pass, too; {'; '.join(torques)}). {more}."
     why = "a model without it would pass, too" if torques else "even a complete model may leave as much as moves there"
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
         for name, reach in gap["range"].items()
     )
-    return (
-        f"Not tested: {found}; data not used for the fit cannot show it ({'; '.join([why, *torques])}). Hold out a log that "
-        f"reaches as far: {reached}."
-    )
+    return f"{found} ({'; '.join([why, *torques])}). Hold out a log that reaches as far: {reached}."
 
 
 def _percent(share: float) -> str:
@@ -331,12 +333,12 @@ def _finding_tables(summary: JsonObject) -> list[PageTable]:
 def _history_tables(summary: JsonObject) -> list[PageTable]:
     """Every model that was tried, in order."""
     rows: list[list[object]] = [
-        [step["tried"], step["nats"], step["standard_errors"], "kept" if step["kept"] else "dropped", step["why"]]
-        for step in summary["history"]
+        [number, step["tried"], step["nats"], step["standard_errors"], "kept" if step["kept"] else "dropped", step["why"]]
+        for number, step in enumerate(summary["history"], 1)
     ]
     if not rows:
         return []
-    head = ["tried", "gain on the log (nats)", "by blocks of the log (standard errors)", "", "why"]
+    head = ["step", "tried", "gain on the log (nats)", "by blocks of the log (standard errors)", "", "why"]
     return [PageTable("How the name was found", head, rows)]
 
 
