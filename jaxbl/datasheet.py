@@ -441,8 +441,9 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
         load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
         load_numbers = value["load_inertia"], value["load_viscous"]
-        at_motor = (factor * value[name] for factor, name in zip(_to_motor(ratio), ("stiffness", "backlash"), strict=True))
-        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, *at_motor)
+        factors = zip(_to_motor(ratio), ("stiffness", "backlash"), strict=True)
+        at_motor, half_gap = (factor * value[name] for factor, name in factors)
+        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, at_motor, half_gap)
     else:
         nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"])
     lines += [

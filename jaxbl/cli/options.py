@@ -11,6 +11,7 @@ from jaxbl.files import to_path
 from jaxbl.lines import doubts_among
 
 if TYPE_CHECKING:
+    from jaxbl.identification.logs import SealedRecord
     from jaxbl.records import Record
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
@@ -57,7 +58,7 @@ def folder_of(source: Path, result: str, out: str | Path | None) -> Path:
     return to_path(out) if out is not None else Path("results") / f"{source.stem}_{result}"
 
 
-def check_doubts(records: "Iterable[Record]", force: bool) -> None:
+def check_doubts(records: "Iterable[Record | SealedRecord]", force: bool) -> None:
     """Refuse a search of minutes on a log of which a unit or a sign is doubtful."""
     for record in records:
         if not force and (doubts := doubts_among(record.warnings)):

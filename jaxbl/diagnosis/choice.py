@@ -277,7 +277,7 @@ class Choice:
         own, known = self.setup.own, np.diag(self.setup.prior**2)
         # if nothing is missing, its numbers are off by as much as the fit says
         off = fitted.white + np.outer(fitted.theta, fitted.theta)
-        return FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off)
+        return FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off, fitted.linear)
 
     def _gain(self, search: EffectSearch, fitted: FittedModel, compared: Comparison, name: str) -> tuple[float, float]:
         """Standard errors and nats by which a model beats the one without an effect, all numbers fitted anew.

@@ -27,7 +27,7 @@ class FittedModel(NamedTuple):
         theta: of these.
         covariance: of theta.
         white: the same if prediction errors are white, as those of a complete model.
-        linear: the model along the log; None of the model as given.
+        linear: the model along the log; of the model as given, with its own numbers fitted.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
         log_likelihood: nats, with the numbers' prior; only differences count.
     """
@@ -38,13 +38,12 @@ class FittedModel(NamedTuple):
     theta: np.ndarray
     covariance: np.ndarray
     white: np.ndarray
-    linear: Linear | None = None
+    linear: Linear
     left_out: np.ndarray | None = None
     log_likelihood: float = np.nan
 
     def share(self, name: str) -> float:
         """Torque of an effect along the log, rms over the driving torque's."""
-        assert self.linear is not None
         return self.linear.share(name)
 
     @property
