@@ -9,21 +9,21 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
-# The honest proof and logs read for what they are stand at 410 410 for now: they are done at 400 548.
+# The honest proof and logs read for what they are stand at 410 476 for now: they are done at 400 548.
 CEILINGS = {
-    "all": (410410, 3.73, 3.95, 5.95),
-    "report": (64379, 8.71, 6.12, 16.67),
-    "diagnosis": (65778, 10.13, 12.75, 15.6),
+    "all": (410476, 3.72, 3.93, 5.91),
+    "report": (64438, 8.58, 6.0, 16.61),
+    "diagnosis": (65771, 10.12, 12.75, 15.47),
     "records": (49106, 0.0, 0.0, 0.0),
     "gains": (40310, 0.03, 0.0, 0.0),
-    "identification": (36229, 8.61, 15.0, 17.3),
+    "identification": (36229, 8.6, 14.92, 17.2),
     "sweeps": (28766, 0.07, 0.0, 0.0),
     "exports": (24764, 0.02, 0.0, 0.68),
     "fused": (24004, 0.1, 0.0, 0.0),
-    ".": (18387, 0.03, 0.0, 0.0),
-    "drive": (12804, 0.0, 2.23, 0.0),
+    ".": (18393, 0.03, 0.0, 0.0),
+    "drive": (12804, 0.0, 2.21, 0.0),
     "throughput": (11788, 0.0, 0.0, 0.0),
-    "cli": (9882, 0.09, 0.0, 0.0),
+    "cli": (9890, 0.09, 0.0, 0.0),
     "config": (9721, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
     "monitoring": (5530, 0.0, 0.0, 0.0),
