@@ -88,7 +88,8 @@ class Outcome:
     def named_effects(self) -> list[str]:
         """Effects that the diagnosis asserts."""
         partly = self.kind in ("clutter", "rough")
-        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" or partly else []
+        says = self.verdict in ("explained", "not_tested") or partly
+        return [effect for effect, _, _ in self.findings] if says else []
 
     @property
     def answer(self) -> str:

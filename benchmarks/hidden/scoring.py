@@ -40,7 +40,7 @@ from .figures import draw
 from .outcomes import FIRST_LINE, NEXT_STEP, TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
 from .proof import proofs
 
-VERDICTS = ("explained", "no_discrepancy", "unknown_effect", "rough_numbers")
+VERDICTS = ("explained", "no_discrepancy", "unknown_effect", "not_tested", "rough_numbers")
 CONFIDENT = 0.9
 Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
 """diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it;
