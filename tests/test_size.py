@@ -12,7 +12,7 @@ from size import ROOT, Size, measure_file, measure_folders
 # The honest proof and logs read for what they are stand at 410 476 for now: they are done at 400 548.
 CEILINGS = {
     "all": (410476, 3.72, 3.93, 5.91),
-    "report": (64438, 8.58, 6.0, 16.61),
+    "report": (61318, 1.01, 1.2, 1.68),
     "diagnosis": (65771, 10.12, 12.75, 15.47),
     "records": (49106, 0.0, 0.0, 0.0),
     "gains": (40310, 0.03, 0.0, 0.0),

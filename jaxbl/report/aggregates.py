@@ -13,8 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from pandas import DataFrame, Series
 
 from jaxbl.sweeps.sweep import StudyResult
+
+Array = np.ndarray
 
 MOST_VALUES = 4_000_000
 """Sorted at once: 100 MB with what sorting them takes."""
@@ -36,23 +39,23 @@ class Rows:
         self,
         result: StudyResult,
         columns: Iterable[str],
-        changed: Callable[[pd.DataFrame], pd.DataFrame] = lambda frame: frame,
+        changed: Callable[[DataFrame], DataFrame] = lambda frame: frame,
         needs: Iterable[str] = (),
     ):
         self._result, self._columns, self._changed = result, list(dict.fromkeys(columns)), changed
         self._needs = tuple(needs)
 
-    def __iter__(self) -> Iterator[pd.DataFrame]:
+    def __iter__(self) -> Iterator[DataFrame]:
         return self.some(self._columns)
 
-    def some(self, columns: Iterable[str]) -> Iterator[pd.DataFrame]:
+    def some(self, columns: Iterable[str]) -> Iterator[DataFrame]:
         """Some of the columns, or more."""
         if self._result.runs * len(self._columns) <= _MOST_KEPT:
             return iter([self.frame])
         return map(self._changed, self._result.batches([*columns, *self._needs]))
 
     @functools.cached_property
-    def frame(self) -> pd.DataFrame:
+    def frame(self) -> DataFrame:
         """All of them at once."""
         parts = [self._changed(part) for part in self._result.batches(self._columns)]
         return pd.concat(parts, ignore_index=True)
@@ -62,33 +65,33 @@ class Distinct:
     """Rows that differ from one another, of frames that come one after the other."""
 
     def __init__(self):
-        self._members: list[pd.DataFrame] = []
+        self._frames: list[DataFrame] = []
         self._known = self._new = 0
 
-    def add(self, frame: pd.DataFrame) -> None:
+    def add(self, frame: DataFrame) -> None:
         """Note the rows of another frame."""
-        self._members.append(frame.drop_duplicates())
-        self._new += len(self._members[-1])
+        self._frames.append(frame.drop_duplicates())
+        self._new += len(self._frames[-1])
         if self._new > self._known + 10_000:
             self.frame()
 
-    def frame(self) -> pd.DataFrame:
+    def frame(self) -> DataFrame:
         """All that differ, in the order of their first appearance."""
-        together = pd.concat(self._members, ignore_index=True).drop_duplicates(ignore_index=True)
-        self._members, self._known, self._new = [together], len(together), 0
+        together = pd.concat(self._frames, ignore_index=True).drop_duplicates(ignore_index=True)
+        self._frames, self._known, self._new = [together], len(together), 0
         return together
 
 
 class Spread(NamedTuple):
     """Numbers of each group, NaN left out: count, least, largest `(groups,)` and quantiles `(quantiles, groups)`."""
 
-    count: np.ndarray
-    least: np.ndarray
-    largest: np.ndarray
-    quantiles: np.ndarray
+    count: Array
+    least: Array
+    largest: Array
+    quantiles: Array
 
 
-def _some(rows: Iterable[pd.DataFrame], columns: Iterable[str]) -> Iterable[pd.DataFrame]:
+def _read_columns(rows: Iterable[DataFrame], columns: Iterable[str]) -> Iterable[DataFrame]:
     return rows.some(columns) if isinstance(rows, Rows) else rows
 
 
@@ -96,7 +99,7 @@ class Column(NamedTuple):
     """Numbers of each row, from some columns of it."""
 
     needs: Sequence[str]
-    of: Callable[[pd.DataFrame], Any]
+    of: Callable[[DataFrame], Any]
 
 
 class Groups:
@@ -108,12 +111,12 @@ class Groups:
         rows: number of all rows.
     """
 
-    def __init__(self, rows: Iterable[pd.DataFrame], keys: Sequence[str], others: Sequence[str] = ()):
+    def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], others: Sequence[str] = ()):
         self._rows, self._keys = rows, list(keys)
         distinct, first = Distinct(), {}
         self.varied: set[str] = set()
         self.rows = 0
-        for frame in _some(rows, [*self._keys, *others]):
+        for frame in _read_columns(rows, [*self._keys, *others]):
             self.rows += len(frame)
             if self._keys:
                 distinct.add(frame[self._keys])
@@ -124,86 +127,81 @@ class Groups:
         if not self._keys:
             self.index: pd.Index = pd.RangeIndex(1)
             return
-        found = distinct.frame().sort_values(self._keys, ignore_index=True)
-        self.index = pd.MultiIndex.from_frame(found) if len(self._keys) > 1 else pd.Index(found[self._keys[0]])
-        self._values = [pd.Index(np.sort(found[key].unique())) for key in self._keys]
-        self._known = self._flat(found)
+        groups = distinct.frame().sort_values(self._keys, ignore_index=True)
+        self.index = pd.MultiIndex.from_frame(groups) if len(self._keys) > 1 else pd.Index(groups[self._keys[0]])
+        self._values = [pd.Index(np.sort(groups[key].unique())) for key in self._keys]
+        self._numbers = self._number(groups)
 
     def __len__(self) -> int:
         return len(self.index)
 
-    def _flat(self, frame: pd.DataFrame) -> np.ndarray:
+    def _number(self, frame: DataFrame) -> Array:
         """One number for the keys of each row, growing as they are sorted."""
-        flat = np.zeros(len(frame), np.int64)
+        number = np.zeros(len(frame), np.int64)
         for key, values in zip(self._keys, self._values, strict=True):
-            flat = flat * len(values) + values.get_indexer(frame[key])
-        return flat
+            number = number * len(values) + values.get_indexer(frame[key])
+        return number
 
-    def of(self, frame: pd.DataFrame) -> np.ndarray:
+    def of(self, frame: DataFrame) -> Array:
         """The group of each row."""
-        return np.searchsorted(self._known, self._flat(frame)) if self._keys else np.zeros(len(frame), np.int64)
+        return np.searchsorted(self._numbers, self._number(frame)) if self._keys else np.zeros(len(frame), np.int64)
 
-    def means(self, columns: dict[str, Column]) -> pd.DataFrame:
+    def _read(self, columns: Sequence[Column]) -> Iterator[tuple[Array, list[Array]]]:
+        """Groups of the rows, and numbers by column, part by part."""
+        for frame in _read_columns(self._rows, [*self._keys, *(name for column in columns for name in column.needs)]):
+            yield self.of(frame), [np.asarray(column.of(frame), float) for column in columns]
+
+    def means(self, columns: dict[str, Column]) -> DataFrame:
         """Means of numbers by group, NaN left out, and the number of rows in `rows`."""
-        sums = {name: np.zeros(len(self)) for name in columns}
-        counts = {name: np.zeros(len(self), np.int64) for name in ("rows", *columns)}
-        needs = [name for column in columns.values() for name in column.needs]
-        for frame in _some(self._rows, [*self._keys, *needs]):
-            groups = self.of(frame)
-            np.add.at(counts["rows"], groups, 1)
-            for name, column in columns.items():
-                values = np.asarray(column.of(frame), float)
+        rows, counts = np.zeros(len(self), np.int64), np.zeros((len(columns), len(self)), np.int64)
+        sums = np.zeros(counts.shape)
+        for groups, numbers in self._read([*columns.values()]):
+            np.add.at(rows, groups, 1)
+            for i, values in enumerate(numbers):
                 there = ~np.isnan(values)
-                np.add.at(sums[name], groups[there], values[there])
-                np.add.at(counts[name], groups[there], 1)
+                np.add.at(sums[i], groups[there], values[there])
+                np.add.at(counts[i], groups[there], 1)
         with np.errstate(invalid="ignore"):
-            found = {name: sums[name] / counts[name] for name in columns}
-        return pd.DataFrame({"rows": counts["rows"], **found}, index=self.index)
+            means = dict(zip(columns, sums / counts, strict=True))
+        return DataFrame({"rows": rows, **means}, index=self.index)
 
     def spread(self, column: Column, quantiles: Sequence[float] = (0.5,)) -> Spread:
-        """How the numbers of a column are spread in each group."""
+        """The spread of a column's numbers in each group."""
+        return spread(lambda: ((groups, values) for groups, (values,) in self._read([column])), len(self), quantiles)
 
-        def numbers() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for frame in _some(self._rows, [*self._keys, *column.needs]):
-                yield self.of(frame), np.asarray(column.of(frame), float)
-
-        return spread(numbers, len(self), quantiles)
-
-    def medians(self, column: Column) -> pd.Series:
+    def medians(self, column: Column) -> Series:
         """The median of a column in each group."""
-        return pd.Series(self.spread(column).quantiles[0], self.index)
+        return Series(self.spread(column).quantiles[0], self.index)
 
 
-Stream = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
+Stream = Callable[[], Iterable[tuple[Array, Array]]]
 """Gives groups and numbers of rows, part by part, the same each time."""
 
 
 def spread(stream: Stream, groups: int, quantiles: Sequence[float]) -> Spread:
-    """How numbers are spread in groups 0 ... groups - 1; NaN where a group has none."""
+    """The spread of numbers in groups 0 ... groups - 1; NaN where a group has none."""
     count, total = np.zeros(groups, np.int64), 0
     least, largest = np.full(groups, np.inf), np.full(groups, -np.inf)
-    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    parts = [(np.zeros(0, int), np.zeros(0))]
     for of, values in _numbers(stream):
         np.add.at(count, of, 1)
         np.minimum.at(least, of, values)
         np.maximum.at(largest, of, values)
         total += len(values)
         if total <= MOST_VALUES:
-            kept.append((of, values))
+            parts.append((of, values))
         else:
-            kept.clear()
+            parts.clear()
     empty = count == 0
     place = np.asarray(quantiles, float)[:, None] * np.maximum(count - 1, 0)
     # each quantile lies between two ranks
     ranks = np.stack([np.floor(place), np.ceil(place)], axis=1).astype(np.int64).reshape(-1, groups)
     if total <= MOST_VALUES:
-        of, values = (np.concatenate(one) for one in zip(*kept, strict=True)) if kept else (empty[:0], least[:0])
-        values = np.append(values[np.lexsort((values, of))], np.nan)
-        first = np.cumsum(count) - count
-        found = values[np.where(empty, len(values) - 1, first + ranks)]
+        values = np.append(_sort_by_group(parts), np.nan)
+        ranked = values[np.where(empty, len(values) - 1, np.cumsum(count) - count + ranks)]
     else:
-        found = _ranked(stream, count, least, largest, ranks)
-    below, above = found[::2], found[1::2]
+        ranked = _select_ranks(stream, count, least, largest, ranks)
+    below, above = ranked[::2], ranked[1::2]
     share = place - np.floor(place)
     with np.errstate(invalid="ignore"):
         # as NumPy interpolates
@@ -213,7 +211,13 @@ def spread(stream: Stream, groups: int, quantiles: Sequence[float]) -> Spread:
     return Spread(count, least, largest, between)
 
 
-def _numbers(stream: Stream) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _sort_by_group(parts: Iterable[tuple[Array, Array]]) -> Array:
+    """Values of all parts, those of the first group first, growing in each group."""
+    of, values = map(np.concatenate, zip(*parts, strict=True))
+    return values[np.lexsort((values, of))]
+
+
+def _numbers(stream: Stream) -> Iterator[tuple[Array, Array]]:
     for of, values in stream():
         there = ~np.isnan(values)
         yield of[there], values[there]
@@ -222,26 +226,25 @@ def _numbers(stream: Stream) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 _SIGN = np.uint64(1 << 63)
 
 
-def _keys(values: np.ndarray) -> np.ndarray:
+def _keys(values: Array) -> Array:
     """Whole numbers in the order of floating-point ones."""
     bits = (values + 0.0).view(np.uint64)
     return np.where(bits & _SIGN, ~bits, bits | _SIGN)
 
 
-def _floats(keys: np.ndarray) -> np.ndarray:
+def _floats(keys: Array) -> Array:
     return np.where(keys & _SIGN, keys ^ _SIGN, ~keys).view(np.float64)
 
 
-def _ranked(stream: Stream, count: np.ndarray, least: np.ndarray, largest: np.ndarray, ranks: np.ndarray) -> np.ndarray:
+def _select_ranks(stream: Stream, count: Array, least: Array, largest: Array, ranks: Array) -> Array:
     """The values of some ranks `(ranks, groups)`, growing along the first axis, in each group."""
-    some = count > 0
-    shape = ranks.shape
-    low, high = (np.broadcast_to(_keys(np.where(some, one, 0.0)), shape).copy() for one in (least, largest))
-    inside = np.broadcast_to(count, shape).copy()
+    # an empty group has the same ends
+    ends = (np.where(count > 0, values, 0.0) for values in (least, largest))
+    low, high, inside = (np.broadcast_to(values, ranks.shape).copy() for values in (*map(_keys, ends), count))
     ranks = ranks.copy()
     while True:
         # ranks in the same interval share it, as they lie side by side
-        sought = (low < high) & some
+        sought = low < high
         fresh = sought.copy()
         fresh[1:] &= (low[1:] != low[:-1]) | (high[1:] != high[:-1])
         numbers = np.cumsum(fresh, axis=0) + np.r_[0, np.cumsum(fresh.sum(axis=0))[:-1]] - 1
@@ -250,38 +253,29 @@ def _ranked(stream: Stream, count: np.ndarray, least: np.ndarray, largest: np.nd
             break
         bins = int(np.clip(MOST_VALUES // owners, 4, 4096))
         width = (high - low) // np.uint64(bins) + np.uint64(1)
-        counts = np.zeros(owners * bins, np.int64)
+        counts = np.zeros((owners, bins), np.int64)
         for t, of, keys in _within(stream, low, high, fresh):
-            which = ((keys - low[t, of]) // width[t, of]).astype(np.int64)
-            np.add.at(counts, numbers[t, of] * bins + which, 1)
-        below = np.cumsum(counts.reshape(owners, bins), axis=1)
-        for t in range(len(ranks)):
-            at = np.flatnonzero(sought[t])
-            own = below[numbers[t, at]]
-            found = (own <= ranks[t, at, None]).sum(axis=1)
-            before = np.where(found > 0, own[np.arange(len(at)), found - 1], 0)
-            inside[t, at] = own[np.arange(len(at)), found] - before
-            ranks[t, at] -= before
-            low[t, at] += found.astype(np.uint64) * width[t, at]
-            high[t, at] = np.minimum(low[t, at] + (width[t, at] - np.uint64(1)), high[t, at])
-    parts = [(numbers[t, of], keys) for t, of, keys in _within(stream, low, high, fresh)] if left else []
-    result = low.copy()
-    if parts:
-        of, keys = (np.concatenate(one) for one in zip(*parts, strict=True))
-        keys = keys[np.lexsort((keys, of))]
-        sizes = np.bincount(of, minlength=owners)
-        first = np.cumsum(sizes) - sizes
-        result[sought] = keys[first[numbers[sought]] + ranks[sought]]
-    return _floats(result)
+            np.add.at(counts, (numbers[t, of], ((keys - low[t, of]) // width[t, of]).astype(np.int64)), 1)
+        counts = np.cumsum(counts, axis=1)
+        for t, rows in enumerate(sought):
+            up_to = counts[numbers[t, rows]]
+            bin_, place = (up_to <= ranks[t, rows, None]).sum(axis=1), np.arange(len(up_to))
+            before = np.where(bin_ > 0, up_to[place, bin_ - 1], 0)
+            inside[t, rows] = up_to[place, bin_] - before
+            ranks[t, rows] -= before
+            low[t, rows] += bin_.astype(np.uint64) * width[t, rows]
+        high[sought] = np.minimum(low + width - np.uint64(1), high)[sought]
+    if left:
+        parts = [(numbers[t, of], keys) for t, of, keys in _within(stream, low, high, fresh)]
+        sizes = inside[fresh][np.argsort(numbers[fresh])]
+        low[sought] = _sort_by_group(parts)[(np.cumsum(sizes) - sizes)[numbers[sought]] + ranks[sought]]
+    return _floats(low)
 
 
-def _within(
-    stream: Stream, low: np.ndarray, high: np.ndarray, fresh: np.ndarray
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Of each part, for each rank: groups and keys of the numbers that lie in the group's interval for that rank."""
-    wanted = [t for t in range(len(low)) if fresh[t].any()]
+def _within(stream: Stream, low: Array, high: Array, fresh: Array) -> Iterator[tuple[int, Array, Array]]:
+    """For each rank, of each part: groups and keys of the numbers that lie in the group's interval for that rank."""
     for of, values in _numbers(stream):
         keys = _keys(values)
-        for t in wanted:
+        for t in np.flatnonzero(fresh.any(axis=1)):
             there = fresh[t, of] & (keys >= low[t, of]) & (keys <= high[t, of])
             yield t, of[there], keys[there]

@@ -7,7 +7,7 @@ from jaxbl.files import write_json
 from jaxbl.lines import Lines, format_table
 from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
-from .figures import COLOURS, Drawn, style, subplots
+from .figures import BLUE, GREEN, VERMILION, Drawn, style, subplots
 from .page import save_all
 
 
@@ -21,42 +21,45 @@ def _bars(result: BenchResult) -> Drawn:
     names = list(dict.fromkeys(row.name for row in result.rows))
     names.sort(key=lambda name: result.find_speed(name, "float32") or result.find_speed(name, "float64") or 0.0)
     figure, (ax,) = subplots(8.0, 0.42 * len(names) + 1.1)
-    height = 0.38
-    for shift, precision, alpha in ((height / 2, "float32", 1.0), (-height / 2, "float64", 0.45)):
+    for shift, precision, alpha in ((0.19, "float32", 1.0), (-0.19, "float64", 0.45)):
         for i, name in enumerate(names):
             speed = result.find_speed(name, precision)
             if speed is not None:
-                colour = COLOURS[1] if name.startswith("jaxbl") else COLOURS[0]
-                ax.barh(i + shift, speed, height, color=colour, alpha=alpha)
+                ax.barh(i + shift, speed, 0.38, color=VERMILION if name.startswith("jaxbl") else BLUE, alpha=alpha)
                 ax.text(1.15 * speed, i + shift, f"{speed:.2g}", va="center", fontsize=7)
-    label = "lane-steps per second (log scale); upper bar float32, lower bar float64"
-    ax.set(xscale="log", xlabel=label)
+    ax.set(xscale="log", xlabel="lane-steps per second (log scale); upper bar float32, lower bar float64")
     ax.set_yticks(range(len(names)), names)
     ax.set_xlim(right=12.0 * max(row.lane_steps_per_second for row in result.rows))
     ax.grid(axis="y", visible=False)
-    caption = (
+    return Drawn(
+        "throughput",
+        figure,
         "The paper's chain on many lanes by each program. A lane-step is one sample of one lane: plant, two observers, "
-        "filter and both identifiers. Longer bars are faster; from one grid line to the next is a factor of ten."
+        "filter and both identifiers. Longer bars are faster; from one grid line to the next is a factor of ten.",
     )
-    return Drawn("throughput", figure, caption)
 
 
 def _curve(result: BenchResult) -> Drawn:
     figure, (ax,) = subplots(7.0, 3.8)
-    for name, colour in ((CPP_NAME, COLOURS[0]), (FUSED_NAME, COLOURS[1]), (SCAN_NAME, COLOURS[2])):
+    for name, colour in ((CPP_NAME, BLUE), (FUSED_NAME, VERMILION), (SCAN_NAME, GREEN)):
         for precision, line in zip(PRECISIONS, ("-", "--"), strict=True):
-            points = [point for point in result.curve if (point["name"], point["precision"]) == (name, precision)]
-            lanes, speeds = [p["lanes"] for p in points], [p["lane_steps_per_second"] for p in points]
+            points = [
+                (point["lanes"], point["lane_steps_per_second"])
+                for point in result.curve
+                if (point["name"], point["precision"]) == (name, precision)
+            ]
             if points:
-                ax.plot(lanes, speeds, line, color=colour, marker="o", markersize=3, label=f"{name}, {precision}")
+                label = f"{name}, {precision}"
+                ax.plot(*zip(*points, strict=True), line, color=colour, marker="o", markersize=3, label=label)
     ax.set_xscale("log", base=2)
     ax.set(yscale="log", xlabel="lanes", ylabel="lane-steps per second")
     ax.legend()
-    caption = (
+    return Drawn(
+        "lanes",
+        figure,
         "Throughput over the number of lanes. On the left the fixed cost of a call and of a block of samples limits it, on "
-        "the right caches and memory."
+        "the right caches and memory.",
     )
-    return Drawn("lanes", figure, caption)
 
 
 def _table(result: BenchResult, precision: str) -> list[list[str]]:
@@ -73,26 +76,27 @@ def _table(result: BenchResult, precision: str) -> list[list[str]]:
 
 def throughput_lines(result: BenchResult) -> Lines:
     """The benchmark for the terminal."""
-    lines = ["Lane-steps/s, best and median of the calls; time of the first call; deviation of the results."]
+    machine = result.machine
+    lines = [
+        f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}; {result.rows[0].steps} "
+        "samples a run",
+        "Lane-steps/s, best and median of the calls; time of the first call; deviation of the results.",
+    ]
     for precision in PRECISIONS:
         lines += ["", *format_table(_table(result, precision), numbers=True)]
-    machine = result.machine
-    on = f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}"
-    lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
     if result.study:
         study = result.study[0]
-        lines += [
-            "",
-            f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:",
-        ]
+        size = f"{study['lanes']} lanes of {study['steps']} samples, {study['precision']}"
+        lines += ["", f"A small study from nothing, {size}:"]
         lines += format_table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
     if result.studies:
         lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
-    for row in result.studies:
-        about = f"{row['name']}, {row['seeds']} seeds of {row['lanes']} lanes"
-        share = f"{row['jaxbl'] / row['c++']:.2g}"
-        lines.append(f"  {about}: jaxbl {row['jaxbl']:.3g}, C++ {row['c++']:.3g}, {share} of it")
-    lines += [f"{name}: left out, {why}" for name, why in result.left_out.items()]
+    lines += [
+        f"  {row['name']}, {row['seeds']} seeds of {row['lanes']} lanes: jaxbl {row['jaxbl']:.3g}, C++ {row['c++']:.3g}, "
+        f"{row['jaxbl'] / row['c++']:.2g} of it"
+        for row in result.studies
+    ]
+    lines += [f"{name}: left out, {reason}" for name, reason in result.left_out.items()]
     return lines + result.failures
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxbl.files import json_with_checksum, remove, write_atomic
 from jaxbl.json_types import JsonObject
 
-from .figures import COLOURS, Drawn, style, subplots
+from .figures import BLUE, VERMILION, Drawn, legend_below, style, subplots
 from .page import PageTable
 
 ASSUMPTIONS = (
@@ -23,7 +23,7 @@ ASSUMPTIONS = (
 
 def write_certificates(summary: JsonObject, folder: Path) -> None:
     """Write `certificate.json` of the sides of which something is proven; where there is none, remove an earlier one."""
-    proven = {side: found for side, found in summary.get("certificates", {}).items() if found["certified"]}
+    proven = _proven(summary)
     if not proven:
         remove(folder / "certificate.json")
         return
@@ -31,15 +31,20 @@ def write_certificates(summary: JsonObject, folder: Path) -> None:
     write_atomic(folder / "certificate.json", json_with_checksum(data))
 
 
+def _proven(summary: JsonObject) -> JsonObject:
+    """Certificates of the sides of which something is proven."""
+    return {side: proof for side, proof in summary.get("certificates", {}).items() if proof["certified"]}
+
+
 def certificate_lines(summary: JsonObject) -> list[str]:
     """The certificates in sentences."""
-    found = summary.get("certificates", {})
-    return [line for side in found for line in _lines(side, found[side], summary["passed_over"][side])]
+    certificates = summary.get("certificates", {}).items()
+    return [line for side, proof in certificates for line in _lines(side, proof, summary["passed_over"][side])]
 
 
 def is_refuted(summary: JsonObject) -> bool:
-    """Whether the search found an error above what was proven: that is said before all else."""
-    return any(found.get("search", {}).get("violations") for found in summary.get("certificates", {}).values())
+    """True if the search found an error above what was proven: that is said before all else."""
+    return any(proof.get("search", {}).get("violations") for proof in summary.get("certificates", {}).values())
 
 
 def _above(value: float, sign: float = 1.0) -> float:
@@ -55,30 +60,31 @@ def _below(value: float) -> float:
     return _above(value, -1.0)
 
 
-def _lines(side: str, found: JsonObject, passed_over: int) -> list[str]:
-    if not found["certified"]:
-        return [f"{side}: no certificate: {found['why_none']}."]
-    given = {name: _below(value) for name, value in found["assumptions"].items() if name != "discretisation"}
-    tried = found["search"]
-    nominal = f", nominal acceleration of {given['acceleration']:.4g} rad/s²" if "acceleration" in given else ""
-    promise = f"{_above(found['accuracy']):.4g} rad/s"
+def _lines(side: str, proof: JsonObject, passed_over: int) -> list[str]:
+    if not proof["certified"]:
+        return [f"{side}: no certificate: {proof['why_none']}."]
+    bounds = {name: _below(value) for name, value in proof["assumptions"].items() if name != "discretisation"}
+    search = proof["search"]
+    nominal = f", nominal acceleration of {bounds['acceleration']:.4g} rad/s²" if "acceleration" in bounds else ""
+    promise = f"{_above(proof['accuracy']):.4g} rad/s"
+    period = f"{proof['assumptions']['period']:.4g} s"
     lines = [
-        f"{side}, promised: a velocity error of at most {promise} from {_above(found['reaching_time']):.4g} s on, proven "
-        f"(with {_above(found['final_accuracy']):.4g} rad/s from {_above(found['curve']['time'][-1]):.4g} s on) for any "
-        f"noise within ±{given['noise']:.4g} rad and any missing acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}"
-        f", sampled every {found['assumptions']['period']:.4g} s, from errors of {given['velocity_error']:.4g} rad/s and "
-        f"{given['position_error']:.4g} rad.",
-        f"{side}, tried: the worst of {tried['runs']} adversarial runs errs by {tried['worst']:.3g} rad/s. Another search "
+        f"{side}, promised: a velocity error of at most {promise} from {_above(proof['reaching_time']):.4g} s on, proven "
+        f"(with {_above(proof['final_accuracy']):.4g} rad/s from {_above(proof['curve']['time'][-1]):.4g} s on) for any "
+        f"noise within ±{bounds['noise']:.4g} rad and any missing acceleration within ±{bounds['f_plus']:.4g} rad/s²"
+        f"{nominal}, sampled every {period}, from errors of {bounds['velocity_error']:.4g} rad/s "
+        f"and {bounds['position_error']:.4g} rad.",
+        f"{side}, tried: the worst of {search['runs']} adversarial runs errs by {search['worst']:.3g} rad/s. Another search "
         f"may find more, but not more than the {promise} that are promised.",
     ]
     missed = [
         f"{name.replace('_', ' ')} {limit['asked']:.3g} {'s' if name == 'reaching_time' else 'rad/s'}"
-        for name, limit in found["limits"].items()
+        for name, limit in proof["limits"].items()
         if not limit["met"]
     ]
     if missed:
         lines.insert(0, f"{side}, certificate: what was asked for is not proven: {', '.join(missed)}.")
-    elif found["limits"]:
+    elif proof["limits"]:
         gains = f"; {passed_over} gains with less error in the runs do not" if passed_over else ""
         lines.append(f"{side}, certificate: the gains keep what was asked for{gains}.")
     return lines
@@ -86,21 +92,21 @@ def _lines(side: str, found: JsonObject, passed_over: int) -> list[str]:
 
 def certificate_tables(summary: JsonObject) -> list[PageTable]:
     """The certificates' numbers and assumptions, if there are any."""
-    found = {side: one for side, one in summary.get("certificates", {}).items() if one["certified"]}
-    if not found:
+    certificates = _proven(summary)
+    if not certificates:
         return []
     names = ["promised accuracy (rad/s)", "promised from (s)", "proven later (rad/s)", "that from (s)",
              "worst found (rad/s)", "proven later / found", "found from (s)", "without noise, continuous (s)", "noise (rad)",
              "f⁺ (rad/s²)", "period (s)", "velocity error at start (rad/s)", "position error at start (rad)"]  # fmt: skip
     sides = [
-        [*(_above(one[name]) for name in ("accuracy", "reaching_time", "final_accuracy")), _above(one["curve"]["time"][-1]),
-         one["search"]["worst"],
-         one["search"]["ratio"], one["search"]["reaching_time"], one["reaching_time_continuous"],
-         *(one["assumptions"][name] if name == "period" else _below(one["assumptions"][name])
+        [*(_above(proof[name]) for name in ("accuracy", "reaching_time", "final_accuracy")),
+         _above(proof["curve"]["time"][-1]), *(proof["search"][name] for name in ("worst", "ratio", "reaching_time")),
+         proof["reaching_time_continuous"],
+         *(proof["assumptions"][name] if name == "period" else _below(proof["assumptions"][name])
            for name in ("noise", "f_plus", "period", "velocity_error", "position_error"))]
-        for one in found.values()
+        for proof in certificates.values()
     ]  # fmt: skip
-    columns, rows = ["", *found], list(zip(names, *sides, strict=True))
+    columns, rows = ["", *certificates], list(zip(names, *sides, strict=True))
     table = PageTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
     return [table, PageTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
 
@@ -108,23 +114,22 @@ def certificate_tables(summary: JsonObject) -> list[PageTable]:
 @style()
 def draw_certificates(summary: JsonObject) -> list[Drawn]:
     """The proven bound over time on each side, and the worst that was found."""
-    return [_bounds(side, one) for side, one in summary.get("certificates", {}).items() if one["certified"]]
+    return [_bounds(side, proof) for side, proof in _proven(summary).items()]
 
 
-def _bounds(side: str, found: JsonObject) -> Drawn:
+def _bounds(side: str, proof: JsonObject) -> Drawn:
     figure, (ax,) = subplots(6.6, 4.4, beside=True)
-    curve, tried = found["curve"], found["search"]
+    time, bound, start = proof["curve"]["time"], proof["curve"]["bound"], proof["reaching_time"]
     # beyond its last point the bound stays as it is
-    end = max(1.3 * found["reaching_time"], curve["time"][-1], 20.0 * found["assumptions"]["period"])
-    ax.step(
-        [*curve["time"], end], [*curve["bound"], curve["bound"][-1]], where="post", color=COLOURS[0], label="proven bound"
-    )
-    ax.axhline(tried["worst"], color=COLOURS[1], ls="--", label="worst found, from rest")
-    ax.plot(found["reaching_time"], found["accuracy"], "o", ms=7, color=COLOURS[0], label="proven from here on")
+    end = max(1.3 * start, time[-1], 20.0 * proof["assumptions"]["period"])
+    ax.step([*time, end], [*bound, bound[-1]], where="post", color=BLUE, label="proven bound")
+    ax.axhline(proof["search"]["worst"], color=VERMILION, ls="--", label="worst found, from rest")
+    ax.plot(start, proof["accuracy"], "o", ms=7, color=BLUE, label="proven from here on")
     ax.set(xlabel="time (s)", ylabel="velocity error (rad/s)", yscale="log", title=side, xlim=(0.0, end))
-    figure.legend(loc="outside lower center", ncols=3)
-    caption = (
+    legend_below(figure)
+    return Drawn(
+        f"certificate_{side}",
+        figure,
         f"{side}: bound of the error of the estimated velocity, whatever noise and missing acceleration do within what is "
-        f"assumed, and the worst of {tried['runs']} adversarial runs."
+        f"assumed, and the worst of {proof['search']['runs']} adversarial runs.",
     )
-    return Drawn(f"certificate_{side}", figure, caption)

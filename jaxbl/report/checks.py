@@ -7,12 +7,18 @@ from jaxbl.gains.accuracy_laws import signal_size_columns
 from jaxbl.sweeps.metrics import explain_missing_metric
 from jaxbl.validation import suggest_word
 
+
+def has_words(axis: AxisTable) -> bool:
+    """True if values of an axis are words."""
+    return any(isinstance(value, str) for value in axis.values or ())
+
+
 MOST_PARTS = 60
 """Panels or lines of a figure: twenty rows of three panels, more than anyone compares."""
 
 
 def values_of(config: Config, axis: AxisTable) -> int:
-    """How many values an axis has, of a quasi-random one as many as points."""
+    """The number of values of an axis, of a quasi-random one as many as points."""
     if axis.values is not None:
         return len(set(axis.values))
     return (config.sweep.points or 0) if axis.num is None else axis.size(config.sweep.refine or 0)
@@ -20,33 +26,34 @@ def values_of(config: Config, axis: AxisTable) -> int:
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
     """Raise `InputError` where a figure names an axis that does not exist, or needs a metric that is not there."""
-    axes = [axis.path for axis in config.axes]
-    counts = {axis.path: values_of(config, axis) for axis in config.axes}
-    parts = {"facet": "panel", "series": "line"}
-    words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
+    axes = {axis.path: axis for axis in config.axes}
+    parts = {"x": None, "y": None, "facet": "panel", "series": "line"}
     for i, figure in enumerate(figures):
-        for key in ("x", "y", "facet", "series"):
+        for key, part in parts.items():
             path = getattr(figure, key)
-            if path is not None and path not in axes:
+            if path is None:
+                continue
+            place = f"figures[{i}].{key}: '{path}'"
+            if path not in axes:
                 hint = suggest_word(path, axes) if axes else "the study has no axes"
-                raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
-            if path in words and key in ("x", "y"):
-                other = "facet" if figure.kind == "heatmap" else "facet or series"
-                raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
-            if path is not None and key in parts and (count := counts[path]) > MOST_PARTS:
+                raise InputError(f"{place} is not an axis of this study; {hint}")
+            if part is None:
+                if has_words(axes[path]):
+                    other = "facet" if figure.kind == "heatmap" else "facet or series"
+                    raise InputError(f"{place} has no numeric values; use it as {other}")
+            elif (count := values_of(config, axes[path])) > MOST_PARTS:
                 raise InputError(
-                    f"figures[{i}].{key}: '{path}' has {count} values, each of which would be a {parts[key]}; at most "
+                    f"{place} has {count} values, each of which would be a {part}; at most "
                     f"{MOST_PARTS} can be drawn; name another axis, or give it fewer values"
                 )
         metrics = [column for column in columns if column not in (*axes, "seed")]
-        of_curves = ("converged", "f_plus") if figure.overlays else ()
-        needed = {
-            "value": [figure.value],
-            "overlays": [f"{figure.x.split('.')[1]}.{name}" for name in of_curves],
-            "theory": [] if figure.theory is None else signal_size_columns(figure.value),
-        }
-        for key, names in needed.items():
-            for name in names:
-                if name not in metrics:
-                    raise InputError(f"figures[{i}].{key}: {explain_missing_metric(name, config.build(), metrics)}")
+        needs = [("value", figure.value)]
+        if figure.overlays:
+            side = figure.x.split(".")[1]
+            needs += [("overlays", f"{side}.converged"), ("overlays", f"{side}.f_plus")]
+        if figure.theory is not None:
+            needs += [("theory", name) for name in signal_size_columns(figure.value)]
+        for key, name in needs:
+            if name not in metrics:
+                raise InputError(f"figures[{i}].{key}: {explain_missing_metric(name, config.build(), metrics)}")
         check_selection(config, figure, i)

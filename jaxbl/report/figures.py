@@ -10,19 +10,27 @@ import matplotlib as mpl
 import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch as Patch
 from matplotlib.ticker import NullLocator
 
 from jaxbl.errors import escape_unprintable, shorten
 from jaxbl.files import is_remote, open_draft
 
 SIDES = ("motor", "load")
+Pair = tuple[float, float]
+"""Two numbers: ends of an axis, or a place."""
 
 # Okabe and Ito, in an order that also parts in grey
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-SIDE_COLOURS = {"motor": COLOURS[0], "load": COLOURS[1]}
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK = COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000",
+)  # fmt: skip
+SIDE_COLOURS = {"motor": BLUE, "load": VERMILION}
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MAP = "viridis"
 MISSING = "#BDBDBD"
@@ -70,6 +78,11 @@ def style() -> Iterator[None]:
 def with_unit(label: str, unit: str) -> str:
     """A label with its unit in brackets, if it has one."""
     return f"{label} ({unit})" if unit else label
+
+
+def missing_quantity(unit: str) -> str:
+    """The quantity that has a unit of torque, or of force on a linear axis."""
+    return "force" if unit == "N" else "torque"
 
 
 _LONGEST_NAME = 40
@@ -127,6 +140,12 @@ def subplots(
     return figure, axes
 
 
+def arrange(count: int) -> tuple[int, int]:
+    """Rows and columns of so many panels."""
+    columns = 2 if count == 4 else min(count, 3)
+    return -(-count // columns), columns
+
+
 def stacked(
     count: int, height: float, xlabel: str = "time (s)", *, width: float = 9.0, sharex: bool = True
 ) -> tuple[Figure, list[Axes]]:
@@ -136,11 +155,11 @@ def stacked(
     return figure, axes
 
 
-def decades(ax: Axes, which: str = "both") -> None:
+def decades(ax: Axes, names: str = "both") -> None:
     """Plain numbers at the decades of logarithmic axes, and nothing between: powers in mathematical type, and the many small
     ticks, take longer than all else in a figure."""
     for name, axis in (("x", ax.xaxis), ("y", ax.yaxis)):
-        if which in (name, "both"):
+        if names in (name, "both"):
             axis.set_major_formatter("{x:g}")
             axis.set_minor_locator(NullLocator())
 
@@ -148,16 +167,34 @@ def decades(ax: Axes, which: str = "both") -> None:
 def legend(ax: Axes, columns: int = 1, of: Sequence[Axes] = (), **how: Any) -> None:
     """A legend above the axes, where it hides no line, with each label (also of the axes `of`) once."""
     named = {}
-    for one in of or (ax,):
-        handles, labels = one.get_legend_handles_labels()
+    for other in of or (ax,):
+        handles, labels = other.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
     place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
     ax.legend(named.values(), named.keys(), ncols=columns, **place | how)
 
 
-def mark(
-    ax: Axes, place: tuple[float, float], marker: str, label: str, size: float, colour: str = "white", held: bool = True
-) -> Line2D:
+def legend_below(figure: Figure, handles: Sequence[Any] | None = None, columns: int = 3) -> None:
+    """Put a legend below all axes."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+def colour_bar(figure: Figure, axes: Any, norm: Normalize, label: str = "", colours: Any = MAP, **how: Any) -> Colorbar:
+    """Put a colour bar beside axes; `how` is matplotlib's."""
+    return figure.colorbar(ScalarMappable(norm, colours), ax=axes, **{"pad": 0.02, "aspect": 28, "label": label} | how)
+
+
+def draw_zero(ax: Axes, zorder: float = 2.0) -> None:
+    """Draw a faint line at y = 0."""
+    ax.axhline(0.0, color=FAINT, lw=0.8, zorder=zorder)
+
+
+def write_inside(ax: Axes, text: str, **how: Any) -> None:
+    """Write into the middle of axes that have nothing to show."""
+    ax.text(0.5, 0.5, text, ha="center", transform=ax.transAxes, **how)
+
+
+def mark(ax: Axes, place: Pair, marker: str, label: str, size: float, colour: str = "white", held: bool = True) -> Line2D:
     """Mark a point; if `held`, on the edge of the axes where it lies outside. Returns the legend's handle."""
     x, y = place
     if held:
@@ -177,29 +214,33 @@ def outline(values: np.ndarray, points: int = LINE_POINTS, share: float = 1.0) -
     if len(values) <= 2 * points:
         return np.arange(len(values))
     size = -(-len(values) // (points // 2))
-    padded = np.full(-(-len(values) // size) * size, np.nan)
-    padded[: len(values)] = values
+    padded = np.pad(np.asarray(values, float), (0, -len(values) % size), constant_values=np.nan)
     bins = padded.reshape(-1, size)
     ends = [
         np.argmin(np.where(np.isnan(bins), np.inf, bins), axis=1),
         np.argmax(np.where(np.isnan(bins), -np.inf, bins), axis=1),
     ]
-    at = np.arange(len(bins)) * size + np.sort(ends, axis=0)
-    return np.minimum(at.T.ravel(), len(values) - 1)
+    samples = np.arange(len(bins)) * size + np.sort(ends, axis=0)
+    return np.minimum(samples.T.ravel(), len(values) - 1)
 
 
-def limits(
-    *values: np.ndarray, share: float = 0.001, room: float = 0.12, shown: Sequence[float] = ()
-) -> tuple[float, float] | None:
+def stretches(there: Any) -> list[tuple[int, int]]:
+    """First, and one after the last, index of each stretch that is true."""
+    steps = np.flatnonzero(np.diff(there, prepend=False, append=False))
+    return list(zip(steps[::2], steps[1::2], strict=True))
+
+
+def limits(*values: np.ndarray, share: float = 0.001, room: float = 0.12, shown: Sequence[float] = ()) -> Pair | None:
     """Ends of an axis that a few outliers do not set; None (matplotlib's own ends) where no value is finite.
 
     `share` of the values may lie outside at each end, `room` is added there as a share of the span, and `shown` lie inside
     in any case.
     """
-    finite = np.concatenate([one[np.isfinite(one)] for one in values])
+    finite = np.concatenate(values)
+    finite = finite[np.isfinite(finite)]
     if not len(finite):
         return None
     low, high = np.quantile(finite, [share, 1.0 - share])
-    low, high = min((low, *shown)), max((high, *shown))
+    low, high = min(low, high, *shown), max(low, high, *shown)
     margin = room * (high - low) or 1e-12 + 0.1 * abs(high)
     return float(low - margin), float(high + margin)

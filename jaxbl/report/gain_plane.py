@@ -3,15 +3,12 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 
-from .figures import MISSING, Drawn, mark, style, subplots
+from .figures import MISSING, Axes, Drawn, Patch, legend_below, mark, style, subplots
 from .maps import condition_curves
 
 _SHORT = {name: condition.title.partition(",")[0] for name, condition in CONDITIONS.items()}
@@ -26,57 +23,58 @@ def name_gains(ax: Axes, bound: float) -> None:
     name_ratio(ax, "y", np.sqrt(bound), "λ / √f⁺")
 
 
-def name_ratio(ax: Axes, which: str, unit: float, label: str) -> None:
+def name_ratio(ax: Axes, axis_name: str, unit: float, label: str) -> None:
     """A second axis on the top (`which` x) or on the right (y), which counts in a unit; both are logarithmic."""
     functions = (lambda value: value / unit, lambda ratio: ratio * unit)
-    if which == "x":
-        own, second = ax.xaxis, (other := ax.secondary_xaxis("top", functions=functions)).xaxis
+    if axis_name == "x":
+        axes = ax.xaxis, ax.secondary_xaxis("top", functions=functions).xaxis
     else:
-        own, second = ax.yaxis, (other := ax.secondary_yaxis("right", functions=functions)).yaxis
-    other.set(**{f"{which}label": label})
-    low, high = own.get_view_interval()
-    for axis in (own, second):
+        axes = ax.yaxis, ax.secondary_yaxis("right", functions=functions).yaxis
+    axes[1].set_label_text(label)
+    low, high = axes[0].get_view_interval()
+    for axis in axes:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
 
 
-def conditions_line(side: str, found: JsonObject, which: str) -> str:
-    """Which conditions hold for a side's gains at an f⁺ (`which` says whose), and how far the exact one is from failing."""
-    lambda_, alpha, bound, largest = (found[name] for name in ("lambda", "alpha", "f_plus", "largest_f_plus"))
-    at = f"{side}: at f⁺ = {bound:.3g} rad/s², {which},"
+_GAINS = "lambda", "alpha", "f_plus", "largest_f_plus"
+
+
+def conditions_line(side: str, judged: JsonObject, source: str) -> str:
+    """Which conditions hold for a side's gains at an f⁺ (`source` says whose), and how far the exact one is from failing."""
+    lambda_, alpha, bound, largest, holds = (judged[key] for key in (*_GAINS, "holds"))
+    lead = f"{side}: at f⁺ = {bound:.3g} rad/s², {source},"
     if bound == 0.0:
-        return f"{at} nothing disturbs the observer: the exact gain condition asks for λ > 0 alone."
-    holds = [name for name, held in found["holds"].items() if held]
-    if not found["alpha_exceeds_f_plus"]:
+        return f"{lead} nothing disturbs the observer: the exact gain condition asks for λ > 0 alone."
+    if not judged["alpha_exceeds_f_plus"]:
         return (
-            f"{at} no gain condition can hold, as α = {alpha:.3g} rad/s² does not exceed it. The exact one would hold up to "
-            f"f⁺ = {largest:.3g} rad/s²."
+            f"{lead} no gain condition can hold, as α = {alpha:.3g} rad/s² does not exceed it. The exact one would hold up "
+            f"to f⁺ = {largest:.3g} rad/s²."
         )
-    least = found["least_lambda"]["exact"]
-    if not found["holds"]["exact"]:
+    least = judged["least_lambda"]["exact"]
+    if not holds["exact"]:
         more = "" if lambda_ == 0.0 else f" ({least / lambda_:.3g} times as large)"
         less = "" if largest == 0.0 else f", or f⁺ below {largest:.3g} rad/s² ({bound / largest:.3g} times smaller)"
-        return f"{at} no gain condition holds. The exact one asks for λ above {least:.3g} √rad/s{more}{less}."
-    missed = [_SHORT[name] for name in found["holds"] if name not in holds]
-    what = f"gain conditions met: {', '.join(_SHORT[name] for name in holds)}"
-    what += f"; not met: {', '.join(missed)}" if missed else " (all)"
+        return f"{lead} no gain condition holds. The exact one asks for λ above {least:.3g} √rad/s{more}{less}."
+    met, missed = (", ".join(_SHORT[name] for name in holds if holds[name] == is_met) for is_met in (True, False))
     return (
-        f"{at} {what}. λ may fall by a factor of {lambda_ / least:.4g} (to {least:.3g} √rad/s), or f⁺ grow by one of "
-        f"{largest / bound:.4g} (to {largest:.3g} rad/s²), until the exact one fails."
+        f"{lead} gain conditions met: {met}{f'; not met: {missed}' if missed else ' (all)'}. λ may fall by a factor of "
+        f"{lambda_ / least:.4g} (to {least:.3g} √rad/s), or f⁺ grow by one of {largest / bound:.4g} (to {largest:.3g} "
+        "rad/s²), until the exact one fails."
     )
 
 
 @style()
-def draw_gain_plane(side: str, found: JsonObject) -> Drawn:
+def draw_gain_plane(side: str, judged: JsonObject) -> Drawn:
     """The plane of gains with all conditions at one f⁺ > 0, and where the gains lie in it.
 
     Args:
         side: motor or load.
-        found: gains, f⁺ and what follows from them, as of :func:`jaxbl.observer.conditions.judge_gains`.
+        judged: gains, f⁺ and what follows from them, as of :func:`jaxbl.observer.conditions.judge_gains`.
     """
-    lambda_, alpha, bound, largest = (found[name] for name in ("lambda", "alpha", "f_plus", "largest_f_plus"))
-    least = found["least_lambda"]["exact"]
+    lambda_, alpha, bound, largest = (judged[key] for key in _GAINS)
+    least = judged["least_lambda"]["exact"]
     figure, (ax,) = subplots(6.6, 5.8, beside=True)
     ax.grid(False)
     # a gain of zero has no place on a logarithmic axis
@@ -90,20 +88,18 @@ def draw_gain_plane(side: str, found: JsonObject) -> Drawn:
     ax.fill_between([alphas[0], x[0], *x], [lambdas[1], lambdas[1], *y], lambdas[0], color=MISSING, alpha=0.6, lw=0.0)
     handles.append(Patch(facecolor=MISSING, alpha=0.6, label="exact one fails"))
     if largest > 0.0:
-        condition_curves(ax, {"exact": CONDITIONS["exact"]}, largest, alphas)
-        edge = ax.lines[-1]
+        (edge,) = condition_curves(ax, {"exact": CONDITIONS["exact"]}, largest, alphas)
         x, y = np.asarray(edge.get_xydata()).T
         label = f"where it would fail at f⁺ = {largest:.3g} rad/s²"
         edge.set(data=([x[0], *x], [lambdas[1], *y]), color="black", ls="--", lw=1.2, path_effects=[], label=label)
-        handles.append(Line2D([], [], color="black", ls="--", lw=1.2, label=label))
+        handles.append(edge)
     if least is not None:
-        ends = [least, max(lambda_, lambdas[0])]
-        ax.plot([alpha, alpha], ends, color="black", lw=1.2)
+        ax.plot([alpha, alpha], [least, max(lambda_, lambdas[0])], color="black", lw=1.2)
     ax.set(xlim=alphas, ylim=lambdas)
     name_gains(ax, bound)
     handles.append(mark(ax, (alpha, lambda_), "*", "the observer's gains", 15))
     ax.set_title(f"{side}: λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²")
-    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    legend_below(figure, handles, 2)
     caption = (
         f"Gains of the {side} observer and the least λ of each gain condition at the true f⁺ = {bound:.3g} rad/s² along the "
         "run. Above and on the right: the axes of the atlas (jaxbl verify)."

@@ -1,19 +1,34 @@
 """Figures, table and report of an inspected log."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 
 from jaxbl.files import to_jsonable, write_json
-from jaxbl.lines import NextStep, format_descriptions, format_table
+from jaxbl.lines import Lines, NextStep, format_descriptions, format_table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
 from jaxbl.records.time_stamps import GAP_PERIODS
 
-from .figures import COLOURS, FAINT, Drawn, legend, limits, stacked, style, subplots
+from .figures import (
+    BLACK,
+    BLUE,
+    COLOURS,
+    FAINT,
+    GREEN,
+    PURPLE,
+    VERMILION,
+    Drawn,
+    draw_zero,
+    legend,
+    limits,
+    stacked,
+    style,
+    subplots,
+)
 from .page import PageTable, write_report
 
 _POINTS = 6000
@@ -21,68 +36,67 @@ _POINTS = 6000
 _LINES, _REMARKS = 25, 3
 """Lines that a terminal shows, about; and lines of remarks that are printed beyond that, too."""
 _CHANNELS = {
-    "u": ("input u", COLOURS[6]), "theta_e": ("motor θe", COLOURS[0]), "theta_s": ("load θs", COLOURS[1]),
-    "transmitted": ("transmitted", COLOURS[2]),
+    "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
+    "transmitted": ("transmitted", GREEN),
 }  # fmt: skip
 """Label and colour of each channel."""
 
 
-def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
+def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
     """Write `inspection.json`, figures and report into a folder that exists; the page says what to try next (`steps`).
 
     Returns the lines for the terminal.
     """
     record = inspection.record
     write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
-    judgements = [(one.quantity, one.answer, one.reason) for one in inspection.identifiability]
+    head, *rows = _channel_table(record)
     tables = [
-        PageTable("What the log can identify", ["quantity", "", "why"], judgements),
-        PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
+        PageTable("What the log can identify", ["quantity", "", "why"], _judgements(inspection)),
+        PageTable("Channels", head, rows),
     ]
-    how = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
+    log = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
     lead = [*record.warnings, _headline(record), inspection.describe_sizes()]
-    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, how, record.notes, steps)
+    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, log, record.notes, steps)
     return summary(inspection)
+
+
+def _judgements(inspection: Inspection) -> list[tuple[str, str, str]]:
+    return [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
 
 
 def _headline(record: Record) -> str:
     sampling, count = record.statistics.sampling, len(record.segments)
-    span = float(sum(record.time[s][-1] - record.time[s][0] for s in record.segments)) + count * record.sample_period
+    span = float(sum(np.ptp(record.time[part]) for part in record.segments)) + count * record.sample_period
     stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
     parts = "one segment" if count == 1 else f"{count} segments"
     return f"{len(record.time)} samples, {span:.4g} s every {1e3 * record.sample_period:.5g} ms, {stamps}, {parts}"
 
 
-_CHANNEL_COLUMNS = ("channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew")
-
-
-def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
+def _channel_table(record: Record) -> list[tuple[str, ...]]:
+    """Header and rows of the table of channels."""
+    rows = [("channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew")]
     for name, c in record.statistics.channels.items():
         skew = "–" if c.skew is None or c.skew_error is None else f"{1e3 * c.skew:.2g} ± {1e3 * c.skew_error:.1g} ms"
-        yield (
+        rows.append((
             name, c.unit, f"{c.least:.4g}", f"{c.largest:.4g}", f"{c.resolution:.3g}" if c.resolution else "–",
             f"{c.noise:.2g}", f"{c.bandwidth:.3g} Hz" if c.bandwidth else "–",
             f"{100 * c.saturated:.2g} %" if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
-        )  # fmt: skip
+        ))  # fmt: skip
+    return rows
 
 
-def summary(inspection: Inspection) -> list[str]:
+def summary(inspection: Inspection) -> Lines:
     """The log: channels and what can be identified, in tables of 80 columns, and as many remarks as there is room for."""
     record = inspection.record
     lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.describe_sizes(), ""]
-    columns = list(zip(_CHANNEL_COLUMNS, *_channel_rows(record), strict=True))
+    columns = zip(*_channel_table(record), strict=True)
     lines += format_table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
-    lines += [
-        "",
-        *format_descriptions(
-            [("identifies", "", ""), *((j.quantity, j.answer, j.reason) for j in inspection.identifiability)]
-        ),
-    ]
+    lines += ["", *format_descriptions([("identifies", "", ""), *_judgements(inspection)])]
     room = max(_LINES - len(lines) - 1, _REMARKS)
     notes = list(record.notes)
     if len(notes) > room:
         notes = [*notes[: room - 1], f"... and {len(notes) - room + 1} more remarks in the report"]
-    return [*lines, *([""] if notes else []), *notes]
+    return [*lines, "", *notes] if notes else lines
 
 
 @style()
@@ -100,35 +114,35 @@ def draw_inspection(inspection: Inspection) -> list[Drawn]:
 
 
 def _values(record: Record) -> dict[str, np.ndarray]:
-    found = {} if record.torque is None else {"u": record.torque}
-    found |= {POSITION_CHANNELS[side]: values for side, values in record.positions.items()}
-    return found if record.transmitted is None else found | {"transmitted": record.transmitted}
+    positions = {POSITION_CHANNELS[side]: values for side, values in record.positions.items()}
+    values = {"u": record.torque, **positions, "transmitted": record.transmitted}
+    return {name: signal for name, signal in values.items() if signal is not None}
 
 
-def _shown(record: Record, segments: Sequence[slice]) -> np.ndarray:
+def _thin(record: Record, segments: Sequence[slice]) -> np.ndarray:
     """Indices of samples: no more than a page shows, in proportion to the segments."""
-    every = max(len(record.time) // _POINTS, 1)
-    return np.concatenate([np.arange(one.start, one.stop, every) for one in segments])
+    step = max(len(record.time) // _POINTS, 1)
+    return np.concatenate([np.arange(segment.start, segment.stop, step) for segment in segments])
 
 
 def _channels(record: Record) -> Drawn:
-    values = _values(record)
-    side = main_side(record)
-    unit = record.statistics.channels[POSITION_CHANNELS[side]].unit
-    channels = [(_CHANNELS[n][0], record.statistics.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
-    rows = [*channels, (f"{side} velocity", f"{unit}/s", compute_velocity(record, side), COLOURS[3])]
-    figure, axes = stacked(len(rows), 1.5, width=7.0)
-    for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
+    side, channels = main_side(record), record.statistics.channels
+    panels = [(signal, *_CHANNELS[name], channels[name].unit) for name, signal in _values(record).items()]
+    unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
+    panels.append((compute_velocity(record, side), f"{side} velocity", PURPLE, unit))
+    figure, axes = stacked(len(panels), 1.5, width=7.0)
+    for ax, (signal, label, colour, unit) in zip(axes, panels, strict=True):
         for segment in record.segments:
-            at = _shown(record, [segment])
-            ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
+            samples = _thin(record, [segment])
+            ax.plot(record.time[samples], signal[samples], color=colour, lw=0.9)
         ax.set_ylabel(f"{label}\n({unit})")
-    caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
-    return Drawn("channels", figure, caption)
+    return Drawn(
+        "channels", figure, f"The channels over time, and the velocity by differences of the low-passed {side} position."
+    )
 
 
 def _spectra(record: Record) -> Drawn:
-    values = {n: v for n, v in _values(record).items() if np.ptp(v)}
+    values = {name: signal for name, signal in _values(record).items() if np.ptp(signal)}
     part = longest_segment(record.segments)
     figure, axes = stacked(len(values), 2.1, "frequency (Hz)", width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
@@ -141,85 +155,87 @@ def _spectra(record: Record) -> Drawn:
             floor = channel.noise * np.sqrt(2.0 * record.sample_period)
             ax.axhline(floor, color="#555555", lw=1.0, ls="--", label=f"noise {channel.noise:.2g} {channel.unit} rms")
         if channel.bandwidth:
-            what = "of velocity's power" if name.startswith("theta") else "of power"
-            label = f"95 % {what} below {channel.bandwidth:.3g} Hz"
+            power = "of velocity's power" if name.startswith("theta") else "of power"
+            label = f"95 % {power} below {channel.bandwidth:.3g} Hz"
             ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
         if channel.noise or channel.bandwidth:
             legend(ax, 2)
-    caption = "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
-    return Drawn("spectra", figure, caption)
+    return Drawn(
+        "spectra", figure, "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
+    )
 
 
 def _torque_over_velocity(record: Record) -> Drawn:
     assert record.torque is not None
-    side = main_side(record)
-    channel = record.statistics.channels[POSITION_CHANNELS[side]]
-    dynamics = record.statistics.dynamics
+    side, channels, dynamics = main_side(record), record.statistics.channels, record.statistics.dynamics
+    channel, period = channels[POSITION_CHANNELS[side]], record.sample_period
     speed = compute_velocity(record, side)
-    torque, label, less, edge = record.torque.copy(), "torque u", "", 0
+    torque, label, edge = record.torque.copy(), "torque u", 0
+    caption = "Torque over velocity: friction, as far as this log shows it."
     if dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05:
-        for s in record.segments:
+        inertia, bandwidth = dynamics.values[0], 4.0 * channel.bandwidth
+        for segment in record.segments:
             # the same low-pass as that of the acceleration
-            torque[s] = low_pass(torque[s], 4.0 * channel.bandwidth, record.sample_period)
-            torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
+            torque[segment] = low_pass(torque[segment], bandwidth, period)
+            torque[segment] -= inertia * np.gradient(speed[segment], period)
         label = "u less inertia torque"
-        less = f" Less the torque of an inertia of {dynamics.values[0]:.4g}: a rough estimate, not an identification."
+        caption += f" Less the torque of an inertia of {inertia:.4g}: a rough estimate, not an identification."
         # transients of the filter
-        edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
+        edge = round(1.0 / (bandwidth * period))
     figure, (ax,) = subplots(7.0, 3.4)
-    inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
-    at = _shown(record, inner or record.segments)
-    ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
-    ax.axhline(0.0, color=FAINT, lw=0.8)
+    inner = [slice(part.start + edge, part.stop - edge) for part in record.segments if part.stop - part.start > 4 * edge]
+    samples = _thin(record, inner or record.segments)
+    ax.plot(speed[samples], torque[samples], ".", ms=1.6, color=BLUE, alpha=0.5)
+    draw_zero(ax)
     ax.axvline(0.0, color=FAINT, lw=0.8)
     # a few samples at sharp corners of the motion would set the scale
-    ends = limits(torque[at], share=0.002, room=0.15)
-    torque_unit = record.statistics.channels["u"].unit
-    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({torque_unit})", ylim=ends)
-    return Drawn("torque_over_velocity", figure, f"Torque over velocity: friction, as far as this log shows it.{less}")
+    ends = limits(torque[samples], share=0.002, room=0.15)
+    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({channels['u'].unit})", ylim=ends)
+    return Drawn("torque_over_velocity", figure, caption)
 
 
 def _twist(inspection: Inspection) -> Drawn:
     record, twist = inspection.record, inspection.twist
     assert twist is not None
-    unit = record.statistics.channels["theta_e"].unit
-    torque = record.torque if record.transmitted is None else record.transmitted
-    panels = [(record.positions["load"], f"load position θs ({record.statistics.channels['theta_s'].unit})")]
+    channels = record.statistics.channels
+    panels = [(record.positions["load"], f"load position θs ({channels['theta_s'].unit})")]
+    name = "u" if record.transmitted is None else "transmitted"
+    torque = _values(record).get(name)
     if torque is not None and np.ptp(torque):
-        name = "u" if record.transmitted is None else "transmitted"
-        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({record.statistics.channels[name].unit})"))
+        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({channels[name].unit})"))
     figure, axes = subplots(7.0, 3.6, columns=len(panels), sharey=True)
-    at = _shown(record, record.segments)
+    samples = _thin(record, record.segments)
     gearing = record.statistics.gearing
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")
-        chosen = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
+        chosen = np.searchsorted(gearing.flank_times, record.time[samples]) % 2 == 0
     else:
         split, names = "the direction of motion", ("forwards", "backwards")
-        chosen = compute_velocity(record, "load")[at] > 0.0
+        chosen = compute_velocity(record, "load")[samples] > 0.0
     for ax, (x, label) in zip(axes, panels, strict=True):
-        for rows, colour, name in zip((at[chosen], at[~chosen]), COLOURS, names, strict=False):
+        for rows, colour, name in zip((samples[chosen], samples[~chosen]), COLOURS, names, strict=False):
             ax.plot(x[rows], twist[rows], ".", ms=1.8, color=colour, alpha=0.6, label=name)
         ax.set_xlabel(label)
-    axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
+    axes[0].set_ylabel(f"θe − N₀ θs about its median ({channels['theta_e'].unit})")
     legend(axes[-1], 2, markerscale=5)
-    caption = (
+    return Drawn(
+        "twist",
+        figure,
         f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {split}. Over torque: the loop's "
         "width shows lost motion and friction, its slope compliance. Over position: a periodic twist shows eccentricity of "
-        "encoders or gears."
+        "encoders or gears.",
     )
-    return Drawn("twist", figure, caption)
 
 
 def _intervals(record: Record) -> Drawn:
-    ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
-    inside = record.intervals <= GAP_PERIODS * record.statistics.sampling.median_period
-    ends, intervals = ends[inside], intervals[inside]
+    median = record.statistics.sampling.median_period
+    inside = record.intervals <= GAP_PERIODS * median
+    ends, intervals = np.cumsum(record.intervals)[inside], 1e3 * record.intervals[inside]
     figure, (left, right) = subplots(7.0, 2.6, columns=2, width_ratios=(3, 1), sharey=True)
-    left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
-    left.axhline(1e3 * record.statistics.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
+    left.plot(ends, intervals, ".", ms=2.0, color=BLUE)
+    left.axhline(1e3 * median, color=VERMILION, lw=1.0, ls="--", label="median")
     left.set(xlabel="time (s)", ylabel="interval\n(ms)")
     legend(left)
-    right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])
+    right.hist(intervals, bins=60, orientation="horizontal", color=BLUE)
     right.set(xlabel="samples (1)")
     return Drawn("intervals", figure, "Intervals between raw time stamps, before resampling; gaps are left out.")

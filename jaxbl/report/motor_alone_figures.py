@@ -6,7 +6,7 @@ import numpy as np
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.identify import Identification
 
-from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, style, subplots
+from .figures import BLACK, BLUE, FAINT, VERMILION, Drawn, legend, limits, style, subplots
 
 _CLOUD = 6000
 """Points of a cloud at most."""
@@ -14,63 +14,51 @@ _GAP = "#F3E3A1"
 
 
 @style()
-def draw_motor_alone(found: Identification | Diagnosis) -> list[Drawn]:
+def draw_motor_alone(result: Identification | Diagnosis) -> list[Drawn]:
     """Torque over twist, and the fit over the half gap; nothing where the model has no gap to be found."""
-    if found.summary.get("backlash") is None:
+    if result.summary.get("backlash") is None:
         return []
-    return [_hysteresis(found), _profile(found)]
+    return [_hysteresis(result), _profile(result)]
 
 
-def _hysteresis(found: Identification | Diagnosis) -> Drawn:
-    trace, unit = found.trace, found.record.unit_of("motor.position", "rad")
-    force = found.record.unit_of("motor.torque", "N m")
-    plant = found.model.build().plant
-    twist = trace["theta_e"].to_numpy() - float(plant.drive.ratio("load")) * trace["load.modelled_position"].to_numpy()
+def _hysteresis(result: Identification | Diagnosis) -> Drawn:
+    unit, torque_unit = result.record.unit_of("motor.position", "rad"), result.record.unit_of("motor.torque", "N m")
+    trace = result.trace.iloc[len(result.trace) // 10 :: max(1, len(result.trace) // _CLOUD)]
+    ratio = float(result.model.build().plant.drive.ratio("load"))
+    twist = (trace["theta_e"] - ratio * trace["load.modelled_position"]).to_numpy()
     by_motor, law = trace["torque_by_motor"].to_numpy(), trace["torque"].to_numpy()
-    rows = np.arange(len(twist) // 10, len(twist))[:: max(1, len(twist) // _CLOUD)]
     figure, (ax,) = subplots(9.0, 4.4)
-    ax.plot(
-        twist[rows],
-        by_motor[rows],
-        ".",
-        ms=2.5,
-        mew=0.0,
-        color=SIDE_COLOURS["motor"],
-        alpha=0.5,
-        label="by the motor's side",
-    )
-    ax.plot(twist[rows], law[rows], ".", ms=2.0, mew=0.0, color=COLOURS[6], label="model")
-    half = found.summary["backlash"]["half_gap"]
+    ax.plot(twist, by_motor, ".", ms=2.5, mew=0.0, color=BLUE, alpha=0.5, label="by the motor's side")
+    ax.plot(twist, law, ".", ms=2.0, mew=0.0, color=BLACK, label="model")
+    half = result.summary["backlash"]["half_gap"]
     if half:
         ax.axvspan(-half, half, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=f"gap: half width {half:.4g} {unit}")
-    ax.set(
-        xlabel=f"twist θe − N₀ θs, the load's position by the model ({unit})", ylabel=f"torque in the gear ({force})",
-        xlim=limits(twist[rows]), ylim=limits(by_motor[rows], law[rows]),
-    )  # fmt: skip
+    ax.set(xlabel=f"twist θe − N₀ θs, the load's position by the model ({unit})", xlim=limits(twist))
+    ax.set(ylabel=f"torque in the gear ({torque_unit})", ylim=limits(by_motor, law))
     legend(ax, 3, markerscale=4.0)
-    caption = (
+    return Drawn(
+        "hysteresis",
+        figure,
         "Torque in the gear over the twist. Blue: what the motor's torque, smoothed acceleration and friction leave for the "
         "gear, which uses the motor's encoder only. Black: the model. Within the gap the motor drives nothing but itself. "
-        "Smoothing rounds the impacts."
+        "Smoothing rounds the impacts.",
     )
-    return Drawn("hysteresis", figure, caption)
 
 
-def _profile(found: Identification | Diagnosis) -> Drawn:
-    said, unit = found.summary["backlash"], found.record.unit_of("motor.position", "rad")
+def _profile(result: Identification | Diagnosis) -> Drawn:
+    gap, unit = result.summary["backlash"], result.record.unit_of("motor.position", "rad")
     figure, (ax,) = subplots(9.0, 3.6)
-    half, deviance = np.array(said["starts"], float).T
+    half, deviance = np.array(gap["starts"], float).T
     ax.loglog(half, np.maximum(deviance, 0.1), "o-", color=FAINT, ms=4, lw=1.0, label="begun at this half gap, first fits")
-    if said["shown"]:
-        ax.axvline(
-            said["half_gap"], color=COLOURS[0], lw=1.2, label=f"half gap of the last fit: {said['half_gap']:.4g} {unit}"
-        )
+    if gap["shown"]:
+        ax.axvline(gap["half_gap"], color=BLUE, lw=1.2, label=f"half gap of the last fit: {gap['half_gap']:.4g} {unit}")
     else:
-        ax.axvline(said["at_most"], color=COLOURS[1], lw=1.2, label=f"not ruled out: up to {said['at_most']:.3g} {unit}")
+        ax.axvline(gap["at_most"], color=VERMILION, lw=1.2, label=f"not ruled out: up to {gap['at_most']:.3g} {unit}")
     ax.set(xlabel=f"half gap ({unit} at the motor)", ylabel="−2 log likelihood\nabove the least")
     legend(ax, 3)
-    caption = (
+    return Drawn(
+        "half_gaps",
+        figure,
         "How well half gaps fit: minus twice the log-likelihood of short fits begun at each, above that of the best. A "
-        "clear valley is a gap that the log shows; without one any gap would do."
+        "clear valley is a gap that the log shows; without one any gap would do.",
     )
-    return Drawn("half_gaps", figure, caption)

@@ -22,12 +22,14 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, write_atomic
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines, NextStep
 
 from .figures import Drawn, save
 from .picture import Picture, picture
 
 if TYPE_CHECKING:
+    from jaxbl.config import Config
     from jaxbl.diagnosis.diagnose import Diagnosis
     from jaxbl.identification.element import ElementIdentification
     from jaxbl.identification.identify import Identification
@@ -41,22 +43,40 @@ class PageTable(NamedTuple):
     rows: Sequence[Sequence[object]]
 
 
+def number_line(path: str, number: JsonObject, condition: str = "") -> str:
+    """A number that was found, in a sentence: value, standard error, unit, interval, and on what condition that holds."""
+    low, high = number["interval"]
+    unit = f" {number['unit']}" if number.get("unit") else ""
+    reach = "for noise alone" if low is None else f"95 %: {low:.5g} to {high:.5g}{condition}"
+    return f"{path} = {number['value']:.5g} ± {number['standard_error']:.2g}{unit}, {reach}."
+
+
+NUMBER_COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
+
+
+def number_row(path: str, number: JsonObject) -> list[object]:
+    """Cells of a number that was found, below `NUMBER_COLUMNS`."""
+    return [path, number["value"], number["standard_error"], *number["interval"]]
+
+
 def write_report(
     folder: Path,
     title: str,
     lead: Sequence[str],
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
-    config: str,
+    config: "Config | str",
     remarks: Sequence[str] = (),
     steps: Sequence[NextStep] = (),
 ) -> Lines:
     """Write figures into `figures/`, and `report.html` with what was found (`lead`), remarks, and what to try next.
 
-    Returns lead and remarks, the lines for the terminal.
+    A study's own title takes the place of `title`. Returns lead and remarks, the lines for the terminal.
     """
+    if not isinstance(config, str):
+        title, config = config.title or title, config.to_toml()
     save_all(drawn, folder)
-    page = html(title, lead, remarks, [(one.name, picture(one)) for one in drawn], tables, config, steps)
+    page = html(title, lead, remarks, [(figure.name, picture(figure)) for figure in drawn], tables, config, steps)
     write_atomic(folder / "report.html", page)
     return [*lead, *remarks]
 
@@ -64,11 +84,11 @@ def write_report(
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     """Write figures into the folder's `figures/`. Returns their files and captions."""
     with catch_write_errors(folder):
-        return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
+        return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
 
 
 def write_results(
-    found: "Identification | Diagnosis | ElementIdentification",
+    result: "Identification | Diagnosis | ElementIdentification",
     folder: Path,
     name: str,
     title: str,
@@ -84,17 +104,15 @@ def write_results(
     The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
     for the terminal.
     """
-    from jaxbl.identification.element import ElementIdentification
-
     with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
-        found.trace.to_parquet(draft / "trace.parquet", index=False)
-        if not isinstance(found, ElementIdentification):
-            model = format_model(found, draft / "trace.parquet")
+        result.trace.to_parquet(draft / "trace.parquet", index=False)
+        # that of a transmission alone is given
+        model = model or format_model(result, draft / "trace.parquet")  # pyright: ignore[reportArgumentType]
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
-        write_atomic(draft / f"{name}.json", json_with_checksum(found.summary))
-        for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
+        write_atomic(draft / f"{name}.json", json_with_checksum(result.summary))
+        for file in sorted(draft.rglob("*"), key=lambda file: file.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)
                 target.parent.mkdir(exist_ok=True)
@@ -102,17 +120,17 @@ def write_results(
     return lines
 
 
-def format_model(found: "Identification | Diagnosis", trace: Path) -> str:
+def format_model(result: "Identification | Diagnosis", trace: Path) -> str:
     """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
     from jaxbl.gains.machine_study import complete_study
     from jaxbl.identification.logs import run_of
 
-    data, record = found.model.to_dict(), found.record
-    if found.replays:
-        data["run"] |= run_of(found.model, record) | {"duration": float(f"{record.time[-1] + record.sample_period:.9g}")}
+    data, record = result.model.to_dict(), result.record
+    if result.replays:
+        data["run"] |= run_of(result.model, record) | {"duration": float(f"{record.time[-1] + record.sample_period:.9g}")}
         data["excitation"] = {"kind": "recorded", "file": str(trace.resolve()), "time_column": "t", "torque_column": "u"}
-    data = complete_study(data, record, found.config)
-    if found.replays:
+    data = complete_study(data, record, result.config)
+    if result.replays:
         data["excitation"]["file"] = trace.name
     return tomli_w.dumps(data)
 
@@ -134,14 +152,14 @@ def html(
     script = "\n".join(scripts)
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
-    ranks = ["lead answer", *("lead" for _ in lead[1:])]
-    parts = [f'<p class="{rank}">{escape(line)}</p>' for rank, line in zip(ranks, lead, strict=False)]
+    parts = [f'<p class="lead{"" if i else " answer"}">{escape(line)}</p>' for i, line in enumerate(lead)]
     if remarks:
         parts += ["<h2>Remarks</h2><ul>", *(f"<li>{escape(line)}</li>" for line in remarks), "</ul>"]
     if steps:
-        parts += ["<h2>What to try next</h2><dl>", *map(_step, steps), "</dl>"]
+        pairs = (f"<dt>{escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>" for step in steps)
+        parts += ["<h2>What to try next</h2><dl>", *pairs, "</dl>"]
     if pictures:
-        parts += ["<h2>Figures</h2>", *(_figure(name, one) for name, one in pictures)]
+        parts += ["<h2>Figures</h2>", *(_figure(name, picture) for name, picture in pictures)]
     parts += map(_table, tables)
     parts.append(f"<h2>Config</h2><details><summary>study.toml</summary><pre>{escape(config)}</pre></details>")
     return f"""<!doctype html>
@@ -154,19 +172,15 @@ def html(
 """
 
 
-def _step(one: NextStep) -> str:
-    return f"<dt>{escape(one.answers)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
-
-
-def _figure(name: str, shown: Picture) -> str:
-    width, height = shown.size
+def _figure(name: str, picture: Picture) -> str:
+    width, height = picture.size
     # a script of data ends where the next tag of that name begins, whatever it holds
-    panels = json.dumps(shown.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
-    image = f'<img src="{shown.source}" alt="{escape(shown.described)}" width="{width}" height="{height}">'
+    panels = json.dumps(picture.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    image = f'<img src="{picture.source}" alt="{escape(picture.described)}" width="{width}" height="{height}">'
     label = "figure: arrow keys read values, plus and minus zoom, 0 shows the whole"
     return (
         f'<figure data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '
-        f'style="width:{width}px">{image}</div><figcaption>{escape(shown.caption)}</figcaption>'
+        f'style="width:{width}px">{image}</div><figcaption>{escape(picture.caption)}</figcaption>'
         f'<script type="application/json">{panels}</script></figure>'
     )
 
@@ -182,7 +196,7 @@ def _table(table: PageTable) -> str:
 
 
 def _cell(value: object) -> str:
-    if isinstance(value, bool) or value is None:
+    if isinstance(value, bool | None):
         value = {True: "yes", False: "no", None: "–"}[value]
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
@@ -192,11 +206,11 @@ def _cell(value: object) -> str:
 
 
 def _origin() -> str:
-    """What made the page: versions, and the command, if it was one."""
+    """Say what made the page: versions, and the command, if it was one."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("jaxbl", "jax", "numpy"))
-    made = f"Made by {versions}, Python {platform.python_version()}"
+    origin = f"Made by {versions}, Python {platform.python_version()}"
     program = Path(sys.argv[0]).parts
     # `jaxbl`, or `python -m jaxbl`
     if sys.argv[1:] and (program[-1:] == ("jaxbl",) or program[-2:] == ("jaxbl", "__main__.py")):
-        return f"{made}, with: {shlex.join(['jaxbl', *sys.argv[1:]])}"
-    return f"{made}."
+        return f"{origin}, with: {shlex.join(['jaxbl', *sys.argv[1:]])}"
+    return f"{origin}."

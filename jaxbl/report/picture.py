@@ -2,7 +2,6 @@
 
 import base64
 import math
-from collections.abc import Iterator
 from io import BytesIO
 from typing import Any, NamedTuple
 
@@ -14,7 +13,6 @@ from matplotlib.colors import to_hex
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from jaxbl.json_types import JsonObject
@@ -58,7 +56,7 @@ def picture(drawn: Drawn) -> Picture:
     axes = [ax for ax in figure.axes if ax.get_visible() and ax not in bars]
     for ax in axes:
         for artist in ax.get_children():
-            if _marks(artist) > _MOST_MARKS:
+            if _count_marks(artist) > _MOST_MARKS:
                 # one by one they would be larger than an image of them
                 artist.set_rasterized(True)
     file = BytesIO()
@@ -67,23 +65,19 @@ def picture(drawn: Drawn) -> Picture:
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     value = next((_plain(bar.get_ylabel() or bar.get_xlabel()) for bar in bars), None)
-    share = _share(axes)
-    panels = [_panel(figure, ax, value, share) for ax in axes]
-    described = " ".join([drawn.caption, *(_described(panel) for panel in panels[:6])])
+    # of the points of each line every n-th is kept, so that a page stays small
+    count = sum(len(_xy(line)) for ax in axes for line in _lines(ax))
+    step = max(math.ceil(2 * count / _MOST_VALUES), 1)
+    panels = [_panel(figure, ax, value, step) for ax in axes]
+    described = " ".join([drawn.caption, *map(_describe, panels[:6])])
     return Picture(file.getvalue(), (width, height), drawn.caption, described, panels)
 
 
-def _marks(artist: Any) -> int:
+def _count_marks(artist: Any) -> int:
     """Markers that an artist draws."""
     if isinstance(artist, Line2D) and artist.get_marker() not in ("None", "", " ", None):
         return len(_xy(artist))
     return len(np.asarray(artist.get_offsets())) if isinstance(artist, PathCollection) else 0
-
-
-def _share(axes: list[Axes]) -> int:
-    """Of the points of each line, every n-th is kept, so that a page stays small."""
-    count = sum(len(_xy(line)) for ax in axes for line in _lines(ax))
-    return max(math.ceil(2 * count / _MOST_VALUES), 1)
 
 
 def _xy(line: Line2D) -> np.ndarray:
@@ -96,70 +90,59 @@ def _lines(ax: Axes) -> list[Line2D]:
     return [line for line in ax.get_lines() if line.get_transform() == ax.transData and len(_xy(line))]
 
 
-def _panel(figure: Figure, ax: Axes, value: str | None, every: int) -> JsonObject:
-    """What a page needs to read values off axes.
+def _panel(figure: Figure, ax: Axes, value: str | None, step: int) -> JsonObject:
+    """The numbers that a page needs to read values off axes.
 
     Place (left, top, width, height) as shares of the figure; label, ends, scale and named ticks of both axes; lines (names,
     x and y); the cells of a map (edges along x and y, values by row); bars (left, bottom, width, height).
     """
     place = ax.get_position()
     panel: JsonObject = {
-        "place": [round(float(one), 5) for one in (place.x0, 1.0 - place.y1, place.width, place.height)],
+        "place": [round(float(number), 5) for number in (place.x0, 1.0 - place.y1, place.width, place.height)],
         "title": _plain(ax.get_title() or ax.get_title("left")).replace("\n", ", "),
-        "x": _axis(ax.xaxis, ax.get_xlim()),
-        "y": _axis(ax.yaxis, ax.get_ylim()),
-        "lines": [_line(line, every) for line in _lines(ax)],
     }
-    for label in ("x", "y"):
-        if not panel[label]["label"]:
-            # shared axes are named once, on the outer panels
-            shared = (getattr(one, f"get_{label}label")() for one in figure.axes if one in _siblings(ax, label))
-            panel[label]["label"] = next((_plain(text) for text in shared if text), "")
+    for name, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
+        panel[name] = _axis(getattr(ax, f"{name}axis"))
+        # shared axes are named once, on the outer panels
+        siblings = shared.get_siblings(ax)
+        labels = (getattr(other, f"get_{name}label")() for other in figure.axes if other in siblings)
+        panel[name]["label"] = panel[name]["label"] or next((_plain(label) for label in labels if label), "")
+    panel["lines"] = [_line(line, step) for line in _lines(ax)]
     # without a colour bar cells are a cloud behind lines
-    for mesh in ax.collections if value is not None else ():
-        if isinstance(mesh, QuadMesh):
-            corners = np.asarray(mesh.get_coordinates())
-            cells = np.ma.filled(np.ma.masked_invalid(np.ma.asarray(mesh.get_array(), float)), np.nan)
-            if cells.size <= _MOST_VALUES and cells.ndim == 2:
-                panel["cells"] = {
-                    "name": value,
-                    "x": packed(corners[0, :, 0]),
-                    "y": packed(corners[:, 0, 1]),
-                    "values": packed(cells.ravel()),
-                }
-            break
-    bars = [(*one.get_xy(), one.get_width(), one.get_height()) for one in _bars(ax)]
+    mesh = next((mesh for mesh in ax.collections if isinstance(mesh, QuadMesh)), None)
+    if mesh is not None and value is not None:
+        corners = np.asarray(mesh.get_coordinates())
+        cells = np.ma.filled(np.ma.masked_invalid(np.ma.asarray(mesh.get_array(), float)), np.nan)
+        if cells.size <= _MOST_VALUES and cells.ndim == 2:
+            edges = {"x": packed(corners[0, :, 0]), "y": packed(corners[:, 0, 1])}
+            panel["cells"] = {"name": value, **edges, "values": packed(cells.ravel())}
+    # those of bar charts and histograms of bars, not what marks a stretch of an axis
+    bars = [
+        (*bar.get_xy(), bar.get_width(), bar.get_height())
+        for container in ax.containers
+        if isinstance(container, BarContainer)
+        for bar in container.patches
+    ]
     panel["bars"] = [[float(f"{number:.6g}") for number in bar] for bar in bars if np.all(np.isfinite(bar))]
     return panel
 
 
-def _bars(ax: Axes) -> Iterator[Rectangle]:
-    """Those of bar charts and histograms of bars, not what marks a stretch of an axis."""
-    for container in ax.containers:
-        if isinstance(container, BarContainer):
-            yield from container.patches
-
-
-def _siblings(ax: Axes, label: str) -> list[Axes]:
-    shared = ax.get_shared_x_axes() if label == "x" else ax.get_shared_y_axes()
-    return shared.get_siblings(ax)
-
-
-def _axis(axis: Any, ends: tuple[float, float]) -> JsonObject:
-    found: JsonObject = {
+def _axis(axis: Any) -> JsonObject:
+    content: JsonObject = {
         "label": _plain(axis.label.get_text()).replace("\n", " "),
-        "ends": [float(f"{end:.8g}") for end in ends],
+        "ends": [float(f"{end:.8g}") for end in axis.get_view_interval()],
         "log": axis.get_scale() == "log",
     }
     if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
         texts = [_plain(label.get_text()).replace("\n", ", ") for label in axis.get_majorticklabels()]
-        found["names"] = [[float(at), text] for at, text in zip(axis.get_majorticklocs(), texts, strict=False) if text]
-    return found
+        ticks = zip(axis.get_majorticklocs(), texts, strict=False)
+        content["names"] = [[float(place), text] for place, text in ticks if text]
+    return content
 
 
-def _line(line: Line2D, every: int) -> JsonObject:
+def _line(line: Line2D, step: int) -> JsonObject:
     label = str(line.get_label())
-    x, y = _xy(line)[::every].T
+    x, y = _xy(line)[::step].T
     return {
         "name": "" if label.startswith("_") else _plain(label),
         "colour": to_hex(line.get_color() if line.get_linestyle() != "None" else line.get_markerfacecolor()),
@@ -174,8 +157,8 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 def packed(values: Any) -> str:
     """Numbers for a page: float32, little-endian, in base64; the largest where they are larger."""
-    held = np.clip(np.asarray(values, float), -_LARGEST, _LARGEST)
-    return base64.b64encode(held.astype("<f4").tobytes()).decode()
+    clipped = np.clip(np.asarray(values, float), -_LARGEST, _LARGEST)
+    return base64.b64encode(clipped.astype("<f4").tobytes()).decode()
 
 
 def _plain(text: str) -> str:
@@ -183,7 +166,7 @@ def _plain(text: str) -> str:
     return text.replace(r"\$", "$")
 
 
-def _described(panel: JsonObject) -> str:
+def _describe(panel: JsonObject) -> str:
     """One panel in words."""
     head = f"{panel['title']}: " if panel["title"] else ""
     axes = [

@@ -34,7 +34,8 @@ from .tune import draw_tuning, write_tune_report
 from .verify import draw_verdict, write_verify_report
 from .watch import draw_watch, write_watch_report
 
-_KINDS: dict[type, tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], list[str]]]] = {
+_Functions = tuple[Callable[[Any], list[Drawn]], Callable[..., list[str]]]
+_KINDS: dict[type, _Functions] = {
     Trial: (draw_trial, write_trial_report),
     StudyResult: (draw_study, write_sweep_report),
     Tuning: (draw_tuning, write_tune_report),
@@ -57,10 +58,10 @@ class Drawings(list[Drawn]):
 
 def _figure(drawn: Drawn) -> str:
     lay_out(drawn.figure)
-    shown = picture(drawn)
+    image = picture(drawn)
     return (
-        f'<figure><img src="{shown.source}" alt="{escape(shown.described)}" style="max-width:100%">'
-        f"<figcaption>{escape(shown.caption)}</figcaption></figure>"
+        f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
+        f"<figcaption>{escape(image.caption)}</figcaption></figure>"
     )
 
 
@@ -75,7 +76,7 @@ def draw(result: Any, *names: str) -> Drawings:
     Raises:
         InputError: no result of these, or no figure of that name.
     """
-    drawn = {one.name: one for one in _of(result)[0](result)}
+    drawn = {figure.name: figure for figure in _functions_for(result)[0](result)}
     if unknown := [name for name in names if name not in drawn]:
         raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], drawn)}")
     return Drawings(drawn[name] for name in names or drawn)
@@ -92,21 +93,20 @@ def write_report(result: Any, folder: str | Path) -> list[str]:
         InputError: no result of these.
         NoResult: the files cannot be written.
     """
-    write = writer(result)
-    where = to_path(folder)
-    with catch_write_errors(where):
-        where.mkdir(parents=True, exist_ok=True)
-    return write(result, where)
+    write, place = writer(result), to_path(folder)
+    with catch_write_errors(place):
+        place.mkdir(parents=True, exist_ok=True)
+    return write(result, place)
 
 
 def writer(result: Any) -> Callable[..., list[str]]:
-    """What writes the report of a result into a folder that exists. Raises `InputError`."""
-    return _of(result)[1]
+    """The function that writes the report of a result into a folder that exists. Raises `InputError`."""
+    return _functions_for(result)[1]
 
 
-def _of(result: Any) -> tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], list[str]]]:
+def _functions_for(result: Any) -> _Functions:
     for kind, functions in _KINDS.items():
         if isinstance(result, kind):
             return functions
-    known = ", ".join(kind.__name__ for kind in _KINDS)
-    raise InputError(f"no report of {type(result).__name__}; a result should be one of {known}")
+    kinds = ", ".join(kind.__name__ for kind in _KINDS)
+    raise InputError(f"no report of {type(result).__name__}; a result should be one of {kinds}")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
+from pandas import DataFrame
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.files import write_json, write_table
@@ -11,11 +11,24 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
 from .error_plane import error_plane
-from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, stacked, style, subplots, with_unit
+from .figures import (
+    BLACK,
+    BLUE,
+    SIDE_COLOURS,
+    SIDES,
+    VERMILION,
+    Drawn,
+    draw_zero,
+    legend,
+    stacked,
+    style,
+    subplots,
+    with_unit,
+)
 from .gain_plane import conditions_line, draw_gain_plane
 from .page import PageTable, write_report
 
-_TRUE, _OBSERVED = COLOURS[6], COLOURS[1]
+_TRUE, _OBSERVED = BLACK, VERMILION
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
 
@@ -25,27 +38,24 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     # the summary first: it is what makes the folder this study's
     write_json(folder / "summary.json", trial.summary)
     write_table(folder / "trace.parquet", trial.trace)
-    metrics = trial.summary["metrics"]
+    summary, metrics = trial.summary, trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
     rows = [
-        [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
-        for name, about in SIDE_METRICS.items()
+        [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
+        for name, metric in SIDE_METRICS.items()
         if f"motor.{name}" in metrics
     ]
     tables = [PageTable("Metrics", ["", *sides, "unit", "meaning"], rows)]
     lead = []
-    if identified := trial.summary["identified"]:
+    if identified := summary["identified"]:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
         tables.insert(0, PageTable("Identified", ["", "true", *sides], rows))
-        for name, _, *values in rows:
+        for name, true, *values in rows:
             texts = ("undetermined" if value is None else f"{value:.4g}" for value in values)
-            found = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
-            lead.append(f"{name}: {found}; true {identified[name]['true']:.4g}")
-    lead += [
-        conditions_line(side, one, "the true bound along this run") for side, one in trial.summary["conditions"].items()
-    ]
-    title, text = trial.config.title or "Run", trial.config.to_toml()
-    return write_report(folder, title, lead, draw_trial(trial), tables, text, trial.summary["remarks"])
+            pairs = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
+            lead.append(f"{name}: {pairs}; true {true:.4g}")
+    lead += [conditions_line(side, gains, "the true bound along this run") for side, gains in summary["conditions"].items()]
+    return write_report(folder, "Run", lead, draw_trial(trial), tables, trial.config, summary["remarks"])
 
 
 @style()
@@ -54,83 +64,81 @@ def draw_trial(trial: Trial) -> list[Drawn]:
     trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
     sides = [side for side in SIDES if f"{side}.position" in trace]
     drawn = [_input(trace)]
-    for side in sides:
-        drawn += [_observed(trace, side, quantity, unit) for quantity, unit in (("velocity", "rad/s"), ("position", "rad"))]
+    drawn += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
     drawn.append(_torque(trace, sides))
     judged = trial.summary["conditions"]
-    drawn += [draw_gain_plane(side, found) for side, found in judged.items() if found["f_plus"] > 0.0]
-    drawn += [error_plane(trial.trace, side, found) for side, found in judged.items()]
+    drawn += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
+    drawn += [error_plane(trial.trace, side, gains) for side, gains in judged.items()]
     if len(sides) == 2:
         last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
-        drawn += [_identified(trial, trace, last, sides), _hysteresis(last), _limit_cycle(last)]
+        drawn += [_draw_identified(trial, trace, last), _hysteresis(last), _limit_cycle(last)]
     return drawn
 
 
-def _input(trace: pd.DataFrame) -> Drawn:
+def _input(trace: DataFrame) -> Drawn:
     figure, (ax,) = subplots(7.0, 2.4)
     ax.plot(trace["t"], trace["u"], color=_TRUE)
     ax.set(xlabel="time (s)", ylabel="input torque u (N m)")
     return Drawn("input", figure, "Input torque (analogue of Fig. 7).")
 
 
-_FIGURES = {
-    ("motor", "velocity"): "Figs. 8-9",
-    ("motor", "position"): "Figs. 10-11",
-    ("load", "velocity"): "Figs. 12-13",
-    ("load", "position"): "Figs. 14-15",
-}
+_FIGURES = {"motor.velocity": "8-9", "motor.position": "10-11", "load.velocity": "12-13", "load.position": "14-15"}
+_UNITS = {"velocity": "rad/s", "position": "rad"}
 
 
-def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn:
+def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Drawn:
     figure, (above, below) = stacked(2, 1.9, width=7.0)
-    true, estimate = trace[f"{side}.{quantity}"], trace[f"{side}.{quantity}_estimate"]
-    above.plot(trace["t"], estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
-    above.plot(trace["t"], true, color=_TRUE, lw=1.0, label="true")
+    name, unit = f"{side}.{quantity}", _UNITS[quantity]
+    time, true, estimate = (trace[column] for column in ("t", name, f"{name}_estimate"))
+    above.plot(time, estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
+    above.plot(time, true, color=_TRUE, lw=1.0, label="true")
     above.set(ylabel=f"{side} {quantity} ({unit})")
     legend(above, 2)
-    below.plot(trace["t"], true - estimate, color=COLOURS[0])
-    below.axhline(0.0, color=FAINT, lw=0.8)
+    below.plot(time, true - estimate, color=BLUE)
+    draw_zero(below)
     below.set(ylabel=f"error ({unit})")
     return Drawn(
-        f"{side}_{quantity}", figure,
-        f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of {_FIGURES[side, quantity]}).",
-    )  # fmt: skip
+        f"{side}_{quantity}",
+        figure,
+        f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]}).",
+    )
 
 
-def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
+def _torque(trace: DataFrame, sides: list[str]) -> Drawn:
     figure, (above, below) = stacked(2, 1.9, width=7.0)
+    time, torque = trace["t"], trace["torque"]
     for side in sides:
         estimate, colour = trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]
-        above.plot(trace["t"], estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
-        below.plot(trace["t"], trace["torque"] - estimate, color=colour, lw=1.0, alpha=0.75)
-    above.plot(trace["t"], trace["torque"], color=_TRUE, lw=1.0, label="true")
+        above.plot(time, estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
+        below.plot(time, torque - estimate, color=colour, lw=1.0, alpha=0.75)
+    above.plot(time, torque, color=_TRUE, lw=1.0, label="true")
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
     above.set(ylabel=f"{name} (N m)")
     legend(above, 3)
-    below.axhline(0.0, color=FAINT, lw=0.8)
+    draw_zero(below)
     below.set(ylabel="error (N m)")
     return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
 
-def _identified(trial: Trial, trace: pd.DataFrame, last: pd.DataFrame, sides: list[str]) -> Drawn:
-    names = list(trial.summary["identified"])
+def _draw_identified(trial: Trial, trace: DataFrame, last: DataFrame) -> Drawn:
+    identified = trial.summary["identified"]
     # what a law derives from its own parameters is an angle, as they are
     units = units_of(trial.config.build().transmission)
-    figure, axes = stacked(len(names), 2.0, width=7.0)
-    for ax, name in zip(axes, names, strict=True):
-        true = trial.summary["identified"][name]["true"]
-        for side in sides:
+    figure, axes = stacked(len(identified), 2.0, width=7.0)
+    for ax, (name, values) in zip(axes, identified.items(), strict=True):
+        true = values["true"]
+        for side in SIDES:
             ax.plot(trace["t"], trace[f"{side}.{name}"], color=SIDE_COLOURS[side], label=f"{side} identifier")
         ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
         # the estimates of the first half still converge: the second half sets the scale
-        largest = float((last[[f"{side}.{name}" for side in sides]] - true).abs().max(axis=None))
+        largest = float((last[[f"{side}.{name}" for side in SIDES]] - true).abs().max(axis=None))
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
         ax.set(ylabel=with_unit(name.replace("_", " "), units.get(name, "rad")), ylim=(true - reach, true + reach))
     legend(axes[0], 3)
     return Drawn("dead_zone", figure, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 
-def _hysteresis(last: pd.DataFrame) -> Drawn:
+def _hysteresis(last: DataFrame) -> Drawn:
     figure, (left, right) = subplots(7.0, 3.4, columns=2)
     for side in SIDES:
         left.plot(last["z"], last[f"{side}.torque_estimate"], color=SIDE_COLOURS[side], lw=1.6, alpha=0.75, label=side)
@@ -141,14 +149,15 @@ def _hysteresis(last: pd.DataFrame) -> Drawn:
     right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
     right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
     legend(right, 2)
-    caption = (
+    return Drawn(
+        "hysteresis",
+        figure,
         "Torque over twist (chatter and lag of the estimates widen the loop), and load over motor position. Second half of "
-        "the run (analogue of Fig. 17)."
+        "the run (analogue of Fig. 17).",
     )
-    return Drawn("hysteresis", figure, caption)
 
 
-def _limit_cycle(last: pd.DataFrame) -> Drawn:
+def _limit_cycle(last: DataFrame) -> Drawn:
     figure, (left, right) = subplots(7.0, 3.4, columns=2)
     for ax, side, angle in ((left, "motor", "θe"), (right, "load", "θs")):
         position, velocity = last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, numeric_paths
+from jaxbl.config import Config
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains, describe_margins
@@ -22,7 +22,7 @@ from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Distinct, Groups, Rows, spread
 from .figures import SIDES
-from .maps import best_gains, draw, worst_runs
+from .maps import best_gains, draw, slope_text, unit_of, worst_runs
 from .page import PageTable, write_report
 
 
@@ -37,34 +37,37 @@ def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextSt
     Returns:
         The lines for the terminal.
     """
-    laws = accuracy_laws(result)
+    config, laws = result.config, accuracy_laws(result)
     drawn = draw(result, laws)
     survey = _Survey(result)
+    axes = [
+        [path, len(values), *((values.min(), values.max()) if pd.api.types.is_numeric_dtype(values) else "––")]
+        for path, values in survey.values.items()
+    ]
+    tables = [PageTable("Axes", ["path", "values", "least", "largest"], axes), _metric_table(result)]
     if laws:
         write_json(folder / "laws.json", [law.to_dict() for law in laws])
+        tables.insert(0, _law_table(laws))
     else:
         (folder / "laws.json").unlink(missing_ok=True)
-    lead = [*_headline(result, survey), *_law_lines(laws)]
-    tables = [*([_law_table(laws)] if laws else []), _axes_table(survey), _metric_table(result)]
-    config = result.config
-    answer, *more = lead
-    shown = [answer, _studied(config, survey), *more]
-    write_report(folder, config.title or "Study", shown, drawn, tables, config.to_toml(), config.notes, steps)
+    answer, *more = lead = [*headline(result, survey), *_law_lines(laws)]
+    lines = [answer, _describe_study(config, survey), *more]
+    write_report(folder, "Study", lines, drawn, tables, config, config.notes, steps)
     return lead
 
 
 _DRIVES = {"two_inertia": "a drive of two inertias", "rigid": "a rigid drive"}
 
 
-def _studied(config: Config, found: "_Survey") -> str:
-    """What was varied, in a sentence."""
-    units, varied = numeric_paths(config), []
-    for path, values in found.values.items():
+def _describe_study(config: Config, survey: "_Survey") -> str:
+    """Say what was varied, in a sentence."""
+    varied = []
+    for path, values in survey.values.items():
         if not pd.api.types.is_numeric_dtype(values):
             varied.append(f"{path} ({', '.join(map(str, values))})")
         elif len(values) > 1:
-            unit = f" {units[path].unit}" if path in units else ""
-            varied.append(f"{path} ({len(values)} values, {values.min():.4g} to {values.max():.4g}{unit})".rstrip())
+            ends = f"{values.min():.4g} to {values.max():.4g} {unit_of(config, path)}"
+            varied.append(f"{path} ({len(values)} values, {ends})")
     over = f", over {', '.join(varied)}" if varied else ""
     seeds = f", each with {config.sweep.seeds} sequences of encoder noise" if config.sweep.seeds > 1 else ""
     run = f"{config.run.duration:g} s, sampled every {1e3 * config.run.sample_period:g} ms"
@@ -72,7 +75,7 @@ def _studied(config: Config, found: "_Survey") -> str:
 
 
 class _Survey:
-    """What the sentences and the table of axes say of a study, found in one reading.
+    """The numbers behind the sentences and the table of axes, found in one reading.
 
     Attributes:
         runs: their number; `even` those on points that are always simulated; `diverged`.
@@ -82,17 +85,18 @@ class _Survey:
     """
 
     def __init__(self, result: StudyResult):
-        paths = [axis.path for axis in result.config.axes]
-        wanted = {side: [f"{side}.{name}" for name in ("converged", "velocity_rmse", "margin_alpha")] for side in SIDES}
-        figures = [name for names in wanted.values() for name in names if name in result.columns]
-        self.sides = [side for side in SIDES if f"{side}.converged" in figures]
+        config = result.config
+        paths = [axis.path for axis in config.axes]
+        metrics = [f"{side}.{name}" for side in SIDES for name in ("converged", "velocity_rmse", "margin_alpha")]
+        metrics = [name for name in metrics if name in result.columns]
+        self.sides = [side for side in SIDES if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
-        points = Points(result.config) if result.config.sweep.refine is not None else None
+        points = Points(config) if config.sweep.refine is not None else None
         self.runs = self.even = self.diverged = 0
         self.converged = dict.fromkeys(self.sides, 0)
         self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
         distinct = {path: Distinct() for path in paths}
-        for frame in result.batches([*paths, "seed", "finite", *figures]):
+        for frame in result.batches([*paths, "seed", "finite", *metrics]):
             even = frame if points is None else frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
@@ -101,47 +105,43 @@ class _Survey:
                 distinct[path].add(frame[[path]])
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
-        self.values = {path: one.frame()[path] for path, one in distinct.items()}
-        for side in self.sides if result.config.sweep.design == "grid" else []:
+        self.values = {path: values.frame()[path] for path, values in distinct.items()}
+        for side in self.sides if config.sweep.design == "grid" else []:
             gains = [path for path in paths if path.startswith(f"observer.{side}.") and len(self.values[path]) > 1]
-            if gains and f"{side}.velocity_rmse" in figures:
-                names = [name for name in wanted[side] if name in figures]
-                groups = Groups(Rows(result, [*paths, "finite", *names]), gains, paths)
-                runs = worst_runs(groups, f"{side}.velocity_rmse", f"{side}.margin_alpha" in figures)
+            if gains and f"{side}.velocity_rmse" in metrics:
+                columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
+                groups = Groups(Rows(result, columns), gains, paths)
+                runs = worst_runs(groups, f"{side}.velocity_rmse", f"{side}.margin_alpha" in metrics)
                 self.best[side] = best_gains(runs), runs
 
 
-def headline(result: StudyResult) -> Lines:
-    """What a study found, in sentences."""
-    return _headline(result, _Survey(result))
-
-
-def _headline(result: StudyResult, found: _Survey) -> Lines:
-    refined = result.config.sweep.refine is not None
-    even = found.even or math.nan
-    shares = ", ".join(f"{100 * found.converged[side] / even:.1f} % ({side})" for side in found.sides)
-    counted, of = f"{found.runs} runs.", "them"
-    if refined:
+def headline(result: StudyResult, survey: _Survey | None = None) -> Lines:
+    """Say what a study found, in sentences."""
+    survey = survey or _Survey(result)
+    count, runs, so_far = f"{survey.runs} runs.", "them", ""
+    if result.config.sweep.refine is not None:
         points = len(Points(result.config))
-        simulated = found.runs // result.config.sweep.seeds
-        share = 100 * simulated / points
-        counted = f"{simulated} of {points} grid points simulated ({share:.2g} %), {found.runs} runs."
-        of = "those on the coarse grid"
-    lines = [f"{counted} The observers converged in {shares} of {of}." if found.sides else counted]
-    if not result.is_finished(found.runs):
-        more = " so far" if refined else ""
-        lines.append(f"The study is not finished: it has {result.runs} runs{more}. Go on with 'jaxbl sweep'.")
-    if found.diverged:
-        lines.append(f"{found.diverged} runs diverged: finite = false in the table, grey in the figures.")
-    return [*lines, *(f"{side}: {_best_line(best, runs)}" for side, (best, runs) in found.best.items())]
+        simulated = survey.runs // result.config.sweep.seeds
+        count = f"{simulated} of {points} grid points simulated ({100 * simulated / points:.2g} %), {count}"
+        runs, so_far = "those on the coarse grid", " so far"
+    if survey.sides:
+        even = survey.even or math.nan
+        shares = ", ".join(f"{100 * survey.converged[side] / even:.1f} % ({side})" for side in survey.sides)
+        count += f" The observers converged in {shares} of {runs}."
+    lines = [count]
+    if not result.is_finished(survey.runs):
+        lines.append(f"The study is not finished: it has {result.runs} runs{so_far}. Go on with 'jaxbl sweep'.")
+    if survey.diverged:
+        lines.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
+    return [*lines, *(f"{side}: {_best_line(*best)}" for side, best in survey.best.items())]
 
 
 def _best_line(best: BestGains | None, runs: pd.DataFrame) -> str:
     """The best gains of a side, their margin, and how many others are as good."""
     if best is None:
         return "no gains converged in all runs with α above f⁺."
-    row, names = runs.iloc[best.index], runs.index.names
-    place = ", ".join(f"{name} = {runs.index.get_level_values(name)[best.index]:.3g}" for name in names)
+    row = runs.reset_index().iloc[best.index]
+    place = ", ".join(f"{name} = {row[name]:.3g}" for name in runs.index.names)
     ends = (f" Its {gain} is the {way.replace('er', 'est')} of its axis." for gain, way in best.ends.items())
     return (
         f"best gains {place}: velocity error {row['error']:.3g} rad/s rms, the worst of their runs (least: "
@@ -151,28 +151,23 @@ def _best_line(best: BestGains | None, runs: pd.DataFrame) -> str:
 
 
 def _law_lines(laws: list[Law]) -> Lines:
-    """How many laws agree with theory, and each that does not."""
+    """Say how many laws agree with theory, and each that does not."""
     if not laws:
         return []
     count = sum(law.agrees for law in laws)
     lines = [f"Accuracy laws: {count} of {len(laws)} have a slope within {AGREEMENT:g} of theory."]
     for law in laws:
         if not law.agrees:
-            found = "no power law" if law.fit is None else f"slope {_slope_of(law)}, theory {law.theory:g}"
-            lines.append(f"{law.value} over {law.x} ({_place(law)}): {found}; {_why(law)}.")
+            slope = "no power law" if law.fit is None else f"slope {slope_text(law.fit)}, theory {law.theory:g}"
+            lines.append(f"{law.value} over {law.x} ({_place(law)}): {slope}; {_explain_ends(law)}.")
     return lines
 
 
-def _why(law: Law) -> str:
+def _explain_ends(law: Law) -> str:
     """Why a law ends below and above; the end of the sweep is named only where both ends are that."""
     if law.stops["below"] == law.stops["above"]:
         return law.stops["below"]
     return "; ".join(f"{end}: {law.stops[end]}" for end in ("below", "above") if law.stops[end] != END_OF_SWEEP)
-
-
-def _slope_of(law: Law) -> str:
-    assert law.fit is not None
-    return f"{law.fit.slope:.3f} ± {law.fit.standard_error:.1g}"
 
 
 def _place(law: Law) -> str:
@@ -186,38 +181,30 @@ def _law_table(laws: list[Law]) -> PageTable:
     for law in laws:
         line, slope, halves, ends = f"{law.value} over {law.x}", "no law", "–", "–"
         if law.fit is not None:
-            slope, halves = _slope_of(law), f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
+            slope, halves = slope_text(law.fit), f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
         if law.range is not None:
             ends = f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
         slope, halves, ends = (text.replace(" ", "\u00a0") for text in (slope, halves, ends))
-        rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
+        rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _explain_ends(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return PageTable("Accuracy laws", columns, rows)
 
 
-def _axes_table(found: _Survey) -> PageTable:
-    rows = []
-    for path, values in found.values.items():
-        ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(values) else [values.min(), values.max()]
-        rows.append([path, len(values), *ends])
-    return PageTable("Axes", ["path", "values", "least", "largest"], rows)
-
-
 def _metric_table(result: StudyResult) -> PageTable:
-    about = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
-    shown = [column for column in about if column in result.columns]
-    rows = Rows(result, shown)
+    metrics = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
+    metrics = {column: metric for column, metric in metrics.items() if column in result.columns}
+    rows = Rows(result, metrics)
 
     def numbers() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for frame in rows:
-            for i, column in enumerate(shown):
+            for i, column in enumerate(metrics):
                 values = frame[column].to_numpy(float)
                 values = values[np.isfinite(values)]
                 yield np.full(len(values), i), values
 
-    quantiles = spread(numbers, len(shown), (0.05, 0.5, 0.95)).quantiles.T
+    quantiles = spread(numbers, len(metrics), (0.05, 0.5, 0.95)).quantiles.T
     table = [
-        [column, *(None if np.isnan(q) else q for q in row), about[column].unit, about[column].doc]
-        for column, row in zip(shown, quantiles, strict=True)
+        [column, *(None if np.isnan(value) else value for value in row), metric.unit, metric.doc]
+        for (column, metric), row in zip(metrics.items(), quantiles, strict=True)
     ]
     return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)

@@ -4,13 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from jaxbl.config import numeric_paths
+from jaxbl.report.checks import has_words
+from jaxbl.report.maps import unit_of
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, page_values
+from .folder import page_values, points_writer
 
 
 def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str, Any]:
@@ -22,31 +21,19 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str,
         metrics: columns that are kept.
         out: folder.
     """
-    config, units = result.config, numeric_paths(result.config)
-    words = {
-        axis.path: list(axis.values)
-        for axis in config.axes
-        if axis.values is not None and any(isinstance(value, str) for value in axis.values)
-    }
+    config, rows = result.config, 0
+    words = {axis.path: list(axis.values or ()) for axis in config.axes if has_words(axis)}
     axes = [axis.path for axis in config.axes]
-    schema = pa.schema([*((name, pa.float64()) for name in (*axes, "seed")), *((name, pa.float32()) for name in metrics)])
-    found = 0
-    with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
+    types = dict.fromkeys([*axes, "seed"], np.float64) | dict.fromkeys(metrics, np.float32)
+    with points_writer(out, types) as write:
         for frame in result.batches():
-            columns = {
-                path: [words[path].index(one) for one in frame[path]] if path in words else frame[path] for path in axes
-            }
-            columns |= {"seed": frame["seed"]} | {name: page_values(frame, name) for name in metrics}
-            arrays = {
-                name: np.asarray(values, float).astype(schema.field(name).type.to_pandas_dtype())
-                for name, values in columns.items()
-            }
-            writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
-            found += len(frame)
-    told = [
-        {"path": one.path, "unit": units[one.path].unit if one.path in units else "", "words": words.get(one.path),
-         "log": one.scale == "log"}
-        for one in config.axes
-    ]  # fmt: skip
+            places = {path: frame[path].map(values.index) for path, values in words.items()}
+            metric_values = {name: page_values(frame, name) for name in metrics}
+            write(frame.assign(**places, **metric_values))
+            rows += len(frame)
+    descriptions = [
+        {"path": axis.path, "unit": unit_of(config, axis.path), "words": words.get(axis.path), "log": axis.scale == "log"}
+        for axis in config.axes
+    ]
     sampled = config.sweep.design != "grid"
-    return {"axes": told, "rows": found, "found": found, "total": result.runs, "sampled": sampled}
+    return {"axes": descriptions, "rows": rows, "found": rows, "total": result.runs, "sampled": sampled}

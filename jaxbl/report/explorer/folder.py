@@ -6,13 +6,18 @@ needs them.
 
 import base64
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
 from jaxbl.errors import InputError
 from jaxbl.files import catch_write_errors, is_empty, json_with_checksum, make_folder, read_json
@@ -27,6 +32,19 @@ _MARKER = "jaxbl-explorer.json"
 """Says that a folder is one of ours, which may be written anew."""
 _SHARED = ("explore.css", "hyparquet.LICENSE.txt")
 _SCRIPTS = ("hyparquet", "shared", "plot")
+
+
+@contextmanager
+def points_writer(out: Path, types: Mapping[str, type]) -> Iterator[Callable[[Any], None]]:
+    """A function that adds columns of rows to `points.parquet`, by their NumPy types."""
+    schema = pa.schema([(name, pa.from_numpy_dtype(dtype)) for name, dtype in types.items()])
+    with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
+
+        def write(columns: Any) -> None:
+            arrays = {name: np.asarray(columns[name], float).astype(dtype) for name, dtype in types.items()}
+            writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
+
+        yield write
 
 
 class Source(NamedTuple):
@@ -76,7 +94,7 @@ def write_static(source: Source, out: Path) -> Path:
     return out / "index.html"
 
 
-def write_page(out: Path, parts: Sequence[str], about: JsonObject, *, scripts: bool = True) -> None:
+def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts: bool = True) -> None:
     """Write a page into a folder that has `points.parquet`.
 
     Args:
@@ -86,23 +104,28 @@ def write_page(out: Path, parts: Sequence[str], about: JsonObject, *, scripts: b
         scripts: whether it can be opened from disk.
     """
     points = out / "points.parquet"
-    told = {**about, "bytes": points.stat().st_size, "script": _SCRIPT}
-    (out / "data.js").write_text(f"jaxblData({json.dumps(told)});\n", encoding="utf-8")
+    data = json.dumps({**content, "bytes": points.stat().st_size, "script": _SCRIPT})
+    (out / "data.js").write_text(f"jaxblData({data});\n", encoding="utf-8")
     if scripts:
         with points.open("rb") as file:
-            for number, content in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
-                text = f'jaxblBytes({number}, "{base64.b64encode(content).decode()}");\n'
+            for number, chunk in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
+                text = f'jaxblBytes({number}, "{base64.b64encode(chunk).decode()}");\n'
                 (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
     report = files("jaxbl.report")
-    own, used = report.joinpath("explorer", "page"), [*_SCRIPTS, *parts]
-    elements = "".join(own.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in parts)
+    folder, used = report.joinpath("explorer", "page"), [*_SCRIPTS, *parts]
+    page, *elements = (folder.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in ("page", *parts))
     loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*used, "data"])
-    page = own.joinpath("page.html").read_text(encoding="utf-8").replace("{parts}", elements).replace("{scripts}", loaded)
+    page = page.replace("{parts}", "".join(elements)).replace("{scripts}", loaded)
     (out / "index.html").write_text(page, encoding="utf-8")
-    copied = [*(report.joinpath(name) for name in ("page.css", "shared.js")), *(own.joinpath(name) for name in _SHARED)]
-    copied += [own.joinpath(f"{name}.js") for name in used if name != "shared"]
-    for one in copied:
-        (out / one.name).write_bytes(one.read_bytes())
+    copied = [report.joinpath(name) for name in ("page.css", "shared.js")]
+    copied += [folder.joinpath(name) for name in (*_SHARED, *(f"{name}.js" for name in used if name != "shared"))]
+    for original in copied:
+        (out / original.name).write_bytes(original.read_bytes())
+
+
+def colours_of(name: str) -> list[str]:
+    """A colour map as pages have it."""
+    return [to_hex(colour) for colour in colormaps[name](np.linspace(0.0, 1.0, 256))]
 
 
 def page_values(frame: pd.DataFrame, name: str) -> np.ndarray:

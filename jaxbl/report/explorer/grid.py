@@ -4,27 +4,25 @@ Rows of `points.parquet` are in the order of the axes, which need not be stored 
 """
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from jaxbl.config import Config, numeric_paths
+from jaxbl.config import Config
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.report.maps import least_lambdas, unit_of
 from jaxbl.report.picture import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, page_values
+from .folder import ROW_GROUP, page_values, points_writer
+
+Array = np.ndarray
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -37,19 +35,20 @@ def dimensions(config: Config) -> list[AxisColumns] | None:
         return None
     first = config.sweep.first_seed
     dims = [*Points(config).dimensions, {"seed": np.arange(first, first + config.sweep.seeds)}]
-    return dims if sum(_length(one) > 1 for one in dims[:-1]) >= 2 else None
+    return dims if sum(_length(dim) > 1 for dim in dims[:-1]) >= 2 else None
 
 
 def _length(dim: AxisColumns) -> int:
     return len(next(iter(dim.values())))
 
 
-def _places(dim: AxisColumns, frame: pd.DataFrame) -> np.ndarray:
-    """Where rows of a frame lie along a dimension."""
+def _places(dim: AxisColumns, frame: pd.DataFrame) -> Array:
+    """The places of a frame's rows along a dimension."""
     if len(dim) == 1:
         ((path, values),) = dim.items()
         return pd.Index(values).get_indexer(pd.Index(frame[path]))
-    return pd.MultiIndex.from_arrays([*dim.values()]).get_indexer(pd.MultiIndex.from_arrays([frame[path] for path in dim]))
+    values, rows = (pd.MultiIndex.from_arrays([table[path] for path in dim]) for table in (dim, frame))
+    return values.get_indexer(rows)
 
 
 def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -> JsonObject:
@@ -61,46 +60,44 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
         first: the one that is drawn first.
         out: folder.
     """
-    dims, units = dimensions(result.config), numeric_paths(result.config)
+    dims = dimensions(result.config)
     assert dims is not None
-
-    def axis(path: str, values: np.ndarray) -> JsonObject:
-        return {"path": path, "unit": units[path].unit if path in units else "", "values": to_jsonable(values)}
-
-    return {
-        "axes": [{"paths": [axis(path, values) for path, values in one.items()]} for one in dims],
-        "conditions": _conditions(),
-    } | _write_points(result, metrics, first, out, dims)
+    axes = [
+        {
+            "paths": [
+                {"path": path, "unit": unit_of(result.config, path), "values": to_jsonable(values)}
+                for path, values in dim.items()
+            ]
+        }
+        for dim in dims
+    ]
+    return {"axes": axes, "conditions": _conditions()} | _write_points(result, metrics, first, out, dims)
 
 
 def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
     """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
     Returns what the page needs to read it, and its first picture."""
-    shape = [_length(one) for one in dims]
-    rows, found = math.prod(shape), 0
-    with TemporaryDirectory(dir=out, prefix=".draft.") as place:
-        kept = {name: np.memmap(Path(place) / str(i), np.float32, "w+", shape=(rows,)) for i, name in enumerate(metrics)}
-        for values in kept.values():
+    shape = [_length(dim) for dim in dims]
+    rows, runs = math.prod(shape), 0
+    with (
+        TemporaryDirectory(dir=out, prefix=".draft.") as place,
+        points_writer(out, dict.fromkeys(metrics, np.float32)) as write,
+    ):
+        columns = {name: np.memmap(Path(place) / str(i), np.float32, "w+", shape=(rows,)) for i, name in enumerate(metrics)}
+        for values in columns.values():
             values[:] = np.nan
         for frame in result.batches():
-            at = np.ravel_multi_index([_places(one, frame) for one in dims], shape)
-            found += len(frame)
-            for name, values in kept.items():
-                values[at] = page_values(frame, name)
-        _write_table(out, kept, rows)
-        overview = _overview(kept[first], shape)
-    return {"rows": rows, "found": found, "overview": overview}
-
-
-def _write_table(out: Path, columns: Mapping[str, np.ndarray], rows: int) -> None:
-    schema = pa.schema([(name, pa.float32()) for name in columns])
-    with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
+            places = np.ravel_multi_index([_places(dim, frame) for dim in dims], shape)
+            runs += len(frame)
+            for name, values in columns.items():
+                values[places] = page_values(frame, name)
         for start in range(0, rows, ROW_GROUP):
-            part = {name: pa.array(np.array(values[start : start + ROW_GROUP])) for name, values in columns.items()}
-            writer.write_table(pa.table(part, schema=schema), row_group_size=ROW_GROUP)
+            write({name: values[start : start + ROW_GROUP] for name, values in columns.items()})
+        overview = _overview(columns[first], shape)
+    return {"rows": rows, "found": runs, "overview": overview}
 
 
-def _overview(values: np.ndarray, shape: list[int]) -> JsonObject:
+def _overview(values: Array, shape: list[int]) -> JsonObject:
     """The first picture: the map over the last two axes that vary, at the first value of the others, median over seeds."""
     y, x = [i for i, size in enumerate(shape[:-1]) if size > 1][-2:]
     index: list[Any] = [0] * len(shape)
@@ -116,9 +113,8 @@ def _conditions() -> list[JsonObject]:
     """Each condition as a curve: it is homogeneous, lambda / sqrt(f) over alpha / f."""
     ratios = np.geomspace(1.0005, 2000.0, 600)
     curves = []
-    for name, one in CONDITIONS.items():
-        with jax.enable_x64(True):
-            least = np.asarray(one.least_lambda(jnp.asarray(ratios), jnp.asarray(1.0)))
-        alpha, lambda_ = ([float(f"{number:.6g}") for number in values] for values in (ratios, least))
-        curves.append({"name": name, "title": one.title, "alpha": alpha, "lambda": lambda_})
+    for name, condition in CONDITIONS.items():
+        values = ratios, least_lambdas(condition, ratios, 1.0)
+        alpha, lambda_ = ([float(f"{number:.6g}") for number in numbers] for numbers in values)
+        curves.append({"name": name, "title": condition.title, "alpha": alpha, "lambda": lambda_})
     return curves

@@ -82,12 +82,12 @@ class ExplorerServer(ThreadingHTTPServer):
     ):
         self.answers = answers
         self._write, self._place = write, place
-        self._token = secrets.token_urlsafe(24)
+        self.token = secrets.token_urlsafe(24)
         self._lock, self._versions, self._stale = threading.Lock(), 0, True
         self._loaded: set[str] = set()
         super().__init__(("127.0.0.1", port), _Handler)
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
-        self.url = f"http://127.0.0.1:{self.server_port}/{self._token}/"
+        self.url = f"http://127.0.0.1:{self.server_port}/{self.token}/"
 
     def server_close(self) -> None:
         super().server_close()
@@ -98,10 +98,6 @@ class ExplorerServer(ThreadingHTTPServer):
         # a browser that leaves a page ends what it was reading
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
-
-    def is_known(self, token: str) -> bool:
-        """Whether a request comes from who was given the address."""
-        return secrets.compare_digest(token.encode(), self._token.encode())
 
     def newest(self) -> str:
         """Number of the newest version of the page, written now if the one before is out of date.
@@ -124,23 +120,23 @@ class ExplorerServer(ThreadingHTTPServer):
             return str(self._versions)
 
     def is_outdated(self, version: str, name: str) -> bool:
-        """Whether a page is loaded again while there is, or may be, a newer version of it."""
+        """True if a page is loaded again while there is, or may be, a newer version of it."""
         if name != "index.html":
             return False
         with self._lock:
             again = version in self._loaded
-            if version in self._written():
+            if version in self._version_names():
                 self._loaded.add(version)
             return again and (self._stale or version != str(self._versions))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        folder = self._place / version if version in self._written() else None
+        folder = self._place / version if version in self._version_names() else None
         if folder is None or not folder.is_dir():
             return None
-        return next((one for one in folder.iterdir() if one.name == name and one.is_file()), None)
+        return next((file for file in folder.iterdir() if file.name == name and file.is_file()), None)
 
-    def _written(self) -> Iterator[str]:
+    def _version_names(self) -> Iterator[str]:
         return map(str, range(1, self._versions + 1))
 
 
@@ -169,8 +165,8 @@ class _Handler(BaseHTTPRequestHandler):
         file = self.server.file(*parts) if len(parts) == 2 else None
         if file is None:
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
-            return
-        self._send_file(file)
+        else:
+            self._send_file(file)
 
     def do_POST(self) -> None:
         if (parts := self._parts()) is None:
@@ -183,14 +179,14 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long a question")
         else:
             try:
-                found = answer(json.loads(self.rfile.read(int(length))))
+                result = answer(json.loads(self.rfile.read(int(length))))
             except (ValueError, RecursionError, NoResult) as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
             except (RuntimeError, MemoryError) as error:
                 # of XLA, too
                 self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}")
             else:
-                self._send(HTTPStatus.OK, json.dumps(found, allow_nan=False).encode(), "application/json")
+                self._send(HTTPStatus.OK, json.dumps(result, allow_nan=False).encode(), "application/json")
 
     def _parts(self) -> list[str] | None:
         """The address behind the token; None where the request was refused.
@@ -205,7 +201,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.FORBIDDEN, "asked for by another site")
         else:
             token, *parts = self.path.partition("?")[0].removeprefix("/").split("/")
-            if self.server.is_known(token):
+            if secrets.compare_digest(token.encode(), self.server.token.encode()):
                 return parts
             self._refuse(HTTPStatus.FORBIDDEN, "open the address that jaxbl explore printed")
         return None
@@ -227,19 +223,19 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(HTTPStatus.OK, part, kind)
 
-    def _refuse(self, status: HTTPStatus, why: str) -> None:
+    def _refuse(self, status: HTTPStatus, reason: str) -> None:
         # what was not read of the request would be taken for the next one
         self.close_connection = True
-        self._send(status, json.dumps({"error": why}).encode(), "application/json")
+        self._send(status, json.dumps({"error": reason}).encode(), "application/json")
 
     def _send(self, status: HTTPStatus, content: bytes = b"", kind: str = "", headers: Mapping[str, str] = {}) -> None:
         self.send_response(status)
-        about = {"Content-Type": kind} if kind else {}
+        content_type = {"Content-Type": kind} if kind else {}
         fixed = {
             "Content-Length": str(len(content)), "Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer", "Cache-Control": "no-store", "Cross-Origin-Resource-Policy": "same-origin",
         }  # fmt: skip
-        for name, value in (about | fixed | dict(headers)).items():
+        for name, value in (content_type | fixed | dict(headers)).items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(content)

@@ -6,10 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
-
 from jaxbl.config import Config, is_boolean, with_values
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
@@ -24,7 +20,7 @@ from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
 from .cloud import write_cloud
-from .folder import Source, drawable, write_page
+from .folder import Source, colours_of, drawable, write_page
 from .grid import dimensions, write_grid
 
 
@@ -55,10 +51,10 @@ def study_source(folder: str | Path) -> Source:
 
 
 def _lead(result: StudyResult) -> list[str]:
-    """What was found, and the study's notes; of a sweep at work no figures, which would be out of date on the page."""
+    """The answer, and the study's notes; of a sweep at work no figures, which would be out of date on the page."""
     manifest = result.source.manifest if isinstance(result.source, Store) else {"finished": True}
-    found = headline(result) if manifest["finished"] else ["This sweep is unfinished: the page shows the runs so far."]
-    return [*found, *result.config.notes]
+    lines = headline(result) if manifest["finished"] else ["This sweep is unfinished: the page shows the runs so far."]
+    return [*lines, *result.config.notes]
 
 
 def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:
@@ -74,17 +70,17 @@ def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: 
         Whether runs are still to come.
     """
     config = result.config
-    about = _about(config, result.columns) | {"lead": list(lead), "served": served}
-    names = [one["name"] for one in about["metrics"]]
+    content = _about(config, result.columns) | {"lead": list(lead), "served": served}
+    names = [metric["name"] for metric in content["metrics"]]
     if dimensions(config) is None:
-        about |= write_cloud(result, names, out)
         page = "cloud"
+        content |= write_cloud(result, names, out)
     else:
-        about |= write_grid(result, names, about["first"], out)
         page = "map"
+        content |= write_grid(result, names, content["first"], out)
     (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
-    write_page(out, (page, "runs"), about, scripts=not served)
-    return not result.is_finished(about["found"])
+    write_page(out, (page, "runs"), content, scripts=not served)
+    return not result.is_finished(content["found"])
 
 
 _MOST_SAMPLES = 20_000
@@ -120,21 +116,25 @@ def simulated(config: Config, asked: Any) -> JsonObject:
     Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
     trial = run(point, seed=seed, backend="scan")
-    every = -(-len(trial.trace) // _MOST_SAMPLES)
-    trace = trial.trace.iloc[::every]
-    planes = {side: error_path(trial.trace, side, found) for side, found in trial.summary["conditions"].items()}
+    step = -(-len(trial.trace) // _MOST_SAMPLES)
+    trace = trial.trace.iloc[::step]
+    planes = {}
+    for side, judged in trial.summary["conditions"].items():
+        path = error_path(trial.trace, side, judged)
+        e, slope = path.majorant
+        planes[side] = {
+            "error": packed(drawable(path.error)),
+            "slope": packed(drawable(path.slope)),
+            "reach": [plane_reach(path.error, e), plane_reach(path.slope, slope)],
+            "majorant": [packed(e), packed(slope)] if len(e) else None,
+        }
     return {
-        "every": every,
+        "every": step,
         "metrics": trial.summary["metrics"],
         "columns": {name: packed(drawable(trace[name])) for name in _COLUMNS if name in trace},
-        "planes": {
-            side: {"error": packed(drawable(one.error)), "slope": packed(drawable(one.slope)),
-                   "reach": [plane_reach(one.error, one.majorant[0]), plane_reach(one.slope, one.majorant[1])],
-                   "majorant": [packed(part) for part in one.majorant] if len(one.majorant[0]) else None}
-            for side, one in planes.items()
-        },
+        "planes": planes,
         "config": point.to_toml(),
-    }  # fmt: skip
+    }
 
 
 _NEARBY = 6
@@ -148,9 +148,9 @@ def nearby(config: Config, asked: Any) -> JsonObject:
 
 
 def _about(config: Config, columns: list[str]) -> JsonObject:
-    """What the page says of a study and its columns."""
-    known = {axis.path for axis in config.axes} | {"seed"}
-    names = [name for name in columns if name not in known]
+    """The page's account of a study and its columns."""
+    axes, experiment = {"seed", *(axis.path for axis in config.axes)}, config.build()
+    names = [name for name in columns if name not in axes]
     return {
         "title": config.title or "Study",
         "metrics": [
@@ -159,13 +159,8 @@ def _about(config: Config, columns: list[str]) -> JsonObject:
         "first": next((name for name in names if name.endswith(".velocity_rmse")), names[0]),
         "config": config.to_toml(),
         "file": "study.toml",
-        "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
-        "gains": _gains(config),
+        "colours": colours_of(MAP),
+        # where no axis changes them
+        "gains": {side: getattr(experiment.observer, side).gains() for side in experiment.sides},
         "effects": config.to_dict()["effects"],
     }
-
-
-def _gains(config: Config) -> JsonObject:
-    """Gains of each side's observer, where no axis changes them."""
-    experiment = config.build()
-    return {side: getattr(experiment.observer, side).gains() for side in experiment.sides}
