@@ -9,9 +9,9 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
-# The honest proof and logs read for what they are stand at 410 476 for now: they are done at 400 548.
+# The honest proof and logs read for what they are stand at 407 378 for now: they are done at 400 548.
 CEILINGS = {
-    "all": (410476, 3.72, 3.93, 5.91),
+    "all": (407378, 2.61, 3.26, 4.19),
     "report": (61318, 1.01, 1.2, 1.68),
     "diagnosis": (65771, 10.12, 12.75, 15.47),
     "records": (49106, 0.0, 0.0, 0.0),
@@ -24,7 +24,7 @@ CEILINGS = {
     "drive": (12804, 0.0, 2.21, 0.0),
     "throughput": (11788, 0.0, 0.0, 0.0),
     "cli": (9890, 0.09, 0.0, 0.0),
-    "config": (9721, 0.0, 0.0, 0.0),
+    "config": (9743, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
     "monitoring": (5530, 0.0, 0.0, 0.0),
 }

@@ -119,7 +119,9 @@ class Config(Table):
     def nominal_drive(self) -> NominalDrive:
         """Return the nominal numbers that a log of the drive is checked against."""
         drive, law = self.drive, None if self.transmission is None else self.transmission.build()
-        acts_late = any(effect.kind in ("actuator.delay", "actuator.lag") for effect in self.effects)
+        effects = [effect.build() for effect in self.effects]
+        # what remembers its input acts late
+        acts_late = any(effect.place == "actuator" and jax.tree.leaves(effect.init()) for effect in effects)
         dead_time = "modelled" if acts_late else "no"
         if law is None or drive.kind != "two_inertia":
             return NominalDrive(drive.motor_inertia, drive.motor_viscous, dead_time=dead_time)
