@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import simulate_plants
 from jaxbl.identification.segments import Segment, reading_noise, windows_of
@@ -230,7 +231,7 @@ class ReferenceLog:
         (2, samples), 0 where the model has one; and where the side moves, shape (samples,)."""
         effects = [effect for effect in experiment.effects if effect.place == side]
         dry = not any(type(effect).exclusive for effect in effects)
-        steady = not any(effect.name == f"{side}.constant_torque" for effect in effects)
+        steady = not any(isinstance(effect, ConstantTorque) for effect in effects)
         pieces, columns = residual_torques(at_period(experiment, self.period), self.segments)[side], []
         for segment, piece in zip(self.segments, pieces, strict=True):
             smoothed = segment.smoothed[side]

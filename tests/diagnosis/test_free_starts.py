@@ -39,7 +39,10 @@ def test_runs_are_those_of_the_fit(log, from_rest):
     windows, _ = windows_of(segments_of(record, model.sides), model, 250, from_rest)
     actual, seen = best_runs(model, windows, 8, from_rest), count_seen(250)
     first = dataclasses.replace(
-        windows, torque=windows.torque[:, :seen], measured={side: x[:, :seen] for side, x in windows.measured.items()}
+        windows,
+        torque=windows.torque[:, :seen],
+        measured={side: readings[:, :seen] for side, readings in windows.measured.items()},
+        finer=windows.finer[:, :seen],
     )
     expected, start = jit(projected_residual)(model, first, 8, from_rest)
     assert actual.residual.shape == (8, 250, 2) and seen == 50
@@ -55,7 +58,7 @@ def test_torques_may_be_added_sample_by_sample(log):
     model = set_leaves(model, {"effects.actuator.delay.delay": jnp.asarray(1e-30)})
     windows, _ = windows_of(segments_of(record, model.sides), model, 250)
     expected = best_runs(model, windows, 4, False)
-    idle = type(windows)(0.0 * windows.torque, windows.measured, windows.time, windows.start, windows.noise, windows.rest)
+    idle = dataclasses.replace(windows, torque=0.0 * windows.torque)
     actual = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
     assert actual.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
 

@@ -41,8 +41,8 @@ def simulate_peaks(lambda_, alpha, disturbance, end, damping=0.0, start=(0.0, 1.
             state,
             method="DOP853",
             events=crosses_zero,
-            rtol=1e-7,
-            atol=1e-13,
+            rtol=1e-9,
+            atol=1e-19,
             first_step=min(1e-4 * size, end - time),
             max_step=0.5 * max(size, 1e-3),
         )
