@@ -9,11 +9,11 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
-# The honest proof and logs read for what they are stand at 407 387 for now: they are done at 400 548.
+# The honest proof and logs read for what they are stand at 407 299 for now: they are done at 400 548.
 CEILINGS = {
-    "all": (407387, 2.61, 3.26, 4.19),
+    "all": (407299, 2.6, 3.23, 4.19),
     "report": (61318, 1.01, 1.2, 1.68),
-    "diagnosis": (65780, 10.12, 12.75, 15.47),
+    "diagnosis": (65692, 10.1, 12.54, 15.47),
     "records": (49106, 0.0, 0.0, 0.0),
     "gains": (40310, 0.03, 0.0, 0.0),
     "identification": (36229, 8.6, 14.92, 17.2),

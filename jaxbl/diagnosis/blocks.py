@@ -9,6 +9,8 @@ from .reference_log import Comparison, Errors, ReferenceLog
 BLOCKS = 16
 """Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
 logs."""
+QUARTERS = 4
+"""Parts of a log that numbers are fitted without, one after the other: each as much as is held out."""
 SEEN = 1.0
 """Standard errors by which a channel shows a difference, as a stepwise regression by blocks asks."""
 SURE = 2.0

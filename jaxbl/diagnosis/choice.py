@@ -27,7 +27,7 @@ from .reference_log import Comparison
 from .residuals import SideResiduals
 from .setup import Setup
 from .torque_fit import fit_to_torque
-from .torque_regression import extended
+from .torque_regression import extend_explanation
 from .torque_tables import Tabulation, tabulate
 
 _BOUND = 4.0
@@ -142,7 +142,7 @@ class Choice:
             if again.model.names not in ((), best.fitted.names) and other.plausible(again):
                 best = self._better(best, self._exchange(other, again), SURE)
         if self._leaves_more(best):
-            more = extended(best.search, best.found, best.fitted, self.log, self.history)
+            more = extend_explanation(best.search, best.found, best.fitted, self.log, self.history)
             if more is not best.found:
                 best = self._better(best, self._exchange(best.search, more), SEEN)
         if self._leaves_more(best, or_little=True):

@@ -49,8 +49,7 @@ def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, 
     chance = bool(tested) and any(control.kind == "permuted" and control.z < SURE for control in proof.controls)
     little, remainder = bool(tested) and is_little(share), chosen.found.verdict == "unknown_effect"
     against = proof.failed or far or chance or proof.worse or little or contradicting or remainder
-    open_ = untested or not proof.has_power
-    verdict = "unknown_effect" if against else "not_tested" if open_ else chosen.found.verdict
+    verdict = "unknown_effect" if against else "not_tested" if untested or not proof.has_power else chosen.found.verdict
     torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
     reasons = {"chance": chance, "remainder": remainder, "worse": proof.worse, "little": little}
     tested_by = {"level": LEVEL, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}

@@ -12,6 +12,7 @@ import numpy as np
 from jaxbl.identification.segments import segments_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
+from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .blocks import SEEN, standard_errors_better
@@ -93,7 +94,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     record, log = open_held_out(setup)
     before, after = log.compare(nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.found.model.linear.drive)
-    sizes = _sizes(log, fitted.experiment)
+    sizes = _sizes(log, fitted.experiment, input_rms(record))
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
     return Proof(
@@ -104,19 +105,12 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         _controls(setup, chosen, log, before, after),
         weak,
         _find_untested(setup, chosen, log, expected),
-        _describe_gap(setup, chosen, record, log, before, after) | {"range": _ranges(setup.fitted, log, sizes)},
+        _describe_gap(setup, chosen, record, log, before, after),
     )  # fmt: skip
 
 
-def _ranges(fitted: ReferenceLog, log: ReferenceLog, sizes: Errors) -> JsonObject:
-    """How far both logs reach: travel and speed of each side, and the input's torque; `size` is what is to be predicted."""
-    reach = [_reach(part) for part in (fitted, log)]
-    return {
-        name: {"log": reach[0][name], "proof": reach[1][name], "size": sizes.get(name, reach[1][name])} for name in reach[0]
-    }
-
-
 def _reach(log: ReferenceLog) -> Errors:
+    """How far a log reaches: travel and largest speed of each side, and largest torque of the input."""
     found = {name: float(np.ptp(values)) for name, values in log.readings().items()}
     for side in log.noise:
         speeds = np.concatenate([np.asarray(segment.smoothed[side].velocity) for segment in log.segments])
@@ -125,11 +119,10 @@ def _reach(log: ReferenceLog) -> Errors:
     return found | {"torque_motor": float(np.max(np.abs(torques)))}
 
 
-def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
+def _sizes(log: ReferenceLog, experiment: Experiment, driving: float) -> Errors:
     """What is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives it, N m,
-    rms."""
+    rms; `driving`: that of the input."""
     found = {name: float(np.std(values)) for name, values in log.readings().items()}
-    driving = float(np.sqrt(np.mean(np.concatenate([segment.torque for segment in log.segments]) ** 2)))
     return found | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 
 
@@ -146,11 +139,10 @@ def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Ma
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:
     """Torque by which two models differ along a log, at the motor, rms, N m."""
-    total = 0.0
     pair = [log.missing(each) for each in (model, other)]
-    for side in model.sides:
-        total += float(np.mean((pair[0][side] - pair[1][side]) ** 2)) / float(model.drive.ratio(side)) ** 2
-    return float(np.sqrt(total))
+    return float(
+        np.hypot.reduce([rms(pair[0][side] - pair[1][side]) / float(model.drive.ratio(side)) for side in model.sides])
+    )
 
 
 def _controls(setup: Setup, chosen: Chosen, log: ReferenceLog, before: Comparison, after: Comparison) -> list[Control]:
@@ -175,6 +167,7 @@ def _describe_gap(
 ) -> JsonObject:
     """Errors before and after, and the noise."""
     part, noise = record.segments, log.noise_of(after)
+    reach, there = _reach(setup.fitted), _reach(log)
     found: JsonObject = {
         "holdout": {
             "file": str(record.path.resolve()),
@@ -189,6 +182,7 @@ def _describe_gap(
         "holdout_rmse_before": before.errors,
         "holdout_rmse_after": after.errors,
         "noise_floor": {name: noise[name] for name in after.errors},
+        "range": {name: {"log": reach[name], "proof": there[name]} for name in reach},
         "free_run": {},
     }
     for name, experiment in (("before", setup.nominal), ("after", chosen.fitted.experiment)):

@@ -22,6 +22,7 @@ from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
+from .blocks import QUARTERS
 from .fitted_model import FittedModel
 from .linearised_model import Linear, Predictor
 from .neutral_effects import lean
@@ -32,8 +33,6 @@ _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
 _ROUNDS = 2
 """Choices of the predictor, each followed by a fit."""
-_QUARTERS = 4
-"""Parts of a log of which each is left out once: as much as is held out."""
 
 
 class _Point(NamedTuple):
@@ -124,7 +123,7 @@ class _Refiner:
         theta changes where one quarter of the log after the other is left out."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
         if not own:
-            return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((_QUARTERS, 0))
+            return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((QUARTERS, 0))
         residual, jacobian = [], []
         for errors in linear.errors(point.predictor.smoothness):
             flat = (errors / np.sqrt(point.predictor.given / linear.count)[None, :, None]).reshape(-1, errors.shape[2])
@@ -156,7 +155,7 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     Returns:
         Changes, shape (quarters, numbers).
     """
-    parts = np.array_split(np.arange(len(errors)), _QUARTERS)
+    parts = np.array_split(np.arange(len(errors)), QUARTERS)
     grams = np.stack([np.einsum("rsp,rsq->pq", slopes[rows], slopes[rows]) for rows in parts])
     towards = np.stack([np.einsum("rsp,rs->p", slopes[rows], errors[rows]) for rows in parts])
     whole = np.sum(grams, axis=0) + prior

@@ -53,7 +53,7 @@ class _Tried(NamedTuple):
     z: float
 
 
-def extended(
+def extend_explanation(
     search: EffectSearch, found: Explanation, fitted: FittedModel, log: ReferenceLog, history: list[Step]
 ) -> Explanation:
     """An explanation with what a regression on the missing torque adds; the same one if it adds nothing.
@@ -95,10 +95,12 @@ def _with_one_more(
 
     def note(kept: str, why: str) -> None:
         asked = f"{SEEN:g} standard error and {_GAIN:.0%} of the missing torque are asked"
-        for one in every:
-            nats = one.fitted.log_likelihood - now.log_likelihood
-            reason = why if one in tried else asked
-            history.append(Step(describe_change(now.numbers, one.fitted.numbers), nats, one.z, one.name == kept, reason))
+        for trial in every:
+            nats = trial.fitted.log_likelihood - now.log_likelihood
+            reason = why if trial in tried else asked
+            history.append(
+                Step(describe_change(now.numbers, trial.fitted.numbers), nats, trial.z, trial.name == kept, reason)
+            )
 
     if not tried:
         note("", "")

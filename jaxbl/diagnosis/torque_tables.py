@@ -17,14 +17,14 @@ from jaxbl.identification.segments import Segment
 from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment, with_effects
 
-from .blocks import SURE, is_worse, standard_errors_better, take_folds
+from .blocks import QUARTERS, SURE, is_worse, standard_errors_better, take_folds
 from .reference_log import Comparison, Errors, ReferenceLog
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
 """Points of a table: waves of 12 periods over the range, or 18 a turn, still show; speeds have them where samples are."""
-_BLOCKS, _QUARTERS = 12, 4
-"""Of consecutive samples, each left out once."""
+_BLOCKS = 12
+"""Of consecutive samples, each left out once; some make a quarter."""
 _GAIN = 0.03
 """Share of the rms that a table has to take away by cross-validation."""
 _STIFFNESS = 10.0 ** np.arange(-4.0, 5.0)
@@ -117,7 +117,7 @@ def tabulate(
             continue
         every = {**(best.tables if best else {}), side: tables}
         model = _with_tables(experiment, every)
-        folds = [log.compare(_with_tables(experiment, every, quarter)) for quarter in range(_QUARTERS)]
+        folds = [log.compare(_with_tables(experiment, every, quarter)) for quarter in range(QUARTERS)]
         with_tables, before = take_folds(log.compare(model), folds), best.compared if best else compared
         if standard_errors_better(log, before, with_tables) > SURE and not is_worse(with_tables, before, noise):
             best = Tabulation(every, model, with_tables, standard_errors_better(log, compared, with_tables))
@@ -218,7 +218,7 @@ class _Fit:
             return np.linalg.solve(inner - gram + share * penalty, right - one)
 
         squares = [np.mean((target[rows] - matrix[rows] @ solve_without([i])) ** 2) for i, rows in enumerate(blocks)]
-        left_out = np.stack([solve_without(part) for part in np.array_split(np.arange(len(blocks)), _QUARTERS)])
+        left_out = np.stack([solve_without(part) for part in np.array_split(np.arange(len(blocks)), QUARTERS)])
         inverse = np.linalg.inv(inner + penalty)
         values = inverse @ right
         # scatter of the blocks' gradients: errors within a block are correlated

@@ -407,6 +407,19 @@ def test_effects_of_one_name_behind_an_actuator_are_refused(logs):
         diagnose(logs / "axis.csv", nominal_study() | {"effects": [{"kind": "actuator.lag", "time_constant": 1e-3}, *waves]})
 
 
+def test_a_slow_drive_whose_friction_is_missing_is_not_refused(tmp_path):
+    """Nearly all of the torque overcomes friction: without it the model goes far beyond the motion."""
+    t = 2e-3 * np.arange(4000)
+    speed = 0.1 * np.sin(2.0 * np.pi * 0.25 * t)
+    torque = 0.02 * 0.1 * 0.5 * np.pi * np.cos(2.0 * np.pi * 0.25 * t) + 0.03 * speed + 0.6 * np.sign(speed)
+    simulate_direct_drive(torque, [FRICTION | {"torque": 0.6}], 3e-5, 1).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
+    with jax.enable_x64(True):
+        setup = set_up(task)
+    apart = setup.fitted.compare(setup.nominal).errors["theta_e"]
+    assert apart > 2.0 * np.ptp(task.record.positions["motor"])
+
+
 def test_a_model_that_diverges_is_refused(logs):
     unstable = nominal_study(effects=[{"kind": "motor.viscous_friction", "viscous": -2.0}])
     with pytest.raises(InputError, match=r"axis\.csv: the model diverges under this log's input"):

@@ -1,11 +1,13 @@
 """Effects hidden by the bench's own simulator are named; nothing is named where nothing or something unknown is hidden."""
 
+import jax
 import numpy as np
 import pytest
 from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
 from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
+from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.identify import read_identification_task
 from jaxbl.identification.logs import default_paths, on_record
@@ -26,6 +28,20 @@ def prepare_search(log, study):
     free = make_free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
     return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides))
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [("actuator.delay", {"delay": 2e-3 * (DELAY_SAMPLES + 1)}), ("actuator.gain_error", {"relative": -1.0})],
+)
+def test_a_candidate_that_cannot_be_simulated_is_left_out(name, numbers, tmp_path):
+    """A dead time of more samples than a model has states for; a drive that no input moves."""
+    simulate_multisine_log().write(tmp_path / "axis.csv")
+    with jax.enable_x64(True):
+        search = prepare_search(tmp_path / "axis.csv", nominal_study())
+        theta = np.zeros(len(search.free))
+        model = search.refit({name: numbers}, theta, search.linear({}, theta).choose(()))
+    assert model.log_evidence == -np.inf
 
 
 @pytest.mark.parametrize("i", [1, 2, 3])

@@ -47,9 +47,28 @@ def test_runs_are_those_of_the_fit(log, from_rest):
     expected, start = jit(projected_residual)(model, first, 8, from_rest)
     assert actual.residual.shape == (8, 250, 2) and seen == 50
     assert np.sqrt(np.mean(np.square(expected))) > 1.05
-    assert actual.residual[:, :seen] == pytest.approx(np.asarray(expected), rel=1e-4, abs=1e-4)
+    assert actual.residual[:, :seen] == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
     for actual_start, expected_start in zip(jax.tree.leaves(actual.states), jax.tree.leaves(start), strict=True):
         assert actual_start[:, 0] == pytest.approx(np.asarray(expected_start), rel=1e-4, abs=1e-6)
+
+
+def test_noise_of_the_state_that_is_fitted_is_foretold(tmp_path):
+    """Scatter of errors beyond the first fifth, over logs that differ in their noise alone; two inertias and a shaft."""
+    study = multisine_study(1.0, transmission={"law": "linear_shaft", "stiffness": 60.0})
+    model, _ = with_torques(as_arrays(prepare(read_config(study)), float))
+    segments = segments_of(record_study(study, tmp_path), model.sides)
+    windows, _ = windows_of(segments, model, 250)
+    random, runs = np.random.default_rng(2), []
+    for _ in range(20):
+        measured = {
+            side: np.asarray(readings) + float(windows.noise[side]) * random.standard_normal(readings.shape)
+            for side, readings in windows.measured.items()
+        }
+        runs.append(best_runs(model, dataclasses.replace(windows, measured=measured), 8, False))
+    foretold = np.stack([run.residual[:, count_seen(250) :] for run in runs])
+    scatter = np.sqrt(np.mean(np.var(foretold, axis=0, ddof=1), axis=(0, 1)))
+    np.testing.assert_allclose(scatter, np.hypot(1.0, runs[0].noise), rtol=0.1)
+    assert (runs[0].noise > 0.3).all()
 
 
 def test_torques_may_be_added_sample_by_sample(log):

@@ -25,6 +25,8 @@ class Torques:
     motion_scale: float = 1.0
     noise: float = 1e-4
     noise_scale: float = 1.0
+    friction: float = 0.0
+    is_beside: bool = True
 
     def missing(self, experiment, name="torque"):
         if name == "deviation":
@@ -33,44 +35,46 @@ class Torques:
         for segment in self.segments:
             i = segment.rows.start // SAMPLES
             time = 1e-3 * np.arange(SAMPLES)
-            speed, change = (
-                self.motion_scale * 30.0 * np.sin(5.0 * time + i),
-                self.motion_scale * 150.0 * np.cos(5.0 * time + i),
-            )
+            # where dry friction is, the second log moves by half as much
+            scale = self.motion_scale / (1 + i * bool(self.friction))
+            speed, change = scale * 30.0 * np.sin(5.0 * time + i), scale * 150.0 * np.cos(5.0 * time + i)
             noise = self.noise_scale * self.noise * np.random.default_rng(i).standard_normal(SAMPLES)
             drive = experiment.drive
             result.append(
                 (self.truth[i] - float(drive.motor_inertia)) * change
                 + (VISCOUS - float(drive.motor_viscous)) * speed
+                + self.friction * np.sign(speed)
                 + noise
             )
         return {"motor": np.concatenate(result)}
 
     def lacking_friction(self, experiment, side):
-        return np.zeros((2, len(self.segments) * SAMPLES)), np.full(len(self.segments) * SAMPLES, True)
+        time, count = 1e-3 * np.arange(SAMPLES), len(self.segments) * SAMPLES
+        phases = [segment.rows.start // SAMPLES for segment in self.segments]
+        direction = np.concatenate([np.sign(np.sin(5.0 * time + i)) for i in phases])
+        return self.is_beside * np.stack([direction, np.ones(count)]), np.full(count, True)
 
 
 def compare_logs(
     first: float,
     second: float,
     motion_scale: float = 1.0,
-    separate: bool = False,
     files: tuple = ("a.csv", "b.csv"),
     noise: float = 1e-4,
     noise_scale: float = 1.0,
+    friction: float = 0.0,
+    is_beside: bool = True,
 ):
     rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
     names = list(zip(map(Path, files), rows, strict=True))
     segments = tuple(SimpleNamespace(rows=row) for row in rows)
-    task = SimpleNamespace(
-        record=SimpleNamespace(logs=names),
-    )
+    task = SimpleNamespace(record=SimpleNamespace(logs=names))
     config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
     with jax.enable_x64(True):
         experiment = prepare(config.with_keys("run", precision="float64"))
         free = make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
         fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
-        log = Torques(segments, (first, second), motion_scale, noise, noise_scale)
+        log = Torques(segments, (first, second), motion_scale, noise, noise_scale, friction, is_beside)
         return contradictions(task, fitted, log, 5e-3)  # type: ignore[arg-type]
 
 
@@ -91,6 +95,15 @@ def test_logs_of_one_name_are_two():
 
 def test_logs_of_one_machine_agree():
     assert compare_logs(INERTIA, INERTIA) == []
+
+
+def test_a_friction_that_the_model_lacks_is_no_contradiction():
+    """Dry friction of one machine would be a viscous friction, a larger one where the drive moves less."""
+    (contradiction,) = compare_logs(INERTIA, INERTIA, friction=5e-3, is_beside=False)
+    assert contradiction.path == "drive.motor_viscous"
+    assert compare_logs(INERTIA, INERTIA, friction=5e-3) == []
+    # another inertia shows beside it
+    assert compare_logs(INERTIA, 1.5 * INERTIA, friction=5e-3) != []
 
 
 def test_a_difference_without_torque_is_no_contradiction():

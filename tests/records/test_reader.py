@@ -567,6 +567,28 @@ def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
     assert record.contradiction.startswith("u falls with the speed as a viscous friction of -2"), record.contradiction
 
 
+@pytest.mark.parametrize("friction", [0.05, 1.5])
+def test_dry_friction_is_no_sign_of_a_wrong_unit(friction, tmp_path):
+    """A drive that turns slowly: dry friction takes up to some hundred times the work of the model's viscous friction."""
+    t = 2e-3 * np.arange(6000)
+    position = np.sin(2.0 * np.pi * 0.2 * t) + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
+    speed = np.gradient(position, t)
+    u = 1e-3 * np.gradient(speed, t) + 5e-3 * speed + friction * np.sign(speed)
+    frame = pd.DataFrame({"t": t, "u": u, "theta_e": position})
+    record = read_record(write_frame(tmp_path, frame), nominal=NominalDrive(1e-3, 5e-3))
+    assert not [warning for warning in record.warnings if warning.startswith("Doubtful")] and not record.contradiction
+
+
+def test_friction_that_falls_with_the_speed_is_no_wrong_sign(tmp_path):
+    t = 2e-3 * np.arange(6000)
+    position = np.sin(2.0 * np.pi * 0.2 * t) + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
+    speed = np.gradient(position, t)
+    u = 0.1 * np.gradient(speed, t) - 0.5 * speed + 2.0 * np.sign(speed)
+    nominal = NominalDrive(0.1, 0.5)
+    record = read_record(write_frame(tmp_path, pd.DataFrame({"t": t, "u": u, "theta_e": position})), nominal=nominal)
+    assert record.contradiction == ""
+
+
 def test_a_falling_load_gives_its_energy_back(tmp_path):
     """Braking all the way down is no wrong sign."""
     t = 1e-3 * np.arange(3000)
