@@ -167,7 +167,7 @@ def main() -> None:
         "--diagnose", metavar="MODULE:FUNCTION", help="diagnose(logs, model, holdout); left out: the package's"
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes that share the work")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there; go on there")
     workshop = parser.add_argument_group("workshop")
     workshop.add_argument("--first", type=int, default=0, metavar="N", help="number of the first case")
     workshop.add_argument(
@@ -197,7 +197,10 @@ def main() -> None:
         if asked.diagnose:
             module, _, function = asked.diagnose.partition(":")
             diagnose, best = getattr(importlib.import_module(module), function), None
-        outcomes = run(hidden_cases, diagnose, best, asked.jobs, identify)
+        answers = None if asked.out is None else asked.out / "answers"
+        if answers is not None:
+            answers.mkdir(parents=True, exist_ok=True)
+        outcomes = run(hidden_cases, diagnose, best, asked.jobs, identify, answers)
     heading = f"Seed {asked.seed}, {len(hidden_cases)} cases, {asked.kind}"
     print(markdown(outcomes, heading))
     if asked.out is not None:

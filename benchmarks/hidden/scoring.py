@@ -85,6 +85,7 @@ def run(
     oracle: Oracle | None = None,
     jobs: int = 1,
     identify: Identify | None = None,
+    folder: Path | None = None,
 ) -> list[Outcome]:
     """Diagnose every case.
 
@@ -94,9 +95,10 @@ def run(
         oracle: what the true effects can reach.
         jobs: processes that share the work; functions must then be importable.
         identify: what the numbers of `rough` are after the advice has been taken.
+        folder: of answers that are kept, case by case; what is there is not asked again.
     """
     results = []
-    diagnose_case = partial(_diagnose, diagnose=diagnose, oracle=oracle, identify=identify)
+    diagnose_case = partial(_diagnose_once, folder=folder, diagnose=diagnose, oracle=oracle, identify=identify)
     for i, (result, model) in enumerate(map_jobs(diagnose_case, hidden_cases, jobs)):
         results.append((result, model))
         judgement = "right" if result.is_right and not result.spurious_effects else "WRONG"
@@ -108,6 +110,24 @@ def run(
     outcomes = [result for result, _ in results]
     prove(hidden_cases, outcomes, [model for _, model in results])
     return outcomes
+
+
+def _diagnose_once(
+    case: Case, folder: Path | None, diagnose: Diagnose, oracle: Oracle | None, identify: Identify | None
+) -> tuple[Outcome, Mapping[str, Any] | None]:
+    """The answer to a case that a folder keeps, or a new one, which is kept there."""
+    if folder is None:
+        return _diagnose(case, diagnose, oracle, identify)
+    path = folder / f"{case.name}.json"
+    if not path.exists():
+        result, model = _diagnose(case, diagnose, oracle, identify)
+        draft = path.with_suffix(".draft")
+        draft.write_text(json.dumps({"outcome": asdict(result), "model": model}), encoding="utf-8")
+        draft.replace(path)
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    result = Outcome(**stored["outcome"])
+    result.findings = [(effect, confidence, rivals) for effect, confidence, rivals in result.findings]
+    return result, stored["model"]
 
 
 def prove(hidden_cases: Sequence[Case], outcomes: Sequence[Outcome], models: Sequence[Mapping[str, Any] | None]) -> None:
