@@ -9,20 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, fit_with_jackknife, rms
+from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
 from .rigid_body import smooth_sign
 from .signal_quality import long_segments, low_pass, trim_filter_ends
 
 _MAX_HARMONIC = 40
 """Largest number of periods a turn: more than poles, slots and balls of small drives make."""
-_MIN_TURNS = 2.0
-"""Turns that each log has to cover: over fewer ones a wave of one period a turn does not repeat."""
+_MIN_PERIODS = 2.0
+"""Periods of a wave that a log has to cover to show it: over fewer ones it does not repeat."""
 _CUTOFF = 50.0
 """Cutoff of the low-pass for accelerations, Hz: above it their noise is larger than the torques of most drives."""
 _MIN_SPEED_SHARE = 0.05
 """Share of the rms speed below which a drive may stick: its torque then does not depend on its position."""
 _SURE_WAVE_ERRORS = 6.0
 """Standard errors from which on a wave is sure: one of eighty numbers exceeds them by chance in 1 log of 100."""
+_MOST_WAVES = 8
+"""Waves that are sought: the largest of them are enough to tell a shift."""
 _SURE_SHIFT_ERRORS, _BETTER_ERRORS = 4.0, 3.0
 """Standard errors by which shifted waves have to be better than no waves, among a hundred shifts, and than unshifted."""
 _SHIFTS_PER_PERIOD = 8
@@ -33,7 +35,7 @@ class TurningLog(NamedTuple):
     """Signals of a log in which torques over the turn are searched.
 
     Attributes:
-        torque: N m, shape (samples,).
+        torque: held from each sample to the next, N m, shape (samples,).
         motor, load: positions, rad on the motor's side, shape (samples,); load is None if it was not recorded.
         segments: parts without gaps.
         period: of the samples, s.
@@ -76,38 +78,37 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     """
     cutoff = min(_CUTOFF, 0.1 / max(first.period, second.period))
     first_rows, rows = (_select_moving_rows(log, cutoff) for log in (first, second))
-    if first_rows is None or rows is None:
+    if first_rows is None or rows is None or len(first_rows.torque) <= BLOCKS * 2 * _MAX_HARMONIC:
         return None
-    return _find_shift(first_rows, rows) or _find_shift(*map(_exchange_acceleration, (first_rows, rows)))
+    turns = sum(float(np.ptp(first.motor[segment])) for segment in first.segments) / (2.0 * np.pi)
+    lowest = int(np.ceil(_MIN_PERIODS / max(turns, _MIN_PERIODS / _MAX_HARMONIC)))
+    return _find_shift(first_rows, rows, lowest) or _find_shift(*map(_exchange_acceleration, (first_rows, rows)), lowest)
 
 
 def _exchange_acceleration(rows: "_MovingRows") -> "_MovingRows":
     """Exchange torque and acceleration: under a constant torque the acceleration shows what repeats with the turn."""
-    # a constant torque is the column of ones once more
-    varying_torque = rows.torque[:, None][:, : int(np.ptp(rows.torque) > 1e-6 * rms(rows.torque))]
-    return rows._replace(torque=rows.columns[:, 0], columns=np.hstack([varying_torque, rows.columns[:, 1:]]))
+    return rows._replace(torque=rows.columns[:, 0], columns=np.hstack([rows.torque[:, None], rows.columns[:, 1:]]))
 
 
-def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows") -> ZeroShift | None:
-    regressors = np.hstack([first_rows.columns, first_rows.cosine, first_rows.sine])
-    values, errors = fit_with_jackknife(first_rows.torque, regressors)
-    if not np.isfinite(values).all():
+def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int) -> ZeroShift | None:
+    """Find the shift of the second rows by the waves of the first, which are of `lowest_wave` periods a turn and more."""
+    # a column that does not vary is a constant
+    varies = np.ptp(first_rows.columns, axis=0) > 1e-6 * column_rms(first_rows.columns)
+    motion = np.hstack([first_rows.columns[:, varies], np.ones((len(first_rows.torque), 1))])
+    waves, values = _find_waves(first_rows, motion, lowest_wave - 1)
+    if not waves:
         return None
-    motion_terms = first_rows.columns.shape[1]
-    cosine_error, sine_error = errors[motion_terms:].reshape(2, -1)
-    cosine, sine = values[motion_terms:].reshape(2, -1)
-    waves = np.flatnonzero(np.hypot(cosine / cosine_error, sine / sine_error) > _SURE_WAVE_ERRORS)
-    if not len(waves):
-        return None
+    cosine, sine = values[motion.shape[1] :].reshape(-1, 2).T
     # torque a_n cos(n q) + b_n sin(n q) = Re((a_n - i b_n) exp(i n q))
-    size = cosine[waves] - 1j * sine[waves]
-    harmonics = waves + 1
-    shifts = np.linspace(-np.pi, np.pi, 2 * (_SHIFTS_PER_PERIOD * int(harmonics[-1]) // 2), endpoint=False)
+    size, harmonics = cosine - 1j * sine, np.array(waves) + 1
+    shifts = np.linspace(-np.pi, np.pi, 2 * (_SHIFTS_PER_PERIOD * int(harmonics.max()) // 2), endpoint=False)
     turns = np.exp(1j * harmonics[:, None] * shifts) * size[:, None]
-    signals = np.hstack([rows.torque[:, None], rows.cosine[:, waves] @ turns.real - rows.sine[:, waves] @ turns.imag])
-    # without the part that the motion explains
-    residuals = signals - rows.columns @ np.linalg.lstsq(rows.columns, signals, rcond=1e-10)[0]
-    blocks = np.array_split(np.arange(len(residuals)), BLOCKS)
+    # what the motion takes is known by the first log, but for constants
+    torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1] - 1]
+    signals = np.hstack([torque[:, None], rows.cosine[:, waves] @ turns.real - rows.sine[:, waves] @ turns.imag])
+    constants = np.hstack([rows.columns[:, ~varies], np.ones((len(signals), 1))])
+    residuals = signals - constants @ np.linalg.lstsq(constants, signals, rcond=1e-10)[0]
+    blocks = np.array_split(np.arange(len(signals)), BLOCKS)
     squares_without_waves = np.array([np.sum(residuals[block, 0] ** 2) for block in blocks])
     squares = np.array([np.sum((residuals[block, :1] - residuals[block, 1:]) ** 2, axis=0) for block in blocks])
     total = squares.sum(axis=0)
@@ -130,16 +131,40 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows") -> ZeroShift | N
     error = float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((np.array(without) - np.mean(without)) ** 2)))
     if not abs(value) > _BETTER_ERRORS * error:
         return None
-    return ZeroShift(float(value), error, tuple(int(n) for n in harmonics))
+    return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
+
+
+def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[list[int], np.ndarray]:
+    """Find the waves that a log surely shows, the one that takes away most first, and fit them beside the motion.
+
+    All at once would not do: over a few turns neighbouring waves look alike.
+
+    Returns:
+        Columns of the waves, and coefficients of the motion and of each wave's cosine and sine.
+    """
+    found: list[int] = []
+    columns, values = motion, np.zeros(0)
+    while len(found) < _MOST_WAVES:
+        basis = np.linalg.qr(columns)[0]
+        parts = (rows.torque[:, None], rows.cosine[:, lowest:], rows.sine[:, lowest:])
+        torque, cosine, sine = (part - basis @ (basis.T @ part) for part in parts)
+        pairs = [np.linalg.qr(np.stack(pair, axis=1))[0] for pair in zip(cosine.T, sine.T, strict=True)]
+        wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
+        columns = np.hstack([columns, rows.cosine[:, [wave]], rows.sine[:, [wave]]])
+        coefficients, errors = fit_with_jackknife(rows.torque, columns)
+        if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_WAVE_ERRORS:
+            break
+        found, values = [*found, wave], coefficients
+    return found, values
 
 
 def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
-    """Select the rows of a log in motion; None if it does not turn far enough."""
+    """Select the rows of a log in motion; None if there are too few."""
     parts = []
     for s in long_segments(log.segments):
         place = low_pass(log.motor[s], cutoff, log.period)
         velocity = np.gradient(place, log.period)
-        columns = [np.gradient(velocity, log.period), velocity, smooth_sign(velocity), np.ones(len(place))]
+        columns = [np.gradient(velocity, log.period), velocity, smooth_sign(velocity)]
         if log.load is not None:
             twist = place - low_pass(log.load[s], cutoff, log.period)
             columns += [twist, np.gradient(twist, log.period)]
@@ -152,18 +177,19 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
             )
             for wave in (np.cos, np.sin)
         )
-        torque = low_pass(log.torque[s], cutoff, log.period)[rows]
+        held = log.torque[s]
+        torque = low_pass(0.5 * (np.append(held[:1], held[:-1]) + held), cutoff, log.period)[rows]
         parts.append((torque, np.stack(columns, axis=1)[rows], cosine, sine))
-    if not parts or sum(float(np.ptp(log.motor[s])) for s in log.segments) < _MIN_TURNS * 2.0 * np.pi:
+    if not parts:
         return None
     rows_in_segments = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))
     speed = np.abs(rows_in_segments.columns[:, 1])
     rows = speed > _MIN_SPEED_SHARE * rms(speed)
     moving_rows = _MovingRows(*(columns_of_rows[rows] for columns_of_rows in rows_in_segments))
     if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
-        # in one direction the sign of the velocity is the column of ones once more
-        moving_rows = moving_rows._replace(columns=np.delete(moving_rows.columns, 2, axis=1))
-    return moving_rows if len(moving_rows.torque) > BLOCKS * 2 * _MAX_HARMONIC else None
+        # in one direction the sign of the velocity is a constant
+        moving_rows.columns[:, 2] = 1.0
+    return moving_rows if len(moving_rows.torque) > BLOCKS * 2 * moving_rows.columns.shape[1] else None
 
 
 def _parabola_minimum(squares: np.ndarray) -> float:

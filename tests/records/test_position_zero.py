@@ -31,6 +31,17 @@ def test_the_difference_of_the_zeros_is_found(gear: bool):
     assert abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
 
 
+def test_the_first_fifth_of_a_log_is_enough_to_turn_it():
+    short = simulate_turning_log(2, 0.4)._replace(segments=[slice(0, 1600)])
+    shift = find_zero_shift(simulate_turning_log(1, 0.0), short)
+    assert shift is not None and abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
+
+
+def test_less_than_a_turn_is_enough_for_fast_waves():
+    shift = find_zero_shift(simulate_turning_log(1, 0.0, turns=0.3), simulate_turning_log(2, 0.4, turns=0.3))
+    assert shift is not None and abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
+
+
 def simulate_torque_step(zero: float, torque: float, cogging: float = 2e-3) -> TurningLog:
     """A motor under a constant torque; cogging of 7 a turn makes its speed ripple."""
     period, speed, position = 2e-3, torque / 1e-3, 0.0
@@ -66,9 +77,9 @@ def test_the_smallest_of_equal_places_is_taken():
         (simulate_turning_log(1, 0.3), simulate_turning_log(2, 0.3)),
         (simulate_turning_log(1, 0.0, cogging=0.0), simulate_turning_log(2, 0.4, cogging=0.0)),
         (simulate_turning_log(1, 0.0), simulate_turning_log(2, 0.4, cogging=0.0)),
-        (simulate_turning_log(1, 0.0, turns=0.3), simulate_turning_log(2, 0.4, turns=0.3)),
+        (simulate_turning_log(1, 0.0, turns=0.05), simulate_turning_log(2, 0.4, turns=0.05)),
     ],
-    ids=["one zero", "no cogging", "cogging in one alone", "less than a turn"],
+    ids=["one zero", "no cogging", "cogging in one alone", "less than two periods of the waves"],
 )
 def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
     assert find_zero_shift(first, second) is None
