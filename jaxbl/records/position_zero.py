@@ -21,6 +21,8 @@ _CUTOFF = 50.0
 """Cutoff of the low-pass for accelerations, Hz: above it their noise is larger than the torques of most drives."""
 _MIN_SPEED_SHARE = 0.05
 """Share of the rms speed below which a drive may stick: its torque then does not depend on its position."""
+_MIN_ROWS = 10 * BLOCKS
+"""Rows of a log in motion at least: some ten in each block."""
 _SURE_WAVE_ERRORS = 6.0
 """Standard errors from which on a wave is sure: one of eighty numbers exceeds them by chance in 1 log of 100."""
 _MOST_WAVES = 8
@@ -78,10 +80,10 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     """
     cutoff = min(_CUTOFF, 0.1 / max(first.period, second.period))
     first_rows, rows = (_select_moving_rows(log, cutoff) for log in (first, second))
-    if first_rows is None or rows is None or len(first_rows.torque) <= BLOCKS * 2 * _MAX_HARMONIC:
-        return None
     turns = sum(float(np.ptp(first.motor[segment])) for segment in first.segments) / (2.0 * np.pi)
-    lowest = int(np.ceil(_MIN_PERIODS / max(turns, _MIN_PERIODS / _MAX_HARMONIC)))
+    if first_rows is None or rows is None or turns * _MAX_HARMONIC < _MIN_PERIODS:
+        return None
+    lowest = int(np.ceil(_MIN_PERIODS / turns))
     return _find_shift(first_rows, rows, lowest) or _find_shift(*map(_exchange_acceleration, (first_rows, rows)), lowest)
 
 
@@ -189,7 +191,7 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
         # in one direction the sign of the velocity is a constant
         moving_rows.columns[:, 2] = 1.0
-    return moving_rows if len(moving_rows.torque) > BLOCKS * 2 * moving_rows.columns.shape[1] else None
+    return moving_rows if len(moving_rows.torque) > _MIN_ROWS else None
 
 
 def _parabola_minimum(squares: np.ndarray) -> float:
