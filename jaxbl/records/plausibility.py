@@ -254,8 +254,8 @@ _DOUBTFUL_TORQUE = 1000.0
 """Factor between the torque and the torque for the nominal inertia that makes a unit doubtful, as mN m for N m. A screw that
 turns slowly against dry friction needs six hundred times the torque of its inertia."""
 _DOUBTFUL_FRICTION = 100.0
-"""Factor between the friction's work, less that of dry friction, and that of the nominal viscous friction that makes a unit
-doubtful. Dry friction may take any multiple, as on a drive that turns slowly; a tenth is seen only with wrong units."""
+"""Factor between the friction's work and that of the nominal viscous friction that makes a unit doubtful, where the rough fit shows viscous friction. Dry friction may take any multiple, as on a drive that turns slowly; a
+tenth is seen only with wrong units."""
 
 
 def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: NominalDrive) -> None:
@@ -266,11 +266,13 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     """
     nominal_inertia = nominal.inertia_at(channel)
     inertia, inertia_error = float(rigid_fit.values[0]), float(rigid_fit.errors[0])
-    nominal_power = nominal.viscous_at(channel) * rigid_fit.square
+    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
+    shows_viscous = abs(viscous) > 8.0 * float(rigid_fit.errors[1]) and rigid_fit.inflation[1] < 10.0
+    nominal_power = nominal_viscous * rigid_fit.square
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
     power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
     if power_ratio is not None and power_ratio >= _DOUBTFUL_FRICTION:
-        power_ratio = max((friction_power - rigid_fit.dry_power) / nominal_power, 1.0)
+        power_ratio = viscous / nominal_viscous if shows_viscous else None
     has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
     sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
     text, is_doubtful, is_surely_wrong, ratio = "", False, False, 1.0
@@ -306,12 +308,10 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
-    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
     if (
         # friction that falls with the speed takes work none the less
         friction_power < 0.0
-        and viscous < -8.0 * float(rigid_fit.errors[1])
-        and rigid_fit.inflation[1] < 10.0
+        and shows_viscous
         and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
     ):
         file.contradiction = (

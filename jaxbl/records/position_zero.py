@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
-from .rigid_body import smooth_sign
+from .rigid_body import MIN_SPEED_SHARE, smooth_sign
 from .signal_quality import long_segments, low_pass, trim_filter_ends
 
 _MAX_HARMONIC = 40
@@ -19,8 +19,6 @@ _MIN_PERIODS = 2.0
 """Periods of a wave that a log has to cover to show it: over fewer ones it does not repeat."""
 _CUTOFF = 50.0
 """Cutoff of the low-pass for accelerations, Hz: above it their noise is larger than the torques of most drives."""
-_MIN_SPEED_SHARE = 0.05
-"""Share of the rms speed below which a drive may stick: its torque then does not depend on its position."""
 _MIN_ROWS = 10 * BLOCKS
 """Rows of a log in motion at least: some ten in each block."""
 _SURE_WAVE_ERRORS = 6.0
@@ -186,7 +184,7 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
         return None
     rows_in_segments = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))
     speed = np.abs(rows_in_segments.columns[:, 1])
-    rows = speed > _MIN_SPEED_SHARE * rms(speed)
+    rows = speed > MIN_SPEED_SHARE * rms(speed)
     moving_rows = _MovingRows(*(columns_of_rows[rows] for columns_of_rows in rows_in_segments))
     if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
         # in one direction the sign of the velocity is a constant

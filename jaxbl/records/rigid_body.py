@@ -26,7 +26,6 @@ class RigidFit:
         torque: rms, N m (N).
         acceleration: rms of the low-passed motion, rad/s² (m/s²).
         power: mean power of the torque, W.
-        dry_power: what the term with the sign of the velocity takes of it, W.
         square: mean of the squared low-passed speed, rad²/s² (m²/s²).
         slowing: fall of the squared speed from begin to end of the segments, over their duration, rad²/s³ (m²/s³).
     """
@@ -40,7 +39,6 @@ class RigidFit:
     torque: float
     acceleration: float
     power: float
-    dry_power: float
     square: float
     slowing: float
 
@@ -57,6 +55,10 @@ class RigidFit:
             for name, value, error, inflation, share in zip(self.names, *columns, strict=True)
         }
         return {"terms": terms, "residual": self.residual}
+
+
+MIN_SPEED_SHARE = 0.05
+"""Share of the rms speed below which a drive may stick: its torque then does not depend on its motion."""
 
 
 def smooth_sign(velocity: np.ndarray) -> np.ndarray:
@@ -90,27 +92,28 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
     if np.ptp(target) == 0.0:
         return None
-    coefficients, errors = fit_with_jackknife(target, rows)
+    # what holds a drive at rest is no function of its motion
+    moves = np.abs(rows[:, 1]) > MIN_SPEED_SHARE * rms(rows[:, 1])
+    coefficients, errors = fit_with_jackknife(target[moves], rows[moves])
     if not np.isfinite(coefficients).all():
         # two terms are proportional to each other
         coefficients, errors = np.zeros(6), np.full(6, np.inf)
-    terms = rows[:, :5]
+    terms = rows[moves, :5]
     centred = terms[:, :4] - terms[:, :4].mean(axis=0)
     inflation = np.full(5, np.inf)
     if np.isfinite(errors).all() and (column_rms(centred) > 0.0).all():
         inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
-    residuals = target - rows @ coefficients
+    residuals = (target - rows @ coefficients)[moves]
     return RigidFit(
         names=("inertia", "viscous", "coulomb", "spring", "constant"),
         values=coefficients[:5],
         errors=errors[:5],
         inflation=inflation,
-        shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(target),
-        residual=float(np.std(residuals) / np.std(target)),
+        shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(target[moves]),
+        residual=float(np.std(residuals) / np.std(target[moves])),
         torque=rms(target),
         acceleration=rms(rows[:, 0]),
         power=float(np.mean(target * rows[:, 1])),
-        dry_power=float(coefficients[2] * np.mean(rows[:, 2] * rows[:, 1])),
         square=float(np.mean(rows[:, 1] ** 2)),
         slowing=slowing / (len(rows) * period),
     )
