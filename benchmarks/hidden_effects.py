@@ -167,7 +167,7 @@ def main() -> None:
         "--diagnose", metavar="MODULE:FUNCTION", help="diagnose(logs, model, holdout); left out: the package's"
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes that share the work")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there; go on there")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores and figures there, and go on there")
     workshop = parser.add_argument_group("workshop")
     workshop.add_argument("--first", type=int, default=0, metavar="N", help="number of the first case")
     workshop.add_argument(

@@ -73,13 +73,17 @@ def _named(summary: dict[str, Any]) -> list[str]:
 
 
 def _answer(machine: Machine, logs: list[Path], holdout: Path | None) -> tuple[bool, str]:
-    """Whether all that is lacking is named and nothing else with more than 0.95, and what is named."""
+    """Whether all that is lacking is named and nothing else with more than 0.95, and what is named.
+
+    The truth's friction bends before it slides: where an encoder sees that, presliding is its name.
+    """
     import jaxbl
 
     summary = jaxbl.diagnose(logs if len(logs) > 1 else logs[0], machine.model, holdout=holdout).summary
-    sure = {finding["effect"] for finding in summary["findings"] if finding["confidence"] > 0.95}
-    text = f"{summary['verdict']}: {', '.join(_named(summary)) or 'nothing'}"
-    return set(machine.lacking) <= set(_named(summary)) and sure <= set(machine.lacking), text
+    lacking = {name.replace("presliding", "coulomb") for name in machine.lacking}
+    named = {finding["effect"].replace("presliding", "coulomb"): finding["confidence"] for finding in summary["findings"]}
+    sure = {name for name, confidence in named.items() if confidence > 0.95}
+    return sure <= lacking <= set(named), f"{summary['verdict']}: {', '.join(_named(summary)) or 'nothing'}"
 
 
 def try_contradiction(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
@@ -175,7 +179,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 try:
                     right, text = KINDS[kind](rng, Path(folder))
-                except (InputError, ArithmeticError) as error:
+                except (InputError, ArithmeticError, LookupError) as error:
                     right, text = False, f"{type(error).__name__}: {error}"
             hits += right
             print(f"{kind} {i}: {'right' if right else 'WRONG'} ({text})", flush=True)

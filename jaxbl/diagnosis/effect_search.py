@@ -527,8 +527,7 @@ class EffectSearch:
             if behind and any(gain > 0.0 for gain, _ in tried):
                 break
             model = self._with(current, one, predictor)
-            gain = self._gain(base, model) if model.linear.share(one.name) > LEAST else -np.inf
-            tried.append((gain, model))
+            tried.append((self._gain(base, model) if self._is_felt(model) else -np.inf, model))
         gains = {model.names[-1]: gain for gain, model in tried}
         # of an effect and its special case the simpler one, unless the other is clearly better
         tried = [
@@ -553,7 +552,7 @@ class EffectSearch:
             gain = self._gain(base, one) + ODDS - linear.choices(one.name)
             if gain > 0.0:
                 model = self._with(current, one, predictor)
-                if np.isfinite(model.log_evidence) and model.linear.share(one.name) > LEAST:
+                if self._is_felt(model):
                     tried.append((gain, model))
         return predictor, sorted(tried, key=lambda pair: -pair[0])
 
@@ -563,6 +562,10 @@ class EffectSearch:
         numbers[one.name] = one.found.numbers
         announce(f"trying {' + '.join(numbers)}")
         return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
+
+    def _is_felt(self, model: Model) -> bool:
+        """Whether a model can be simulated, and its last effect has a torque that counts."""
+        return bool(np.isfinite(model.log_evidence)) and model.linear.share(model.names[-1]) > LEAST
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
         """Gain in evidence of free functions beside a model (nats), and their size over the driving torque, by name."""

@@ -254,8 +254,9 @@ _DOUBTFUL_TORQUE = 1000.0
 """Factor between the torque and the torque for the nominal inertia that makes a unit doubtful, as mN m for N m. A screw that
 turns slowly against dry friction needs six hundred times the torque of its inertia."""
 _DOUBTFUL_FRICTION = 100.0
-"""Factor between the friction's work and that of the nominal viscous friction that makes a unit doubtful, where the rough fit shows viscous friction. Dry friction may take any multiple, as on a drive that turns slowly; a
-tenth is seen only with wrong units."""
+"""Factor between the friction's work and that of the nominal viscous friction that makes a unit doubtful, where the rough
+fit shows viscous friction. Dry friction may take any multiple, as on a drive that turns slowly; a tenth is seen only with
+wrong units."""
 
 
 def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: NominalDrive) -> None:

@@ -41,7 +41,9 @@ def test_a_candidate_that_cannot_be_simulated_is_left_out(name, numbers, tmp_pat
         search = prepare_search(tmp_path / "axis.csv", nominal_study())
         theta = np.zeros(len(search.free))
         model = search.refit({name: numbers}, theta, search.linear({}, theta).choose(()))
-    assert model.log_evidence == -np.inf
+        assert model.log_evidence == -np.inf
+        # nor is it asked what torque it has
+        assert not search._is_felt(model)
 
 
 @pytest.mark.parametrize("i", [1, 2, 3])
