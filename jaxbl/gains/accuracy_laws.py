@@ -163,27 +163,22 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
     """
     is_usable = np.isfinite(y) & (y > 0.0) & (True if usable is None else usable)
     log_x, log_y = np.log(x), np.log(np.where(is_usable, y, 1.0))
-    best_rank: tuple[float, float] | None = None
-    best_fit = None
+    fits = []
     for first in range(len(x)):
         for last in range(first + LEAST_POINTS - 1, len(x)):
             if not is_usable[first : last + 1].all():
                 break
-            span = log_x[last] - log_x[first]
-            if span < math.log(LEAST_SPAN) * (1.0 - 1e-9):
-                continue
-            fit, largest_residual = _fit_line(log_x, log_y, first, last)
-            difference, difference_error = _slope_difference(log_x, log_y, fit)
-            if largest_residual > LARGEST_RESIDUAL or abs(difference) > max(LARGEST_BEND, 2.0 * difference_error):
-                continue
-            rank = (round(span, 9), -fit.standard_error)
-            if best_rank is None or rank > best_rank:
-                best_rank, best_fit = rank, fit
-    return best_fit
+            if log_x[last] - log_x[first] >= math.log(LEAST_SPAN) * (1.0 - 1e-9):
+                fits.append(_fit_line(log_x, log_y, first, last))
+    return max(
+        (fit for fit in fits if fit is not None),
+        key=lambda fit: (round(float(log_x[fit.last] - log_x[fit.first]), 9), -fit.standard_error),
+        default=None,
+    )
 
 
-def _fit_line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tuple[PowerLawFit, float]:
-    """Fit a line to the points first ... last by least squares. Returns it with its largest residual in ln y."""
+def _fit_line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> PowerLawFit | None:
+    """Fit a line to the points first ... last by least squares; None if a point is too far from it, or it bends."""
     run_x, run_y = log_x[first : last + 1], log_y[first : last + 1]
     centred_x, slope = run_x - run_x.mean(), _least_squares_slope(run_x, run_y)
     intercept = float(run_y.mean() - slope * run_x.mean())
@@ -194,25 +189,22 @@ def _fit_line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tu
         _least_squares_slope(run_x[:middle], run_y[:middle]),
         _least_squares_slope(run_x[-middle:], run_y[-middle:]),
     )
-    return PowerLawFit(slope, standard_error, intercept, first, last, half_slopes), float(np.abs(residual).max())
-
-
-def _least_squares_slope(x: np.ndarray, y: np.ndarray) -> float:
-    centred_x = x - x.mean()
-    return float(centred_x @ y / (centred_x @ centred_x))
-
-
-def _slope_difference(log_x: np.ndarray, log_y: np.ndarray, fit: PowerLawFit) -> tuple[float, float]:
-    """Return the slope of the upper half less that of the lower half, and the standard error of this difference."""
-    run_x, run_y = log_x[fit.first : fit.last + 1], log_y[fit.first : fit.last + 1]
-    middle = (len(run_x) + 1) // 2
     # the scatter is taken from each point's distance to the line through its neighbours; a bend moves all of them alike, and
     # is left out of the variance
     weights = (run_x[1:-1] - run_x[:-2]) / (run_x[2:] - run_x[:-2])
     misses = run_y[1:-1] - (1.0 - weights) * run_y[:-2] - weights * run_y[2:]
     variance = float(np.var(misses / np.sqrt(1.0 + weights**2 + (1.0 - weights) ** 2), ddof=1))
     inverse_squares = sum(1.0 / float(((half - half.mean()) ** 2).sum()) for half in (run_x[:middle], run_x[-middle:]))
-    return fit.half_slopes[1] - fit.half_slopes[0], math.sqrt(variance * inverse_squares)
+    difference_error = math.sqrt(variance * inverse_squares)
+    bends = abs(half_slopes[1] - half_slopes[0]) > max(LARGEST_BEND, 2.0 * difference_error)
+    if bends or np.abs(residual).max() > LARGEST_RESIDUAL:
+        return None
+    return PowerLawFit(slope, standard_error, intercept, first, last, half_slopes)
+
+
+def _least_squares_slope(x: np.ndarray, y: np.ndarray) -> float:
+    centred_x = x - x.mean()
+    return float(centred_x @ y / (centred_x @ centred_x))
 
 
 def accuracy_laws(result: StudyResult, figures: list[FigureTable] | None = None) -> list[Law]:
@@ -245,10 +237,13 @@ def _fit_figure_lines(config: Config, frame: pd.DataFrame, figure: FigureTable, 
     assert figure.theory is not None
     fixed = resolve_where(config, figure)
     rows = filter_rows(frame, fixed)
-    for facet in [None] if figure.facet is None else sorted(rows[figure.facet].unique()):
-        for name in [None] if figure.series is None else sorted(rows[figure.series].unique()):
-            where = fixed | ({} if figure.facet is None else {figure.facet: to_jsonable(facet)})
-            series = {} if figure.series is None else {figure.series: to_jsonable(name)}
+
+    def list_values(path: str | None) -> list[dict[str, Any]]:
+        return [{}] if path is None else [{path: to_jsonable(value)} for value in sorted(rows[path].unique())]
+
+    for facet in list_values(figure.facet):
+        for series in list_values(figure.series):
+            where = fixed | facet
             line = _FigureLine(config, frame, figure, where | series)
             fit = fit_power_law(line.x, line.y, line.usable)
             ends = line.explain_ends(fit)

@@ -111,7 +111,7 @@ class _Adversaries(NamedTuple):
 
 def _draw_adversaries(rng: np.random.Generator, system: ErrorSystem, start: tuple[float, float]) -> _Adversaries:
     """A batch of adversaries, all kinds in turn; `start`: largest errors, of position and velocity."""
-    shape, root = (_LANES,), math.sqrt(1.0 + system.noise)
+    root = math.sqrt(1.0 + system.noise)
     low, high = np.log(_RATE_RANGE)
     rates = np.exp(rng.uniform(low, high, (2, _LANES)))
     lines = np.concatenate([rng.uniform(-1.0, 2.0, (2, _LANES)), 0.5 * root * rng.normal(size=(2, _LANES))])
@@ -128,7 +128,7 @@ def _draw_adversaries(rng: np.random.Generator, system: ErrorSystem, start: tupl
         phase=rng.random((2, _LANES)),
         line=lines,
         mean=np.where(rng.random(_LANES) < 0.8, 1.0, rng.random(_LANES)),
-        side=np.sign(rng.normal(size=shape)),
+        side=np.sign(rng.normal(size=_LANES)),
         position=start[0] * corner[0],
         velocity=start[1] * corner[1],
         bits=rng.integers(1, 2**32, _LANES, dtype=np.uint32),
@@ -137,8 +137,9 @@ def _draw_adversaries(rng: np.random.Generator, system: ErrorSystem, start: tupl
 
 def _draw_uniform(bits: Array) -> tuple[Array, Array]:
     """The next state of xorshift (G. Marsaglia, 2003), and a number in 0 ... 1."""
-    for left_shift, right_shift in ((13, 0), (0, 17), (5, 0)):
-        bits = bits ^ ((bits << left_shift) if left_shift else (bits >> right_shift))
+    bits ^= bits << 13
+    bits ^= bits >> 17
+    bits ^= bits << 5
     return bits, bits.astype(float) / 2.0**32
 
 
@@ -231,7 +232,8 @@ def search_violations(
         bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)
 
         def run(lanes: _Adversaries, limits: np.ndarray, record: bool = False) -> tuple[Any, ...]:
-            sequence = _repeat_sequence(best, len(limits))
+            # repeated until it is as long
+            sequence = Sequence(*(np.resize(choices, len(limits)) for choices in best))
             return jax.tree.map(
                 np.asarray, _run_adversaries(observer, bound, push, lanes, sequence, limits, np.asarray(settled), record)
             )
@@ -253,8 +255,3 @@ def search_violations(
                 best = Sequence(*(x[:, 0] for x in recorded))
             worst = max(worst, float(largest.max()))
     return SearchResult(batches * _LANES, explored.state_count, worst, latest, violations, best)
-
-
-def _repeat_sequence(sequence: Sequence, samples: int) -> Sequence:
-    """Repeat a sequence until it has this number of samples."""
-    return Sequence(*(np.resize(x, samples) for x in sequence))

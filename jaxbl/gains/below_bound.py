@@ -4,14 +4,14 @@ causes."""
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
+from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, with_values
+from jaxbl.sweeps.elementwise import call_in_float64
 from jaxbl.sweeps.trial import run
 
 from .under_tuned import excursion, simulate_error
@@ -25,9 +25,8 @@ def missing_acceleration(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarr
 
     It does not depend on the observer: f_plus contains the observer's velocity error as well.
     """
-    with jax.enable_x64(True):
-        nominal = drive.acceleration(side, *(jnp.asarray(trace[name].to_numpy()) for name in (f"{side}.velocity", "u")))
-    return trace[f"{side}.acceleration"].to_numpy() - np.asarray(nominal)
+    velocity, torque = (trace[name].to_numpy() for name in (f"{side}.velocity", "u"))
+    return trace[f"{side}.acceleration"].to_numpy() - call_in_float64(partial(drive.acceleration, side), velocity, torque)
 
 
 def friction_rate(drive: Any, side: str) -> float:

@@ -9,8 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config import SideCertificateTable
@@ -18,6 +16,7 @@ from jaxbl.errors import InputError, NoResult
 from jaxbl.files import json_with_checksum, read_json, to_jsonable, write_atomic
 from jaxbl.observer.conditions import convergence_time_worst, peak_ratio
 from jaxbl.observer.super_twisting import DISCRETISATIONS
+from jaxbl.sweeps.elementwise import call_in_float64
 
 from .adversary import search_violations
 from .gain_search import GainSearch
@@ -93,9 +92,8 @@ def certify(
     system, start, proof, bounds, proven_accuracy, reaching_sample = proven
     speed, final_accuracy = f_plus * period, float(bounds[-1])
     adversary = search_violations(system, *start, proof, proven_accuracy / speed, runs, seed)
-    with jax.enable_x64(True):
-        numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
-        continuous = float(convergence_time_worst(*(jnp.asarray(float(x)) for x in numbers)))
+    numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
+    continuous = float(call_in_float64(convergence_time_worst, *numbers))
     samples = np.unique(np.linspace(0, len(bounds) - 1, _CURVE_POINTS).astype(int))
     refusal = None
     if adversary.violations:
@@ -185,8 +183,7 @@ def _prove(lambda_: float, alpha: float, assumptions: Assumptions, accuracy: flo
         value = numbers[name]
         if value is not None and not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{name}: a certificate needs a finite number > 0, not {value}")
-    with jax.enable_x64(True):
-        ratio = float(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
+    ratio = float(call_in_float64(peak_ratio, lambda_, alpha, f_plus))
     if alpha <= f_plus:
         raise NoResult(f"alpha = {alpha:.4g} rad/s² does not exceed f⁺ = {f_plus:.4g} rad/s²: the error need not shrink")
     if not ratio < 1.0:
@@ -231,19 +228,18 @@ def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumpti
     encoders = config.build().encoders
     rms = float(encoders.noise_of(side, config.drive.gear_ratio if side == "load" else 1.0))
     count = encoders.motor_resolution if side == "motor" else encoders.load_resolution
-    f_plus = max(search.f_plus[side], f_plus, pilot["start"]) if side_table.f_plus is None else side_table.f_plus
-    noise = 0.5 * float(count) + _NOISE_RMS_FACTOR * rms if side_table.noise is None else side_table.noise
-    velocity, position = abs(pilot["velocity_error"]), max(abs(pilot["position_error"]), noise)
-    acceleration = pilot["largest_acceleration"] + f_plus if side_table.acceleration is None else side_table.acceleration
+    stated = side_table.model_dump(exclude={"accuracy", "reaching_time"}, exclude_none=True)
+    f_plus = stated.get("f_plus", max(search.f_plus[side], f_plus, pilot["start"]))
+    noise = stated.get("noise", 0.5 * float(count) + _NOISE_RMS_FACTOR * rms)
     return Assumptions(
         config.observer.discretisation,
         config.run.sample_period,
         f_plus,
         noise,
-        velocity if side_table.velocity_error is None else side_table.velocity_error,
-        position if side_table.position_error is None else side_table.position_error,
-        acceleration,
-    )
+        abs(pilot["velocity_error"]),
+        max(abs(pilot["position_error"]), noise),
+        pilot["largest_acceleration"] + f_plus,
+    )._replace(**stated)
 
 
 def _side_table(search: GainSearch, side: str) -> SideCertificateTable:

@@ -13,6 +13,7 @@ from jaxbl.config import Config, read_config
 from jaxbl.files import to_jsonable
 from jaxbl.sweeps.points import Points
 
+from .pilot import list_axes
 from .stages import Stages
 
 _MOST_REPEATED = 4096
@@ -121,7 +122,7 @@ def repeat_runs(
     if not removed_axes and before == after:
         return None
     points = rows[paths].drop_duplicates()
-    data["axes"] = [{"path": path, "values": points[path].tolist(), "zip": "runs"} for path in paths]
+    data["axes"] = list_axes({"runs": {path: points[path].tolist() for path in paths}})
     data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
     frame = stages.rerun(read_config(data), "causes", name.replace(" ", "_"))
     labels, wanted_labels = (pd.MultiIndex.from_frame(runs[[*paths, "seed"]]) for runs in (frame, rows))

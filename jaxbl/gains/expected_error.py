@@ -1,5 +1,8 @@
 """What the error of a study's observers is due to: its encoders, its gap, and the sampling period."""
 
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false
+
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
+from jaxbl.config.figures import filter_rows
 from jaxbl.sweeps.sweep import sweep
 
 from .pilot import Scenarios, list_axes
@@ -30,10 +34,10 @@ class Causes(NamedTuple):
             frame: the runs, with the columns.
             metric: the column of the errors.
         """
-        errors = []
-        for i in range(len(self.names) + 1):
-            is_run = [frame[path] == values[i] for path, values in self.columns.items()]
-            errors.append(float(frame.loc[np.logical_and.reduce([np.ones(len(frame), bool), *is_run]), metric].max()))
+        errors = [
+            float(filter_rows(frame, {path: values[i] for path, values in self.columns.items()})[metric].max())
+            for i in range(len(self.names) + 1)
+        ]
         # without a disturbance the error may be larger by chance
         squares = np.minimum.accumulate(np.square(errors))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -72,7 +76,7 @@ class ExpectedError(NamedTuple):
     largest_position: float
 
 
-def expect_errors(scenarios: Scenarios, sides: Sequence[str], seeds: int = 4) -> dict[str, ExpectedError]:
+def expect_errors(scenarios: Scenarios, sides: Sequence[str]) -> dict[str, ExpectedError]:
     """Expect the errors of a study's observers, by side, from runs of drives with the study's own gains.
 
     Raises:
@@ -82,11 +86,10 @@ def expect_errors(scenarios: Scenarios, sides: Sequence[str], seeds: int = 4) ->
     for key in ("figures", "tune", "uncertainty", "axes"):
         data.pop(key, None)
     data["axes"] = list_axes({"scenario": scenarios.columns, "causes": causes.columns})
-    result = sweep(read_config(data | {"sweep": {"seeds": seeds}}))
+    result = sweep(read_config(data | {"sweep": {"seeds": 4}}))
     paths = [*scenarios.columns, *causes.columns]
     frame = result.read([*paths, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
-    is_first = [(frame[path] == values[0]).to_numpy() for path, values in scenarios.columns.items()]
-    first = frame.loc[np.logical_and.reduce([np.ones(len(frame), bool), *is_first])]
+    first = filter_rows(frame, {path: values[0] for path, values in scenarios.columns.items()})
     return {
         side: ExpectedError(
             *causes.split(first, f"{side}.velocity_rmse"),

@@ -53,7 +53,7 @@ def usual_rule(f_plus: float) -> tuple[float, float]:
     return 1.5 * math.sqrt(f_plus), 1.1 * f_plus
 
 
-def _grid_ratio(ends: tuple[float, float], num: int) -> float:
+def grid_ratio(ends: tuple[float, float], num: int) -> float:
     """Ratio of neighbouring values among `num` from end to end, evenly spaced on a logarithmic scale."""
     return (ends[1] / ends[0]) ** (1.0 / (num - 1))
 
@@ -101,7 +101,7 @@ class GainSearch:
             self._run_map(0, "wide")
         for stage in range(1, self.table.refine + 1):
             windows = {side: self._zoom_in(side) for side in self.sides}
-            steps = [_grid_ratio(ends, self.table.num) - 1.0 for window in windows.values() for ends in window.values()]
+            steps = [grid_ratio(ends, self.table.num) - 1.0 for window in windows.values() for ends in window.values()]
             if min(steps) < _LEAST_STEP:
                 break
             self.windows.append(windows)
@@ -151,11 +151,7 @@ class GainSearch:
 
     def cell_ratios(self, side: str) -> dict[str, float]:
         """Ratio of neighbouring values of each gain in the last stage."""
-        return {gain: _grid_ratio(ends, self.table.num) for gain, ends in self.windows[-1][side].items()}
-
-    def coarse_cell_ratio(self, gain: str) -> float:
-        """Ratio of neighbouring values of a gain in the coarse map."""
-        return _grid_ratio(self.limits[gain], self.table.num)
+        return {gain: grid_ratio(ends, self.table.num) for gain, ends in self.windows[-1][side].items()}
 
     def _zoom_in(self, side: str) -> Window:
         """The next window: one cell to each side of the candidate with the least error, inside of the limits."""
@@ -173,7 +169,7 @@ class GainSearch:
             for gain, scale in (("alpha", bound), ("lambda", math.sqrt(bound))):
                 values = scale * np.geomspace(*window[gain], self.table.num)
                 # a map that is finer than three digits keeps more
-                digits = 3 if _grid_ratio(window[gain], self.table.num) - 1.0 >= _LEAST_STEP else 16
+                digits = 3 if grid_ratio(window[gain], self.table.num) - 1.0 >= _LEAST_STEP else 16
                 axes[gain][f"observer.{side}.{gain}"] = values = [float(f"{value:.{digits}g}") for value in values]
                 ratios[gain] = values[0] / scale, values[-1] / scale
             self.windows[stage][side] = ratios
@@ -275,10 +271,7 @@ class GainSearch:
     def _run_study(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
         """Run one stage. Its axes are the scenarios' columns and `axes`: columns by label, which advance together."""
         config = self.scenarios.config
-        seeds, first_seed, excitation = config.sweep.seeds, config.sweep.first_seed, None
-        if held_out:
-            first_seed, excitation = first_seed + seeds, self.table.holdout
-        data = stage_tables(config, name, seeds=seeds, first_seed=first_seed, excitation=excitation)
+        data = stage_tables(config, name, self.table, config.sweep.seeds if held_out else None)
         for side in self.sides:
             data["observer"][side]["velocity_error"] = self.pilot[side]["velocity_error"]
         data["axes"] = list_axes({"scenario": self.scenarios.columns} | axes)

@@ -10,7 +10,7 @@ import pandas as pd
 
 from jaxbl.files import to_jsonable
 
-from .gain_search import GainSearch
+from .gain_search import GainSearch, grid_ratio
 
 LEAST_DIFFERENCE = 0.01
 """Smaller relative differences of the error do not count: another noise seed makes as much."""
@@ -131,12 +131,12 @@ def _judge_direction(
     line = profile[sign * np.log(profile[gain] / best[gain]) > _ROUNDING]
     line = line.iloc[::sign]
     if not len(line):
-        # the range ends at this margin
-        if gain == "alpha" and sign < 0 and best["margin_alpha"] < search.table.margin_alpha * (1.0 + LEAST_DIFFERENCE):
-            return {"limit": "constraint", "missed": ["margin_alpha"], "at": None, "change": None, "by": None}
-        return {"limit": "range", "missed": [], "at": None, "change": None, "by": None}
+        least_margin = search.table.margin_alpha * (1.0 + LEAST_DIFFERENCE)
+        ends_at_margin = gain == "alpha" and sign < 0 and best["margin_alpha"] < least_margin
+        limit, missed = ("constraint", ["margin_alpha"]) if ends_at_margin else ("range", [])
+        return {"limit": limit, "missed": missed, "at": None, "change": None, "by": None}
     distance = sign * np.log(line[gain] / best[gain]).to_numpy()
-    cell = np.log(search.coarse_cell_ratio(gain)) * (1.0 - 1e-6)
+    cell = np.log(grid_ratio(search.limits[gain], search.table.num)) * (1.0 - 1e-6)
     near = line.iloc[: int(np.searchsorted(distance, cell)) + 1]
     forbidden = near[near["missed"].map(bool)]
     if len(forbidden) and forbidden["error"].min() < (1.0 - LEAST_DIFFERENCE) * best["error"]:

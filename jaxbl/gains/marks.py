@@ -14,6 +14,7 @@ from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.sweeps.trial import run
 
 from .below_bound import friction_rate, missing_acceleration, share_of_time_above
+from .pilot import list_axes
 from .stages import Stages
 from .under_tuned import (
     excursion,
@@ -44,11 +45,11 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         assert trace is not None
         pairs = [(mark.lambda_, mark.alpha) for mark in marks]
         points = list(dict.fromkeys(pairs))
-        axes = [
-            {"path": f"observer.{side}.{name}", "values": list(gains), "zip": "marks"}
+        columns = {
+            f"observer.{side}.{name}": list(gains)
             for name, gains in zip(("lambda", "alpha"), zip(*points, strict=True), strict=True)
-        ]
-        frame = stages.rerun(base | {"axes": axes, "sweep": {}}, "marks", side)
+        }
+        frame = stages.rerun(base | {"axes": list_axes({"marks": columns}), "sweep": {}}, "marks", side)
         starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
         error, friction = abs(starts[1]), friction_rate(drive, side)
         missing = missing_acceleration(drive, side, trace)

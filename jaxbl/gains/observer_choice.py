@@ -19,10 +19,11 @@ import pandas as pd
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import to_jsonable
 from jaxbl.observer import OBSERVERS, OperatingConditions
+from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
-from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.points import Points, draw_sobol
 
-from .pilot import Scenarios, list_scenarios, run_pilot
+from .pilot import Scenarios, list_axes, list_scenarios, run_pilot
 from .stages import Stages, stage_tables
 
 TIME_CONSTANT = "equivalent_control.time_constant"
@@ -54,22 +55,6 @@ class ObserverChoice:
     summary: dict[str, Any]
     cost: dict[str, float]
     fallback_reasons: tuple[str, ...] = ()
-
-
-class MapPoint(NamedTuple):
-    """A point of the map: its values by path, its scenarios, and the results of its pilot run by side."""
-
-    values: dict[str, Any]
-    scenarios: Scenarios
-    pilot: dict[str, Any]
-
-
-class PointGroup(NamedTuple):
-    """Points with the same structure: a config that has it, the points, and their other values by path."""
-
-    config: Config
-    points: list[MapPoint]
-    lanes: list[dict[str, float]]
 
 
 @dataclasses.dataclass
@@ -105,10 +90,8 @@ class SideSearch:
         """Store the best of the trials, and zoom in on it: to two cells of a grid with as many points."""
         self.error_before, best_trial = self.error, int(np.argmin(errors))
         if errors[best_trial] < self.error:
-            self.error, self.best = (
-                float(errors[best_trial]),
-                {path: float(values[best_trial]) for path, values in trials.items()},
-            )
+            self.error = float(errors[best_trial])
+            self.best = {path: float(values[best_trial]) for path, values in trials.items()}
         if not self.best:
             return
         free = [path for path, (low, high) in self.window.items() if low < high]
@@ -125,13 +108,42 @@ class SideSearch:
         ]  # fmt: skip
 
 
+class MapPoint(NamedTuple):
+    """A point of the map.
+
+    Attributes:
+        values: by path.
+        lane: those of them that differ within a group.
+        scenarios: drives that the observers must serve.
+        pilot: results of the pilot run by side.
+        searches: by kind, the sides' searches.
+        held_out: by kind and side, the errors of the tuned observers on held-out runs, shape (held-out seeds,), the worst
+            over the scenarios.
+    """
+
+    values: dict[str, Any]
+    lane: dict[str, float]
+    scenarios: Scenarios
+    pilot: dict[str, Any]
+    searches: dict[str, dict[str, SideSearch]]
+    held_out: dict[str, NamedArrays]
+
+
+class PointGroup(NamedTuple):
+    """Points with the same structure, and a config that has it."""
+
+    config: Config
+    points: list[MapPoint]
+
+
 def choose_observer(config: Config, table: TuneTable, stages: Stages) -> ObserverChoice:
     """Tune and compare the kinds `table.observers`; arguments as of :func:`.tune.tune`."""
     search = _KindSearch(config, table, stages)
     for kind in table.observers:
         search.tune(kind)
-    held_out = {kind: search.held_out_errors(kind) for kind in table.observers}
-    return ObserverChoice(config, _summary(search, held_out), stages.cost, tuple(stages.fallback_reasons))
+    for kind in table.observers:
+        search.run_held_out(kind)
+    return ObserverChoice(config, _summary(search), stages.cost, tuple(stages.fallback_reasons))
 
 
 class _KindSearch:
@@ -143,8 +155,6 @@ class _KindSearch:
         self.seeds = config.sweep.seeds
         self.held_out_seeds = max(self.seeds, _LEAST_HELD_OUT_SEEDS)
         self.groups = _group_points(config, table, stages)
-        self.searches: dict[str, list[list[dict[str, SideSearch]]]] = {}
-        """By kind: for each group and point, the sides' searches."""
         rows = sum(len(point.scenarios.names) for group in self.groups for point in group.points)
         runs = len(table.observers) * rows * len(self._side_sets())
         stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
@@ -162,14 +172,14 @@ class _KindSearch:
 
     def tune(self, kind: str) -> None:
         """Find the gains of a kind on both sides, at all points."""
-        self.searches[kind] = [
-            [self._start_searches(kind, point, group.config) for point in group.points] for group in self.groups
-        ]
+        for group in self.groups:
+            for point in group.points:
+                point.searches[kind] = self._start_searches(kind, point, group.config)
         for number, group in enumerate(self.groups):
-            searches = self.searches[kind][number]
+            searches = [point.searches[kind] for point in group.points]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
-                unit = _draw_quasi_random(free, self.table.trials, stage)
+                unit = draw_sobol(free, self.table.trials, stage)
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
                 for side_set in self._side_sets():
                     rows = []
@@ -183,27 +193,20 @@ class _KindSearch:
                         for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
                             sides[side].zoom_in(trial[side], trial_errors)
 
-    def held_out_errors(self, kind: str) -> list[list[dict[str, np.ndarray]]]:
-        """Return the held-out errors of a tuned kind by side, for each group and point, shape (held-out seeds,).
-
-        They are the worst over the scenarios.
-        """
-        errors_by_group = []
+    def run_held_out(self, kind: str) -> None:
+        """Find the held-out errors of a tuned kind on all sides, at all points."""
         for number, group in enumerate(self.groups):
-            errors_by_point: list[dict[str, np.ndarray]] = [{} for _ in group.points]
             for side_set in self._side_sets():
                 rows = []
-                for i, sides in enumerate(self.searches[kind][number]):
-                    best = {side: sides[side].best for side in self.sides}
+                for i, point in enumerate(group.points):
+                    best = {side: point.searches[kind][side].best for side in self.sides}
                     rows += [(i, self._merge_gains(best, side_set))] if all(best.values()) else []
                 if not rows:
                     continue
                 name = f"{kind}-{'-'.join(side_set)}-{number}-holdout"
                 errors = self._run_trials(kind, group, rows, name, side_set, held_out=True)
                 for row, (i, _) in enumerate(rows):
-                    errors_by_point[i] |= {side: errors[side][row] for side in side_set}
-            errors_by_group.append(errors_by_point)
-        return errors_by_group
+                    group.points[i].held_out.setdefault(kind, {}).update({side: errors[side][row] for side in side_set})
 
     def _start_searches(self, kind: str, point: MapPoint, config: Config) -> dict[str, SideSearch]:
         """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
@@ -240,23 +243,19 @@ class _KindSearch:
         for i, gains in rows:
             point = group.points[i]
             starts = {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
-            corners = point.scenarios.columns or {}
             for corner in range(len(point.scenarios.names)):
-                values = group.lanes[i] | starts | gains | {path: column[corner] for path, column in corners.items()}
+                corner_values = {path: column[corner] for path, column in point.scenarios.columns.items()}
+                values = point.lane | starts | gains | corner_values
                 for path, value in values.items():
                     columns.setdefault(path, []).append(value)
-        seeds, first_seed, excitation = self.seeds, self.config.sweep.first_seed, None
-        if held_out:
-            seeds, first_seed, excitation = self.held_out_seeds, first_seed + self.seeds, self.table.holdout
+        seeds = self.held_out_seeds if held_out else self.seeds
         # gains that were rounded to the same number are run once
         keys = list(zip(*columns.values(), strict=True))
         unique = {key: i for i, key in enumerate(dict.fromkeys(keys))}
         config = group.points[0].scenarios.config
-        data = stage_tables(config, name, seeds=seeds, first_seed=first_seed, excitation=excitation)
+        data = stage_tables(config, name, self.table, seeds if held_out else None)
         data["observer"] = _observer_table(kind, data["observer"], columns)
-        data["axes"] = [
-            {"path": path, "values": [key[i] for key in unique], "zip": "trial"} for i, path in enumerate(columns)
-        ]
+        data["axes"] = list_axes({"trial": dict(zip(columns, zip(*unique, strict=True), strict=True))})
         error_columns = [f"{side}.{self.table.objective}_rmse" for side in sides]
         time_columns = [f"{side}.convergence_time" for side in sides] if self.table.longest_convergence is not None else []
         frame = self.stages.run(data, name).read([*columns, "seed", *error_columns, *time_columns])
@@ -286,14 +285,6 @@ def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[
     return data
 
 
-def _draw_quasi_random(free: int, count: int, stage: int) -> np.ndarray:
-    """Draw points of the unit cube, shape (count, free); each stage has different ones."""
-    power = math.ceil(math.log2(count))
-    from scipy.stats import qmc  # slow to load, as below
-
-    return qmc.Sobol(free, rng=np.random.default_rng(stage)).random_base2(power)[:count]
-
-
 def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[PointGroup]:
     """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
@@ -302,7 +293,7 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
     groups, pilots = [], {}
     for group in points.groups:
         columns = points.columns(np.arange(points.group_size))
-        map_points, lanes = [], []
+        map_points = []
         for i in range(points.group_size):
             lane = {path: to_jsonable(column[i]) for path, column in columns.items()}
             config_there = with_values(group.config, lane)
@@ -312,9 +303,9 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
             if key not in pilots:
                 pilots[key] = stored_pilots.get(key) or run_pilot(scenarios, table)
             values = group.structural | lane
-            map_points.append(MapPoint({axis.path: values[axis.path] for axis in table.axes}, scenarios, pilots[key]))
-            lanes.append(lane)
-        groups.append(PointGroup(group.config, map_points, lanes))
+            point_values = {axis.path: values[axis.path] for axis in table.axes}
+            map_points.append(MapPoint(point_values, lane, scenarios, pilots[key], {}, {}))
+        groups.append(PointGroup(group.config, map_points))
     if stored_pilots != pilots:
         stages.write_manifest(pilots=pilots)
     return groups
@@ -342,7 +333,7 @@ def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
         log_ratios = logs[kind] - logs[order[0]]
         half = 0.0
         if len(log_ratios) > 1:
-            from scipy.stats import t
+            from scipy.stats import t  # slow to load
 
             quantile = float(t.ppf(0.5 * (1.0 + _CONFIDENCE), len(log_ratios) - 1))
             half = quantile * float(log_ratios.std(ddof=1)) / math.sqrt(len(log_ratios))
@@ -369,17 +360,17 @@ def runs_are_equal(rank: Mapping[str, Any]) -> bool:
     return rank["high"] - rank["low"] < 1e-9 * rank["ratio"]
 
 
-def _summary(search: _KindSearch, held_out: Mapping[str, list[list[dict[str, np.ndarray]]]]) -> dict[str, Any]:
+def _summary(search: _KindSearch) -> dict[str, Any]:
     """Return the content of `tuning.json`."""
     config, table, points = search.config, search.table, []
     none = np.full(search.held_out_seeds, np.inf)
-    for number, group in enumerate(search.groups):
-        for i, point in enumerate(group.points):
+    for group in search.groups:
+        for point in group.points:
             sides = {}
             for side in search.sides:
-                ranking = rank_kinds({kind: held_out[kind][number][i].get(side, none) for kind in table.observers})
+                ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
                 for kind, rank in ranking.items():
-                    rank |= _describe_search(search.searches[kind][number][i][side], side)
+                    rank |= _describe_search(point.searches[kind][side], side)
                 best = next(iter(ranking))
                 sides[side] = {
                     "best": best if ranking[best]["ratio"] is not None else None,

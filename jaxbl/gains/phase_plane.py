@@ -1,10 +1,9 @@
 """The error (33)-(34) of an observer in its phase plane: slope, peaks, worst path, majorant of the proof (Fig. 29)."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.observer.conditions import arc_integral, least_lambda_davila_fridman
+from jaxbl.sweeps.elementwise import call_in_float64
 
 
 def error_slope(error: np.ndarray, rate: np.ndarray, lambda_: float) -> np.ndarray:
@@ -45,8 +44,7 @@ def majorant(peak: float, lambda_: float, alpha: float, f_plus: float) -> tuple[
     Each half cycle drops from its largest e to the next peak, which is (37) times the one before. Needs alpha > f and
     lambda > 0.
     """
-    with jax.enable_x64(True):
-        ratio = float(least_lambda_davila_fridman(jnp.asarray(alpha), jnp.asarray(f_plus))) / lambda_
+    ratio = float(call_in_float64(least_lambda_davila_fridman, alpha, f_plus)) / lambda_
     along = np.linspace(0.0, 1.0, 100)
     # (36), as e over its largest, and slope over the peak
     e, slope = np.r_[along * (2.0 - along), 1.0, 0.0], np.r_[1.0 - along, -ratio, -ratio]
@@ -67,8 +65,7 @@ def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 
     for c, first, last in ((c1, 0.5 * np.pi, 0.0), (c2, 0.0, -0.5 * np.pi)):
         angle = np.linspace(first, last, points)
         sine, cosine = np.sin(angle), np.cos(angle)
-        with jax.enable_x64(True):
-            arc = np.asarray(arc_integral(jnp.asarray(sine + half * cosine), jnp.asarray(cosine), jnp.asarray(c - half**2)))
+        arc = call_in_float64(arc_integral, sine + half * cosine, cosine, c - half**2)
         # the first point out has an arc of zero; where the arc is endless, the path has ended at the origin
         level = size * np.exp(-half * (arc - arc[0]))
         form = np.where(level > 0.0, sine**2 + lambda_ * sine * cosine + c * cosine**2, 1.0)

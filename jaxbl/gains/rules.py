@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_exact
+from jaxbl.observer.conditions import CONDITIONS, least_lambda_exact
+from jaxbl.sweeps.elementwise import call_in_float64
 
 from .error_system import normalised_peak_ratios
 
@@ -43,10 +44,9 @@ def _interval_where(holds: np.ndarray, low: np.ndarray, high: np.ndarray | float
     return np.where(holds, low, np.inf), np.where(holds, high, 0.0)
 
 
-def _intervals_of_condition(condition: Condition) -> Callable[[np.ndarray, np.ndarray], Intervals]:
+def _intervals_of_condition(name: str) -> Callable[[np.ndarray, np.ndarray], Intervals]:
     def intervals(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
-        with jax.enable_x64(True):
-            least = np.asarray(condition.least_lambda(jnp.asarray(alpha), jnp.asarray(f_plus)))
+        least = call_in_float64(CONDITIONS[name].least_lambda, alpha, f_plus)
         return [(least, np.full_like(least, np.inf))]
 
     return intervals
@@ -89,25 +89,25 @@ RULES = {
         "Davila et al. 2005",
         "λ > √(2 / (α − f⁺)) (α + f⁺), α > f⁺",
         "J. Davila, L. Fridman, A. Levant, IEEE Trans. Autom. Control 50 (2005), as (32) of Merzouki et al. (2007), q → 0",
-        _intervals_of_condition(CONDITIONS["davila_fridman"]),
+        _intervals_of_condition("davila_fridman"),
     ),
     "levant": Rule(
         "Levant 1998",
         "λ² > 4 f⁺ (α + f⁺) / (α − f⁺), α > f⁺",
         "A. Levant, Automatica 34 (1998)",
-        _intervals_of_condition(CONDITIONS["levant"]),
+        _intervals_of_condition("levant"),
     ),
     "seeber_horn": Rule(
         "Seeber-Horn 2017",
         "λ > √(α + f⁺), α > f⁺",
         "R. Seeber, M. Horn, Automatica 84 (2017)",
-        _intervals_of_condition(CONDITIONS["seeber_horn"]),
+        _intervals_of_condition("seeber_horn"),
     ),
     "moreno_osorio": Rule(
         "Moreno-Osorio 2012",
         "λ² > 4 (α − √(α² − f⁺²)), α > f⁺",
         "J. A. Moreno, M. Osorio, IEEE Trans. Autom. Control 57 (2012); their inequality solved for λ here",
-        _intervals_of_condition(CONDITIONS["moreno_osorio"]),
+        _intervals_of_condition("moreno_osorio"),
     ),
     "usual_pair": Rule(
         "usual pair 1.5, 1.1",
@@ -274,8 +274,7 @@ def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> li
     """
     rule_gains = {name: rule.gains(1.0) for name, rule in RULES.items() if rule.gains is not None}
     columns = np.concatenate([_ALPHA_RATIOS, alpha, [rule_alpha for _, rule_alpha in rule_gains.values()]])
-    with jax.enable_x64(True):
-        exact = np.asarray(_least_lambda_ratio(jnp.asarray(columns)))
+    exact = call_in_float64(_least_lambda_ratio, columns)
     exact_trials, exact_map, exact_rules = np.split(exact, [len(_ALPHA_RATIOS), len(_ALPHA_RATIOS) + len(alpha)])
     checks = {
         name: {f_plus: _check_rule(rule, exact_trials, f_plus) for f_plus in _F_PLUS_TRIALS}
@@ -291,8 +290,7 @@ def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> li
             if gains is not None:
                 points[name] = (f_plus, gains[1], gains[0])
     bounds, lambdas, alphas = (np.array(column) for column in zip(*points.values(), strict=True))
-    with jax.enable_x64(True):
-        ratios = [np.asarray(ratio) for ratio in normalised_peak_ratios(jnp.asarray(lambdas), jnp.asarray(alphas))]
+    ratios = call_in_float64(normalised_peak_ratios, lambdas, alphas)
     table = zip(bounds, bounds * alphas, np.sqrt(bounds) * lambdas, *reversed(ratios), strict=True)
     keys = ("f_plus", "alpha", "lambda", "peak_ratio", "peak_ratio_simulated")
     simulated = {name: dict(zip(keys, map(float, row), strict=True)) for name, row in zip(points, table, strict=True)}

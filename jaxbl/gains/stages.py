@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from jaxbl.cluster import Cluster, Scheduler, connect
-from jaxbl.config import Config
+from jaxbl.config import Config, TuneTable
 from jaxbl.errors import InputError
 from jaxbl.files import (
     json_with_checksum,
@@ -45,19 +45,21 @@ def open_stages(
         yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
 
 
-def stage_tables(config: Config, name: str, *, seeds: int, first_seed: int, excitation: Any | None = None) -> dict[str, Any]:
-    """Return the tables of a stage's study: those of `config` without its axes and evaluation, with other seeds.
+def stage_tables(config: Config, name: str, table: TuneTable, held_out_seeds: int | None = None) -> dict[str, Any]:
+    """Return the tables of a stage's study: those of `config` without its axes and evaluation.
 
-    `excitation` replaces that of `config`, if it is not None.
+    Held-out runs have so many other seeds, and the excitation `holdout` of the table if it has one.
     """
     data = config.to_dict()
     for key in ("notes", "figures", "tune", "uncertainty", "axes"):
         data.pop(key, None)
     data["title"] = f"{config.title} ({name})" if config.title else name
     chunk = {} if config.sweep.chunk is None else {"chunk": config.sweep.chunk}
-    data["sweep"] = {"seeds": seeds, "first_seed": first_seed} | chunk
-    if excitation is not None:
-        data["excitation"] = excitation.model_dump(by_alias=True, exclude_none=True)
+    data["sweep"] = {"seeds": config.sweep.seeds, "first_seed": config.sweep.first_seed} | chunk
+    if held_out_seeds is not None:
+        data["sweep"] |= {"seeds": held_out_seeds, "first_seed": config.sweep.first_seed + config.sweep.seeds}
+        if table.holdout is not None:
+            data["excitation"] = table.holdout.model_dump(by_alias=True, exclude_none=True)
     return data
 
 

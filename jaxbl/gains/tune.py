@@ -9,14 +9,13 @@ is a study of its own, stored in the folder's `tune/`: an interrupted search con
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import Config, TuneTable, read_config
+from jaxbl.config import Config, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.programs import Backend
@@ -54,7 +53,7 @@ class Tuning:
 
 
 def tune(
-    study: str | Path | Mapping[str, Any] | Config,
+    study: ConfigSource,
     out: str | Path | None = None,
     *,
     progress: Progress | None = None,
@@ -87,12 +86,12 @@ def tune(
             f"'{config.observer.kind}', put observers = [\"{config.observer.kind}\"] into [tune]"
         )
     config = config.model_copy(update={"tune": table})
-    options = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
-    if table.observers:
-        with open_stages(config, "tune", out, scheduler, **options) as stages:
+    scenarios = None if table.observers else list_scenarios(config, table)
+    with open_stages(
+        config, "tune", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
+    ) as stages:
+        if scenarios is None:
             return choose_observer(config, table, stages)
-    scenarios = list_scenarios(config, table)
-    with open_stages(config, "tune", out, scheduler, **options) as stages:
         return _search_gains(config, table, scenarios, stages)
 
 

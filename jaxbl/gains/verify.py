@@ -11,7 +11,6 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable, write_atomic, write_table
 from jaxbl.sweeps.metrics import ROUNDING, no_disturbance_error
@@ -68,7 +67,7 @@ class Verdict:
 
 
 def verify(
-    study: str | Path | Mapping[str, Any] | Config,
+    study: ConfigSource,
     out: str | Path | None = None,
     *,
     progress: Progress | None = None,
@@ -91,8 +90,9 @@ def verify(
     """
     config = read_config(study)
     sides = sides_with_gain_axes(config)
-    options = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
-    with open_stages(config, "verify", out, scheduler, **options) as stages:
+    with open_stages(
+        config, "verify", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
+    ) as stages:
         return _verify_levels(config, sides, stages)
 
 

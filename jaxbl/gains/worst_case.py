@@ -67,8 +67,9 @@ def half_cycle(
         homeward: d / f_plus from there on. The defaults are the worst case, which makes the next peak the largest.
         ray: where d changes, rad^0.5/s; 0 is the turning point.
     """
-    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (lambda_, alpha, f_plus, damping, speed, ray)))
-    lambda_, alpha, f_plus, damping, speed, ray = arguments
+    lambda_, alpha, f_plus, damping, speed, ray = jnp.broadcast_arrays(
+        *(jnp.asarray(number, float) for number in (lambda_, alpha, f_plus, damping, speed, ray))
+    )
     zero = jnp.zeros_like(lambda_)
 
     def field_under(push: Values) -> Callable[[_State], _State]:
@@ -154,20 +155,17 @@ def _march(
     return jax.tree.map(partial(jnp.where, has_event), _runge_kutta(slope, state, h), state), has_event
 
 
-def least_lambda_simulated(
-    alpha: Values, f_plus: Values, *, damping: Values | float = 0.0, speed: Values | float = 1.0
-) -> Values:
-    """Return the least lambda (rad^0.5/s) at which an error of this speed (rad/s) shrinks in the simulated worst case.
+def least_lambda_simulated(alpha: Values, f_plus: Values, *, damping: Values | float = 0.0) -> Values:
+    """Return the least lambda (rad^0.5/s) at which an error of 1 rad/s shrinks in the simulated worst case.
 
     It is found by bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f). It is 0 if damping alone is enough, and
     `inf` if no lambda up to 4 sqrt(alpha + f) is.
     """
-    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
-    alpha, f_plus, damping, speed = arguments
+    alpha, f_plus, damping = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping)))
     high = 4.0 * jnp.sqrt(alpha + f_plus)
 
     def shrinks(lambda_: Values) -> Values:
-        return half_cycle(lambda_, alpha, f_plus, damping=damping, speed=speed).ratio < 1.0
+        return half_cycle(lambda_, alpha, f_plus, damping=damping).ratio < 1.0
 
     low, least_lambda = bisect(shrinks, high, _HALVINGS)
     least_lambda = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(least_lambda)), 0.0, least_lambda), least_lambda)

@@ -6,8 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+
+def call_in_float64(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of JAX in float64 with numbers or arrays, and return what it returns as NumPy's."""
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, function(*(jnp.asarray(argument, float) for argument in arguments)))
 
 
 @functools.lru_cache(maxsize=64)

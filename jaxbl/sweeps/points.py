@@ -274,17 +274,23 @@ def _build_criterion(config: Config, base: Config, metrics: list[str], refined: 
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 
+def draw_sobol(dimensions: int, count: int, seed: int) -> np.ndarray:
+    """Draw points of the unit cube from Sobol's sequence, `(count, dimensions)`; each seed has different ones."""
+    from scipy.stats import qmc  # its import takes 0.3 s, which only such designs need
+
+    # the first 2^m points are balanced; any number of them is a prefix
+    return qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(math.ceil(math.log2(count)))[:count]
+
+
 def _sample_points(axes: list[AxisTable], config: Config) -> AxisColumns:
     """Sample Sobol or Latin hypercube points over the ranges of axes, uniform in their scale."""
-    from scipy.stats import qmc  # its import takes 0.3 s, which only these designs need
-
     assert config.sweep.points is not None
-    rng = np.random.default_rng(config.sweep.design_seed)
     if config.sweep.design == "sobol":
-        # the first 2^m points are balanced; any number of them is a prefix
-        power = max(math.ceil(math.log2(config.sweep.points)), 0)
-        unit = qmc.Sobol(len(axes), rng=rng).random_base2(power)[: config.sweep.points]
+        unit = draw_sobol(len(axes), config.sweep.points, config.sweep.design_seed)
     else:
+        from scipy.stats import qmc
+
+        rng = np.random.default_rng(config.sweep.design_seed)
         unit = qmc.LatinHypercube(len(axes), rng=rng).random(config.sweep.points)
     columns = {}
     for axis, u in zip(axes, unit.T, strict=True):
