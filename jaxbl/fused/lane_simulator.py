@@ -16,6 +16,7 @@ from jaxbl.simulate import (
     Experiment,
     NamedArrays,
     Reducers,
+    TracedArrays,
     advance_sample,
     all_done,
     block_length,
@@ -100,7 +101,7 @@ class LaneSimulator(abc.ABC):
             carry = end_block(place_values(values), carry)
             return carry, all_done(place_values(values), reducers, carry)
 
-        def finish(values: Leaves, carry: Any, _: Any) -> dict[str, Any]:
+        def finish(values: Leaves, carry: Any, _: Any) -> TracedArrays:
             return compute_metrics(place_values(values), reducers, carry)
 
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
@@ -293,7 +294,7 @@ class _ThreadLanes:
             end = min(start + blocks * self._block_length, inputs.length)
             is_end = inputs.final_inputs is not None and end == inputs.length
             self._loop(
-                arrays, end, 0, width, start=start, block_length=self._block_length, begins=not self._has_begun, ends=is_end
+                arrays, end, width, start=start, block_length=self._block_length, begins=not self._has_begun, ends=is_end
             )
             self._has_begun, start = True, end
             if is_end:
@@ -308,7 +309,7 @@ class _ThreadLanes:
             )
             self._select_lanes(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare_arrays(inputs)
-            self._loop(arrays, 0, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
+            self._loop(arrays, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
             self._results.append((self._lanes, results))
 
     def prepare_arrays(self, inputs: SharedInputs) -> tuple[Arrays, Arrays, LoopArrays]:

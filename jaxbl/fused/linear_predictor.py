@@ -75,7 +75,7 @@ class LinearPredictor:
                 from .llvm import ArrayRows
 
                 arrays = carry, np.array(ordered), transition_columns, padded_forcing, padded_readings, errors
-                self.loop([ArrayRows(array) for array in arrays], count, 0, self.padded_width)
+                self.loop([ArrayRows(array) for array in arrays], count, self.padded_width)
             return carry[:, : self.width], errors[:, :, : self.width]
 
         predictions = [predict(changes[0], gains[0])] if len(gains) == 1 else map_in_threads(predict, changes, gains)
@@ -102,13 +102,12 @@ def _sample_function(states: int, sides: int) -> Any:
     return sample
 
 
-@lru_cache(maxsize=64)
+@program_cache.compile_once
 def _compile_loop(states: int, sides: int) -> Any:
     """The recursion as a compiled loop; None if it is not supported."""
-    key = program_cache.program_key("linear predictor", states, sides)
     examples = [[_NUMBER] * size for size in (states, 2 * sides, states * states, states, sides)]
     options = {"carry": states, "constants": 2 * sides, "lane_inputs": states + sides}
-    return program_cache.load_or_compile_loop(key, lambda: (_sample_function(states, sides), examples, options))
+    return _sample_function(states, sides), examples, options
 
 
 def _predict_slowly(

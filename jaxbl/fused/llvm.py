@@ -39,7 +39,7 @@ _MEMORY_TYPES = {
     "bool": ir.IntType(8),
 }
 """Types of numbers in memory."""
-_SCALAR_ARGUMENTS = 7
+_SCALAR_ARGUMENTS = 6
 """Integers that the code takes beside the table of its arrays."""
 Vector = Any
 """A value of LLVM (which has no types that a checker could use): a number in all lanes, or an index."""
@@ -192,8 +192,7 @@ class Loop:
         self,
         arrays: "LoopArrays | ArrayGroups",
         end: int,
-        first_lane: int,
-        end_lane: int,
+        lanes: int,
         *,
         start: int = 0,
         block_length: int | None = None,
@@ -206,7 +205,7 @@ class Loop:
             arrays: in the order of the signature. Outputs are `(samples, lanes)` and flags `(blocks, lanes)`, with as many
                 lanes as run.
             end: the sample before which the loop ends.
-            first_lane, end_lane: the lanes from the first up to the end, multiples of `lanes`.
+            lanes: how many, a multiple of those that are computed together.
             start: the first sample, with which a block must begin.
             block_length: samples of a block; left out, all samples are one block.
             begins: the run begins here: the carry is made, not read.
@@ -215,15 +214,13 @@ class Loop:
         Raises:
             ValueError: arrays do not fit the signature, or no block begins at `start`.
         """
-        fitted = (
-            arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, end, end_lane, block_length)
-        )
-        if end > fitted.steps or end_lane > fitted.lanes:
+        fitted = arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, end, lanes, block_length)
+        if end > fitted.steps or lanes > fitted.lanes:
             made_for = f"arrays were made for {fitted.steps} and {fitted.lanes}"
-            raise ValueError(f"{end} samples of lanes up to {end_lane}: {made_for}")
+            raise ValueError(f"{end} samples of lanes up to {lanes}: {made_for}")
         if start % fitted.block_length:
             raise ValueError(f"no block of {fitted.block_length} samples begins at {start}")
-        self._call(fitted.table, start, end, fitted.block_length, first_lane, end_lane, begins, ends)
+        self._call(fitted.table, start, end, fitted.block_length, lanes, begins, ends)
 
 
 class ArrayRows(NamedTuple):
@@ -314,7 +311,7 @@ class _LoopWriter:
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
         function.attributes.add("nounwind")  # without another one it is not written
-        table, start, steps, block_length, first_lane, end_lane, begins, ends = function.args
+        table, start, steps, block_length, width, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
         places: defaultdict[str, list[int]] = defaultdict(list)
@@ -338,7 +335,6 @@ class _LoopWriter:
 
         constants = [broadcast(i, _INT(0)) for i in places["constant"]]
         final_inputs = [broadcast(i, _INT(0)) for i in places["final input"]]
-        width = build.sub(end_lane, first_lane)
 
         def write_lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
             def read(name: str, index: Vector = lane) -> list[Vector]:
@@ -358,7 +354,7 @@ class _LoopWriter:
             self.invariants = {*values, *constants}
 
             def write_sample(sample: Vector, carry: list[Vector]) -> list[Vector]:
-                index = build.add(build.mul(sample, width), build.sub(lane, first_lane))
+                index = build.add(build.mul(sample, width), lane)
                 lane_inputs = read("lane's sample input", index)
                 inputs = (broadcast(i, sample) for i in places["sample input"])
                 results = self.write_jaxpr(body, [*values, *carry, *constants, *inputs, *lane_inputs])
@@ -375,22 +371,22 @@ class _LoopWriter:
                 block = build.sdiv(block_start, block_length)
                 inputs = (broadcast(i, block) for i in places["block input"])
                 results = self.write_jaxpr(after_block, [*values, *carry, *inputs])
-                index = build.add(build.mul(block, width), build.sub(lane, first_lane))
+                index = build.add(build.mul(block, width), lane)
                 write("block flag", results[carry_count:], index)
                 return results[:carry_count]
 
             if hooks is None:
-                return write("carry", self.write_for(start, steps, read("carry"), write_block, by=block_length), lane)
+                return write("carry", self.write_for(start, steps, read("carry"), write_block, step=block_length), lane)
             start_jaxpr, finish = hooks.start, hooks.finish
             carry = self.write_if(begins, lambda: self.write_jaxpr(start_jaxpr, values), lambda: read("carry"))
-            carry = self.write_for(start, steps, carry, write_block, by=block_length)
+            carry = self.write_for(start, steps, carry, write_block, step=block_length)
             return self.write_if(
                 ends,
                 lambda: write("result", self.write_jaxpr(finish, [*values, *carry, *final_inputs]), lane),
                 lambda: write("carry", carry, lane),
             )
 
-        self.write_for(first_lane, end_lane, [], write_lanes, by=self.lanes)
+        self.write_for(_INT(0), width, [], write_lanes, step=self.lanes)
         build.ret_void()
 
     def write_if(self, condition: Vector, yes: Callable[[], list[Vector]], no: Callable[[], list[Vector]]) -> list[Vector]:
@@ -418,9 +414,9 @@ class _LoopWriter:
         end: Vector,
         state: list[Vector],
         body: Callable[[Vector, list[Vector]], list[Vector]],
-        by: Vector = 1,
+        step: Vector = 1,
     ) -> list[Vector]:
-        """for index in range(first, end, by): state = body(index, state)."""
+        """for index in range(first, end, step): state = body(index, state)."""
         build = self.build
         before = build.block
         head, inside, behind = (build.append_basic_block(name) for name in ("head", "body", "behind"))
@@ -432,7 +428,7 @@ class _LoopWriter:
         build.cbranch(build.icmp_signed("<", index, end), inside, behind)
         build.position_at_end(inside)
         new = body(index, list(carried))
-        new = [build.add(index, _INT(by) if isinstance(by, int) else by), *new]
+        new = [build.add(index, _INT(step) if isinstance(step, int) else step), *new]
         for phi, vector in zip((index, *carried), new, strict=True):
             phi.add_incoming(vector, build.block)
         build.branch(head)
@@ -595,10 +591,8 @@ def _one_minus_square(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
 
 
 _FLOAT_RULES: dict[str, Callable[..., Vector]] = {
-    "add": _instruction("fadd", flags=_FLAGS),
+    **{name: _instruction(f"f{name}", flags=_FLAGS) for name in ("add", "sub", "mul")},
     "add_any": _instruction("fadd", flags=_FLAGS),
-    "sub": _instruction("fsub", flags=_FLAGS),
-    "mul": _instruction("fmul", flags=_FLAGS),
     "div": _divide,
     "neg": _instruction("fneg"),
     "square": lambda w, eqn, a: w.build.fmul(a, a, flags=_FLAGS),

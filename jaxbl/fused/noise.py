@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import define_prng_impl
 
-from jaxbl.simulate import LONGEST_BLOCK, unit_noise
+from jaxbl.simulate import LONGEST_BLOCK, NamedArrays, unit_noise
 
 from . import Unsupported, raising_unsupported
 from .jaxprs import trace
@@ -36,7 +36,7 @@ def host_device() -> Any:
         return jax.local_devices()[0]
 
 
-def draw_noise(seed: int, first: int, count: int) -> dict[str, np.ndarray]:
+def draw_noise(seed: int, first: int, count: int) -> NamedArrays:
     """Draw the noise of each side `(count,)` for at most `LONGEST_SPAN` samples from `first` on."""
     size = max(LONGEST_SPAN // 4, 1 << (count - 1).bit_length())
     return dict(zip(SIDES, np.asarray(_compile_noise(size)(seed, first, count))[:, :count], strict=True))
@@ -75,7 +75,7 @@ def _compile_noise_by_loop(size: int) -> Callable[[int, int, int], Any]:
         padded = -(-count // loop.lanes) * loop.lanes
         bits = np.zeros((2, size), np.uint32)
         samples = np.arange(first, first + padded, dtype=np.uint32)
-        loop([np.array(seed, np.uint32), samples, *bits[:, :padded]], 1, 0, padded)
+        loop([np.array(seed, np.uint32), samples, *bits[:, :padded]], 1, padded)
         return program(bits)
 
     return draw

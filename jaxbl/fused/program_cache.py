@@ -120,22 +120,32 @@ def save(key: str | None, program: Any) -> None:
         draft.replace(folder / key)
 
 
-def load_or_compile_loop(key: str | None, define: Callable[[], LoopDefinition]) -> Any:
-    """Load a loop of float64, or compile and store it; None, and a message, where that is not supported."""
-    if (loop := load(key)) is not None:
-        return loop
-    try:
-        with raising_unsupported(), jax.enable_x64(True):
-            from .jaxprs import trace
-            from .llvm import Loop
+def compile_once(define: Callable[..., LoopDefinition]) -> Any:
+    """Make a function that returns the defined loop of float64 for some arguments: compiled once, or loaded.
 
-            sample, examples, options = define()
-            loop = Loop(trace(sample, *examples), np.dtype(float), **options)
-            save(key, loop)
+    It returns None, with a message, where the loop is not supported. Of an argument that has them, `examples` are described.
+    """
+
+    @functools.lru_cache(maxsize=64)
+    @functools.wraps(define)
+    def compile_loop(*arguments: Any) -> Any:
+        key = program_key("loop", define, *(getattr(argument, "examples", argument) for argument in arguments))
+        if (loop := load(key)) is not None:
             return loop
-    except Unsupported as reason:
-        warn_of_scan(str(reason))
-        return None
+        try:
+            with raising_unsupported(), jax.enable_x64(True):
+                from .jaxprs import trace
+                from .llvm import Loop
+
+                sample, examples, options = define(*arguments)
+                loop = Loop(trace(sample, *examples), np.dtype(float), **options)
+                save(key, loop)
+                return loop
+        except Unsupported as reason:
+            warn_of_scan(str(reason))
+            return None
+
+    return compile_loop
 
 
 def _describe(argument: Any) -> str:

@@ -18,8 +18,6 @@ from .noise import LONGEST_SPAN, draw_noise
 
 SharedValues = tuple[Leaves, Leaves, Leaves]
 """State of the shared part after a span, outputs of each block `(blocks,)`, and outputs of each sample `(samples,)`."""
-SharedPartRunner = Callable[[Leaves, int, int, int], SharedValues]
-"""Computes a span from the state before it, the seed, its first sample and its number of samples."""
 
 
 class SharedPart(NamedTuple):
@@ -127,14 +125,17 @@ class SharedPartLoop:
         loop_outputs = [np.empty(count, dtype) for dtype in self._sample_dtypes]
         if self._loop is not None:
             arrays = [*state, *loop_inputs, *loop_outputs, *block_outputs]
-            self._loop(arrays, count, 0, 1, block_length=part.block_length)
+            self._loop(arrays, count, 1, block_length=part.block_length)
         stateful = iter(loop_outputs)
         sample_outputs = [next(stateless) if is_stateless else next(stateful) for is_stateless in self._is_stateless]
         return [leaf[0] for leaf in state], block_outputs, sample_outputs
 
 
-def compile_shared_part(part: SharedPart) -> SharedPartRunner:
-    """Compile a shared part: by the loop if that supports it, otherwise by XLA."""
+def compile_shared_part(part: SharedPart) -> SharedPartLoop | SharedPartScan:
+    """Compile a shared part: by the loop if that supports it, otherwise by XLA.
+
+    Returns what computes a span from the state before it, the seed, its first sample and its number of samples.
+    """
     try:
         return SharedPartLoop(part)
     except Unsupported:

@@ -1,7 +1,7 @@
 """Scan a function of a sample's scalars along a signal, by a loop for this machine's processor: one loop for all lengths."""
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import jax
@@ -43,20 +43,18 @@ def scan_signal(
         np.ascontiguousarray(column if column.ndim == 1 else np.pad(column, ((0, 0), padding)), float) for column in inputs
     ]
     outputs = [np.empty((samples, width)) for spec in loop.signature if spec.name.startswith("sample output")]
-    loop([*lane_columns, *padded_inputs, *outputs], samples, 0, width)
+    loop([*lane_columns, *padded_inputs, *outputs], samples, width)
     return [output[:, :lanes] for output in outputs]
 
 
-@lru_cache(maxsize=64)
+@program_cache.compile_once
 def _compile_loop(
     sample: SampleFunction, values: int, carry: int, inputs: int, has_single_lane: bool, has_lane_inputs: bool
 ) -> Any:
     """The loop for these numbers of arguments; None if it is not supported."""
-    sizes, lanes, lane_inputs = (values, carry, inputs), 1 if has_single_lane else None, inputs if has_lane_inputs else 0
-    key = program_cache.program_key("signal scan", sample, *sizes, lanes, lane_inputs)
-    examples = [[_NUMBER] * size for size in sizes]
-    options = {"values": values, "carry": carry, "lane_inputs": lane_inputs, "lanes": lanes}
-    return program_cache.load_or_compile_loop(key, lambda: (sample, examples, options))
+    lanes, lane_inputs = 1 if has_single_lane else None, inputs if has_lane_inputs else 0
+    examples = [[_NUMBER] * size for size in (values, carry, inputs)]
+    return sample, examples, {"values": values, "carry": carry, "lane_inputs": lane_inputs, "lanes": lanes}
 
 
 @partial(jax.jit, static_argnums=0)

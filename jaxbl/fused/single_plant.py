@@ -5,8 +5,8 @@ many times as fast: XLA starts some twenty kernels for a step of a single plant,
 What the loops do not support (effects that read tables) is left to XLA. All is in float64, under `jax.enable_x64`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, wraps
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -82,7 +82,7 @@ def simulate_plants(
     """
     structure, varying = _PlantStructure.of(experiment, starts), varying or {}
     sides = () if gain is None else tuple(sorted(gain))
-    loop = _trajectory_loop(structure, sides, structure.leaf_indices(tuple(varying)))
+    loop = _trajectory_loop(structure, sides, _leaf_indices(structure, tuple(varying)))
     if loop is None:
         arguments = starts, torque, time, dict(measured or {}), dict(varying)
         runs = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), arguments) for i in range(len(torque))]
@@ -117,7 +117,7 @@ def _run_loop(
         run_constants[time_index] = time[i]
         inputs = (column[i] for column in columns)
         outputs = (state[i] for state in states)
-        loop([*carry, ArrayRows(run_constants), index, *inputs, *outputs], samples, 0, 1)
+        loop([*carry, ArrayRows(run_constants), index, *inputs, *outputs], samples, 1)
 
     map_in_threads(simulate_run, range(runs))
     return state_tree.unflatten(states)
@@ -140,7 +140,7 @@ class PlantSimulator:
         self.loop = _trajectory_loop(structure, self.sides, ())
         if self.loop is not None:
             self.numbers, read = np.array(structure.read_numbers(experiment), float), _read_indices(structure)
-            self.places = [read.index(i) if i in read else -1 for i in structure.leaf_indices(self.varied)]
+            self.places = [read.index(i) if i in read else -1 for i in _leaf_indices(structure, self.varied)]
 
     def __call__(
         self,
@@ -186,7 +186,7 @@ def step_derivatives(
     """
     structure, varying = _PlantStructure.of(experiment, states), varying or {}
     leaves = jax.tree.leaves(states)
-    loop = _derivatives_loop(structure, structure.leaf_indices(tuple(varying)))
+    loop = _derivatives_loop(structure, _leaf_indices(structure, tuple(varying)))
     if loop is None:
         # numbers as arrays: one program for all directions
         zeros, arguments = jax.tree.map(np.zeros_like, experiment), (states, torque, time, dict(varying))
@@ -213,7 +213,7 @@ def step_derivatives(
 
     def differentiate(tangent: np.ndarray, change: np.ndarray) -> None:
         # every direction writes the same new state
-        loop([*values, ArrayRows(numbers), ArrayRows(tangent), ArrayRows(change), ArrayRows(new)], 1, 0, width)
+        loop([*values, ArrayRows(numbers), ArrayRows(tangent), ArrayRows(change), ArrayRows(new)], 1, width)
 
     map_in_threads(differentiate, tangents, changes)
     return changes[:, :, :count], new[:, :count]
@@ -294,7 +294,7 @@ class _PlantStructure(NamedTuple):
     def stack_tangents(self, directions: Sequence[Direction]) -> np.ndarray:
         """Directions as rows: changes of the numbers that a step reads, of the state's leaves, of the input."""
         paths = tuple(dict.fromkeys(path for direction in directions for path in direction.numbers))
-        leaf_of_path = dict(zip(paths, self.leaf_indices(paths), strict=True))
+        leaf_of_path = dict(zip(paths, _leaf_indices(self, paths), strict=True))
         column_of_leaf = {leaf: i for i, leaf in enumerate(_read_indices(self))}
         tangents = np.zeros((len(directions), len(column_of_leaf) + self.state_tree.num_leaves + 1))
         for row, direction in zip(tangents, directions, strict=True):
@@ -305,10 +305,6 @@ class _PlantStructure(NamedTuple):
                 row[len(column_of_leaf) : -1] = direction.state
             row[-1] = direction.torque
         return tangents
-
-    def leaf_indices(self, paths: tuple[str, ...]) -> tuple[int, ...]:
-        """Indices of numbers among the experiment's leaves, by path."""
-        return _leaf_indices(self, paths)
 
     def build_experiment(self, numbers: Sequence[Any], replacements: Mapping[int, Any]) -> Experiment:
         """The experiment from the numbers that a step reads, with replacements by leaf index; all other leaves are zero."""
@@ -326,6 +322,7 @@ class _PlantStructure(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _leaf_indices(structure: _PlantStructure, paths: tuple[str, ...]) -> tuple[int, ...]:
+    """Indices of numbers among the experiment's leaves, by path."""
     indices = structure.experiment_tree.unflatten(range(len(structure.leaf_types)))
     return tuple(get_leaf(indices, path) for path in paths)
 
@@ -357,19 +354,7 @@ def _find_read_indices(structure: _PlantStructure) -> tuple[int, ...]:
     return indices
 
 
-def _compile_once(define: Callable[..., program_cache.LoopDefinition]) -> Any:
-    """Make a function that compiles the defined loop, once for each structure; it returns None if that is not possible."""
-
-    @lru_cache(maxsize=64)
-    @wraps(define)
-    def compile_loop(structure: _PlantStructure, *arguments: Any) -> Any:
-        key = program_cache.program_key(f"loop of {define.__qualname__}", *structure.examples, arguments)
-        return program_cache.load_or_compile_loop(key, lambda: define(structure, *arguments))
-
-    return compile_loop
-
-
-@_compile_once
+@program_cache.compile_once
 def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
     """The loop from state, numbers, first time and gains, and a sample's index, torque, readings and varying numbers."""
 
@@ -390,7 +375,7 @@ def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = (), va
     return sample, examples, {"carry": count, "lanes": 1, "constants": len(jax.tree.leaves(constants))}
 
 
-@_compile_once
+@program_cache.compile_once
 def _derivatives_loop(structure: _PlantStructure, varying: tuple[int, ...] = ()) -> Any:
     """The loop from a lane's state, torque, time and varying numbers, from numbers, and from a tangent of numbers, state and
     torque."""

@@ -17,6 +17,7 @@ from jaxbl.simulate import (
     Reducers,
     Signals,
     State,
+    TracedArrays,
     advance_sample,
     block_length,
     compute_metrics,
@@ -35,8 +36,8 @@ def record_run(
     experiment: Experiment,
     seed: int,
     reducers: Reducers,
-    record: Callable[[State, Signals], dict[str, Any]],
-    every: int = 1,
+    record: Callable[[State, Signals], TracedArrays],
+    stride: int = 1,
 ) -> tuple[NamedArrays, NamedArrays]:
     """Simulate one experiment, in its precision; arguments as for :func:`jaxbl.simulate.scan`.
 
@@ -57,7 +58,7 @@ def record_run(
         def finish_block(state: Any, _: Any) -> tuple[Leaves, Leaves]:
             return jax.tree.leaves(end_block(experiment, tree.unflatten(state))), []
 
-        def finish(*state: Any) -> dict[str, Any]:
+        def finish(*state: Any) -> TracedArrays:
             return compute_metrics(experiment, reducers, tree.unflatten(state))
 
         steps = experiment.run.steps
@@ -69,7 +70,7 @@ def record_run(
             state, _, outputs = run_span(state, seed, first, min(part.span_length, steps - first))
             for column, output in zip(columns, outputs, strict=True):
                 # copied, so that the samples that are dropped free their memory
-                column.append(np.array(output[-first % every :: every]))
+                column.append(np.array(output[-first % stride :: stride]))
         metrics = dict(zip(sorted(jax.eval_shape(finish, *leaves)), _call_once(finish, *state), strict=True))
     return metrics, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}
 
@@ -82,5 +83,5 @@ def _call_once(function: Callable[..., Any], *numbers: Any) -> Leaves:
     except Unsupported:
         return [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*numbers))]
     outputs = [np.empty(1, aval.dtype) for aval in closed.out_avals]
-    loop([*(np.array([number]) for number in numbers), *outputs], 1, 0, 1)
+    loop([*(np.array([number]) for number in numbers), *outputs], 1, 1)
     return [output[0] for output in outputs]

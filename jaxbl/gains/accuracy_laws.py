@@ -20,6 +20,7 @@ import pandas as pd
 from jaxbl.config import Config, FigureTable
 from jaxbl.config.figures import check_selection, filter_rows, resolve_where
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.sweep import StudyResult
 
 NOISE, PERIOD = "encoders.noise", "run.sample_period"
@@ -90,8 +91,8 @@ class Law:
 
     value: str
     x: str
-    series: dict[str, Any]
-    where: dict[str, Any]
+    series: JsonObject
+    where: JsonObject
     theory: float
     fit: PowerLawFit | None
     stops: dict[str, str]
@@ -123,7 +124,7 @@ class Law:
         """True if a law was found and its slope is within :data:`AGREEMENT` of theory's."""
         return self.fit is not None and abs(self.fit.slope - self.theory) <= AGREEMENT
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Plain data for `laws.json`."""
         return {
             "value": self.value,
@@ -238,7 +239,7 @@ def _fit_figure_lines(config: Config, frame: pd.DataFrame, figure: FigureTable, 
     fixed = resolve_where(config, figure)
     rows = filter_rows(frame, fixed)
 
-    def list_values(path: str | None) -> list[dict[str, Any]]:
+    def list_values(path: str | None) -> list[JsonObject]:
         return [{}] if path is None else [{path: to_jsonable(value)} for value in sorted(rows[path].unique())]
 
     for facet in list_values(figure.facet):
@@ -256,7 +257,7 @@ class _FigureLine:
     Arrays have the shape (points,).
     """
 
-    def __init__(self, config: Config, frame: pd.DataFrame, figure: FigureTable, fixed: dict[str, Any]):
+    def __init__(self, config: Config, frame: pd.DataFrame, figure: FigureTable, fixed: JsonObject):
         self._config, self._frame, self._figure, self._fixed = config, frame, figure, fixed
         self.x, self.y = self._geometric_means(figure.value)
         self._unknown = np.full(len(self.x), np.nan)

@@ -196,8 +196,8 @@ def _run_adversaries(
 
     flat = jnp.zeros_like(lanes.position)
     start = observer.start(flat, flat, lambda _: flat, jnp.ones(()))
-    ones, index = flat + 1.0, jnp.arange(bounds.shape[0])
-    carry = start, lanes.position, lanes.velocity, lanes.bits, (ones, ones), flat, flat > 0.0, jnp.full(flat.shape, -1)
+    upward, index = flat + 1.0, jnp.arange(bounds.shape[0])
+    carry = start, lanes.position, lanes.velocity, lanes.bits, (upward, upward), flat, flat > 0.0, jnp.full(flat.shape, -1)
     (*_, worst, above, latest), recorded = jax.lax.scan(step_lane, carry, (index, sequence, bounds))
     return worst, above, latest, recorded
 

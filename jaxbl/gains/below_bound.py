@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, with_values
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.elementwise import call_in_float64
 from jaxbl.sweeps.trial import run
 
@@ -39,7 +40,7 @@ def share_of_time_above(alpha: float, disturbance: np.ndarray) -> float:
     return float(np.mean(np.abs(disturbance) > alpha))
 
 
-def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> dict[str, Any] | None:
+def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> JsonObject | None:
     """Summarise the converged runs of a level (`frame`) whose alpha is at most f_plus; None if there are none.
 
     Returns the number of `converged_runs`, and of the `runs` that were repeated. For the latter: how many have a disturbance

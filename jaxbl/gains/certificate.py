@@ -7,13 +7,14 @@ import math
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxbl.config import SideCertificateTable
 from jaxbl.errors import InputError, NoResult
 from jaxbl.files import json_with_checksum, read_json, to_jsonable, write_atomic
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import convergence_time_worst, peak_ratio
 from jaxbl.observer.super_twisting import DISCRETISATIONS
 from jaxbl.sweeps.elementwise import call_in_float64
@@ -45,7 +46,7 @@ def certify(
     reaching_time: float | None = None,
     runs: int = 1_000_000,
     seed: int = 0,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Prove a velocity accuracy and a reaching time for gains, and look for a counterexample by adversarial runs.
 
     Source: sets that the sampled error system cannot leave (:mod:`.invariant_set`, docs/theory.md).
@@ -138,7 +139,7 @@ class Assumptions(NamedTuple):
         """Largest position error at the first sample, rad."""
         return self.noise if self.position_error is None else self.position_error
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The table `assumptions` of a certificate."""
         assumptions = self._asdict() | {"position_error": self.starting_position}
         if self.discretisation == "implicit":
@@ -205,12 +206,12 @@ def _prove(lambda_: float, alpha: float, assumptions: Assumptions, accuracy: flo
 
 def _judge_limits(
     assumptions: Assumptions, proven: _ScaledProof, accuracy: float | None, reaching_time: float | None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return each limit that was asked for, and whether the proof meets it.
 
     The reaching time is that of the accuracy that was asked for, if this is met.
     """
-    limits: dict[str, Any] = {}
+    limits: JsonObject = {}
     if accuracy is not None:
         limits["accuracy"] = {"asked": accuracy, "met": bool(proven.bounds[-1] <= accuracy)}
     if reaching_time is not None:
@@ -282,7 +283,7 @@ def choose_certified_gains(search: GainSearch) -> dict[str, int]:
     return passed_over
 
 
-def certify_best_gains(search: GainSearch, path: Path | None) -> dict[str, Any]:
+def certify_best_gains(search: GainSearch, path: Path | None) -> JsonObject:
     """Certify the best gains of each side. Certificates are stored in a file, and read from it if nothing has changed.
 
     Returns certificates by side, as of :func:`certify`. If nothing can be proven, `certified` is false and `why_none` set.

@@ -4,13 +4,13 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import copy
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.points import Points
 
 from .pilot import list_axes
@@ -44,11 +44,11 @@ def add_causes(counterexamples: pd.DataFrame, study: Config, level: str, side: s
     )
 
 
-def _list_remedies(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
+def _list_remedies(run: JsonObject, level: str) -> dict[str, JsonObject]:
     """List the possible causes of a failed run, each with the keys that remove it; `run` is the run's own table."""
     # a factor of four clearly changes an error that depends on the duration or the period
     long, short_period = 4.0 * run["duration"], run["sample_period"] / 4.0
-    remedies: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
+    remedies: dict[str, JsonObject] = {"run too short": {"run.duration": long}}
     remedies["period too long"] = {"run.sample_period": short_period, "run.substeps": max(-(-run["substeps"] // 4), 1)}
     if level == "sampled":
         remedies["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
@@ -57,7 +57,7 @@ def _list_remedies(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]
     return remedies
 
 
-def _set_keys(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def _set_keys(tables: JsonObject, values: JsonObject) -> JsonObject:
     """Set dotted keys in a copy of a config's tables; None removes a key."""
     data = copy.deepcopy(tables)
     for path, value in values.items():
@@ -111,7 +111,7 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
 
 
 def repeat_runs(
-    study: Config, rows: pd.DataFrame, structural_values: dict[str, Any], change: dict[str, Any], stages: Stages, name: str
+    study: Config, rows: pd.DataFrame, structural_values: JsonObject, change: JsonObject, stages: Stages, name: str
 ) -> pd.DataFrame | None:
     """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect."""
     unchanged = _set_keys(study.to_dict(), structural_values)

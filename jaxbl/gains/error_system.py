@@ -12,7 +12,9 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
+from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.elementwise import apply_elementwise
 
 from .stages import Stages
@@ -110,14 +112,14 @@ def _compile_demands(q: float | None) -> Callable[..., Any]:
     )
 
 
-def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> dict[str, np.ndarray]:
+def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> NamedArrays:
     """Return each condition's least lambda (rad^0.5/s) at alpha and f_plus (rad/s^2), with the study's q in (32)."""
     with jax.enable_x64(True):
         demands = apply_elementwise(_compile_demands(config.verify.q), [np.asarray(alpha, float), np.asarray(f_plus, float)])
     return {name: demands[name] for name in list_conditions(config)}
 
 
-def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np.ndarray) -> dict[str, Any]:
+def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np.ndarray) -> JsonObject:
     """Count the runs that a condition judges rightly and wrongly, from bool arrays of one shape."""
     return {
         "name": name,
@@ -128,7 +130,7 @@ def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np
     }
 
 
-def judge_error_system(config: Config, error_map: ErrorSystemMap) -> dict[str, Any]:
+def judge_error_system(config: Config, error_map: ErrorSystemMap) -> JsonObject:
     """Count the cells of the plane by condition: a level of `verdict.json`."""
     converged = error_map.ratio < 1.0
     conditions = []

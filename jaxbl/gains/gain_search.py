@@ -4,7 +4,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +11,9 @@ import pandas as pd
 from jaxbl.config import TUNE_NAMES, TuneTable
 from jaxbl.errors import NoResult
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
+from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import no_disturbance_error
 
@@ -74,7 +75,7 @@ class GainSearch:
         candidates: table of the gains tried, by side, as in :class:`.tune.Tuning`.
     """
 
-    def __init__(self, scenarios: Scenarios, table: TuneTable, pilot: dict[str, Any], stages: Stages):
+    def __init__(self, scenarios: Scenarios, table: TuneTable, pilot: JsonObject, stages: Stages):
         self.scenarios, self.table, self.pilot, self.stages = scenarios, table, pilot, stages
         self.sides = tuple(pilot)
         self.f_plus = {side: float(pilot_values["f_plus"]) for side, pilot_values in pilot.items()}
@@ -140,11 +141,11 @@ class GainSearch:
         assert best is not None
         return best
 
-    def best_candidate(self, side: str) -> dict[str, Any]:
+    def best_candidate(self, side: str) -> JsonObject:
         """Return the best feasible candidate of a side."""
         return self.candidates[side].iloc[self.find_best(side).index].to_dict()
 
-    def least_candidate(self, side: str) -> dict[str, Any]:
+    def least_candidate(self, side: str) -> JsonObject:
         """Return the feasible candidate of a side with the least error; of equal ones that which converges first."""
         frame = self.candidates[side]
         return frame[frame["feasible"]].sort_values(["error", "convergence_time"], kind="stable").iloc[0].to_dict()
@@ -190,7 +191,7 @@ class GainSearch:
             feasible=np.logical_and.reduce(list(self.constraints_met(candidates).values())),
         )
 
-    def constraints_met(self, candidates: pd.DataFrame) -> dict[str, np.ndarray]:
+    def constraints_met(self, candidates: pd.DataFrame) -> NamedArrays:
         """For each constraint (`converged`, or its key in `[tune]`) an array: True for the candidates that meet it."""
         table = self.table
         met = {
@@ -234,7 +235,7 @@ class GainSearch:
         }
         return dict(zip(TUNE_NAMES, (tuned, usual, study_gains), strict=True)) | table_gains
 
-    def compare_gains(self, *, held_out: bool) -> list[dict[str, Any]]:
+    def compare_gains(self, *, held_out: bool) -> list[JsonObject]:
         """Compare all named gains: one row (:func:`summarise_runs`) for each name and side.
 
         The runs have the study's own excitation and seeds, or if `held_out` the held-out excitation and other seeds.
@@ -317,12 +318,12 @@ def _reduce_to_worst(frame: pd.DataFrame, side: str, objective: str, scenario_co
     return worst.rename_axis(["lambda", "alpha"]).reset_index()
 
 
-def summarise_runs(gains_name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> dict[str, Any]:
+def summarise_runs(gains_name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> JsonObject:
     """Summarise the runs of a side with the same gains (lambda, alpha): a row of `named` in `tuning.json`."""
     metrics = {metric: runs[f"{side}.{metric}"] for metric in GAIN_METRICS}
     converged, finite = metrics["converged"].astype(bool), runs["finite"].astype(bool)
     bound = metrics["f_plus"].max() if finite.all() else math.nan
-    row: dict[str, Any] = {
+    row: JsonObject = {
         "name": gains_name, "side": side, "lambda": gains[0], "alpha": gains[1], "runs": len(runs),
         "converged": float(converged.mean()), "finite": float(finite.mean()),
     }  # fmt: skip

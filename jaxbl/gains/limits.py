@@ -3,12 +3,11 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 
 from .gain_search import GainSearch, grid_ratio
 
@@ -29,7 +28,7 @@ _ROUNDING = 1e-9
 """Relative difference up to which two gains are the same."""
 
 
-def find_limits(search: GainSearch, side: str) -> dict[str, Any]:
+def find_limits(search: GainSearch, side: str) -> JsonObject:
     """Find what limits a side's gains: the table `limits` of `tuning.json`.
 
     - `profiles`: for each gain the error along it, with the other gain at the optimum, and the constraints missed there;
@@ -70,7 +69,7 @@ def find_limits(search: GainSearch, side: str) -> dict[str, Any]:
     )
 
 
-def _error_profile(search: GainSearch, side: str, gain: str, best: dict[str, Any]) -> pd.DataFrame:
+def _error_profile(search: GainSearch, side: str, gain: str, best: JsonObject) -> pd.DataFrame:
     """Return candidates along one gain, with the other gain at its optimum, and the constraints that each misses.
 
     They are interpolated between two rows of a map. Where maps overlap, the finer one counts.
@@ -114,9 +113,7 @@ def _interpolate_line(candidates: pd.DataFrame, gain: str, other: str, other_rat
 _COLUMNS = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "error", "chatter", *CONSTRAINT_COLUMNS.values()]
 
 
-def _judge_direction(
-    search: GainSearch, profile: pd.DataFrame, best: dict[str, Any], gain: str, sign: int
-) -> dict[str, Any]:
+def _judge_direction(search: GainSearch, profile: pd.DataFrame, best: JsonObject, gain: str, sign: int) -> JsonObject:
     """Find the reason against a smaller (sign -1) or larger gain, within about one cell of the coarse map.
 
     Returns a dictionary:
@@ -152,7 +149,7 @@ def _judge_direction(
     return judgement | {"by": _growing_part(search, best, last) if grows else None}
 
 
-def _growing_part(search: GainSearch, best: dict[str, Any], last: pd.Series) -> str | None:
+def _growing_part(search: GainSearch, best: JsonObject, last: pd.Series) -> str | None:
     """Return the part of the velocity error that most of its growth is due to, by mean squares."""
     squares = [(row["error"] ** 2, row["chatter"] ** 2) for row in (best, last)]
     if search.table.objective != "velocity" or not all(chatter <= error for error, chatter in squares):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config import Config, read_config
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.sweeps.trial import run
 
@@ -28,7 +29,7 @@ from .under_tuned import (
 from .worst_case import half_cycle
 
 
-def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str, Any]]:
+def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[JsonObject]:
     """Judge the marked gains (`marks` of `verdict.json`): their bounds, margins and peak ratios.
 
     `ideal` is the study with ideal encoders.
@@ -93,7 +94,7 @@ def _explain_convergence(
     disturbance: np.ndarray,
     friction: float,
     starts: tuple[float, ...],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Explain how gains that miss the exact condition behave under a disturbance (rad/s^2).
 
     The numbers are predicted by :mod:`.under_tuned`, and simulated in continuous time. `starts` are the position error (rad)
@@ -103,7 +104,7 @@ def _explain_convergence(
     largest = float(np.abs(disturbance).max())
     share = share_of_time_above(alpha, disturbance)
     error_inputs = {"times": times, "disturbance": disturbance, "damping": friction}
-    explanation: dict[str, Any] = {"largest_disturbance": largest, "share_above_alpha": share}
+    explanation: JsonObject = {"largest_disturbance": largest, "share_above_alpha": share}
     if share > 0.0:
         explanation["excursion_predicted"] = excursion(alpha, **error_inputs)
         explanation["excursion_simulated"] = simulate_error(lambda_, alpha, **error_inputs, velocity_error=0.0).largest
@@ -120,7 +121,7 @@ def _explain_convergence(
             # inf or None: peaks are larger at the end of the run
             explanation[f"tenth_{name}"] = float(peak_times[index]) if index < len(peak_times) else None
     least = least_cycle_frequency(lambda_, alpha, largest, friction)
-    cycle: dict[str, Any] = {"least_predicted": least, "least_simulated": None}
+    cycle: JsonObject = {"least_predicted": least, "least_simulated": None}
     if 0.0 < least < np.inf:
         # far enough above the least frequency
         frequency = 2.0 * least

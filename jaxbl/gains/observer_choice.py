@@ -18,6 +18,7 @@ import pandas as pd
 
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
@@ -52,7 +53,7 @@ class ObserverChoice:
     """
 
     config: Config
-    summary: dict[str, Any]
+    summary: JsonObject
     cost: dict[str, float]
     fallback_reasons: tuple[str, ...] = ()
 
@@ -75,7 +76,7 @@ class SideSearch:
     error: float = math.inf
     error_before: float = math.inf
 
-    def trial_gains(self, unit: np.ndarray) -> dict[str, np.ndarray]:
+    def trial_gains(self, unit: np.ndarray) -> NamedArrays:
         """Return the values of each gain at points of the unit cube, shape (trials, free gains)."""
         gains, column = {}, 0
         for path, (low, high) in self.window.items():
@@ -86,7 +87,7 @@ class SideSearch:
             column += 1
         return gains
 
-    def zoom_in(self, trials: dict[str, np.ndarray], errors: np.ndarray) -> None:
+    def zoom_in(self, trials: NamedArrays, errors: np.ndarray) -> None:
         """Store the best of the trials, and zoom in on it: to two cells of a grid with as many points."""
         self.error_before, best_trial = self.error, int(np.argmin(errors))
         if errors[best_trial] < self.error:
@@ -121,10 +122,10 @@ class MapPoint(NamedTuple):
             over the scenarios.
     """
 
-    values: dict[str, Any]
+    values: JsonObject
     lane: dict[str, float]
     scenarios: Scenarios
-    pilot: dict[str, Any]
+    pilot: JsonObject
     searches: dict[str, dict[str, SideSearch]]
     held_out: dict[str, NamedArrays]
 
@@ -166,7 +167,7 @@ class _KindSearch:
         """
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
-    def _merge_gains(self, sides: Mapping[str, Mapping[str, Any]], side_set: tuple[str, ...]) -> dict[str, Any]:
+    def _merge_gains(self, sides: Mapping[str, Mapping[str, Any]], side_set: tuple[str, ...]) -> JsonObject:
         """Merge the gains of both sides for one run. A shared gain is taken from the sides that the run is for."""
         return {path: value for side in reversed((*side_set, *self.sides)) for path, value in sides[side].items()}
 
@@ -234,7 +235,7 @@ class _KindSearch:
         sides: tuple[str, ...],
         *,
         held_out: bool = False,
-    ) -> dict[str, np.ndarray]:
+    ) -> NamedArrays:
         """Run trials (`rows`: index of the point in its group, gains), and return errors by side, shape (rows, seeds).
 
         They are the worst over the scenarios, and infinite if a run diverged or took too long to converge.
@@ -273,9 +274,9 @@ class _KindSearch:
         return errors_by_side
 
 
-def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> JsonObject:
     """Return the `[observer]` table of a kind, with the first trial's gains."""
-    data: dict[str, Any] = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
+    data: JsonObject = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
     data["kind"] = kind
     for path, values in columns.items():
         section, _, side_key = path.partition(".")
@@ -289,7 +290,7 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
     """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
-    stored_pilots: dict[str, Any] = dict(stages.manifest.get("pilots", {}))
+    stored_pilots: JsonObject = dict(stages.manifest.get("pilots", {}))
     groups, pilots = [], {}
     for group in points.groups:
         columns = points.columns(np.arange(points.group_size))
@@ -311,7 +312,7 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
     return groups
 
 
-def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, JsonObject]:
     """Rank kinds by their error, least first, with the ratio to the best kind's error.
 
     Args:
@@ -328,7 +329,7 @@ def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
         if np.isfinite(kind_errors).all()
     }
     order = sorted(logs, key=lambda kind: float(logs[kind].mean()))
-    ranking: dict[str, dict[str, Any]] = {}
+    ranking: dict[str, JsonObject] = {}
     for kind in order:
         log_ratios = logs[kind] - logs[order[0]]
         half = 0.0
@@ -360,7 +361,7 @@ def runs_are_equal(rank: Mapping[str, Any]) -> bool:
     return rank["high"] - rank["low"] < 1e-9 * rank["ratio"]
 
 
-def _summary(search: _KindSearch) -> dict[str, Any]:
+def _summary(search: _KindSearch) -> JsonObject:
     """Return the content of `tuning.json`."""
     config, table, points = search.config, search.table, []
     none = np.full(search.held_out_seeds, np.inf)
@@ -401,7 +402,7 @@ def _summary(search: _KindSearch) -> dict[str, Any]:
     return to_jsonable(summary) | {"remarks": [*config.notes, *_remarks(search, points)]}
 
 
-def _describe_search(side: SideSearch, name: str) -> dict[str, Any]:
+def _describe_search(side: SideSearch, name: str) -> JsonObject:
     """Describe the search of a kind: its gains by key, its error, the gain by the last zoom, and gains at range ends."""
     gains = {path.removeprefix(f"observer.{name}."): value for path, value in side.best.items()}
     last = (

@@ -13,6 +13,7 @@ from jaxbl.config import Config, TuneTable, precision, prepare, read_config
 from jaxbl.drive.effects import correction_of
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError, NoResult
+from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment, Reducer, Signals, scan
 from jaxbl.sweeps.metrics import ROUNDING
 
@@ -33,7 +34,7 @@ def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
     if not table.worst_over_uncertainty:
         return Scenarios(config, ["nominal"], {})
     data, relative = config.to_dict(), config.uncertainty.relative
-    effects: list[dict[str, Any]] = data.setdefault("effects", [])
+    effects: list[JsonObject] = data.setdefault("effects", [])
     errors_by_number: dict[str, list[tuple[int, str, float]]] = {}
     for number, side in itertools.product(("inertia", "viscous"), config.build().sides):
         nominal = getattr(config.drive, f"{side}_{number}")
@@ -78,7 +79,7 @@ def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
     )
 
 
-def list_axes(columns_by_label: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[dict[str, Any]]:
+def list_axes(columns_by_label: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[JsonObject]:
     """List axes of a study from columns of values by path: those of one label advance together."""
     return [
         {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
@@ -156,7 +157,7 @@ def _find_extremes(scenarios: Scenarios, excitation: Any = None) -> dict[str, di
     return extremes_by_side
 
 
-def run_pilot(scenarios: Scenarios, table: TuneTable) -> dict[str, Any]:
+def run_pilot(scenarios: Scenarios, table: TuneTable) -> JsonObject:
     """Find f_plus (rad/s^2) by side from pilot runs: for the study's excitation and for the held-out one.
 
     The acceleration that an observer's model lacks is the disturbance, plus viscous friction times the velocity error. The

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, least_lambda_exact
 from jaxbl.sweeps.elementwise import call_in_float64
 
@@ -254,7 +255,7 @@ def _share_covered(rule: Rule, alpha: np.ndarray, exact: np.ndarray, window: tup
     return float(np.trapezoid(area, logarithm) / np.trapezoid(np.log(high / exact), logarithm))
 
 
-def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> list[dict[str, Any]]:
+def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> list[JsonObject]:
     """Judge every rule: the table `rules` of `verdict.json`.
 
     Args:

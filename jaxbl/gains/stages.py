@@ -19,6 +19,7 @@ from jaxbl.files import (
     to_path,
     write_atomic,
 )
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, check_backend, share_programs
 from jaxbl.sweeps.store import claim_folder, manifest_head
@@ -45,7 +46,7 @@ def open_stages(
         yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
 
 
-def stage_tables(config: Config, name: str, table: TuneTable, held_out_seeds: int | None = None) -> dict[str, Any]:
+def stage_tables(config: Config, name: str, table: TuneTable, held_out_seeds: int | None = None) -> JsonObject:
     """Return the tables of a stage's study: those of `config` without its axes and evaluation.
 
     Held-out runs have so many other seeds, and the excitation `holdout` of the table if it has one.
@@ -91,7 +92,7 @@ class Stages:
         self.folder: Path | None = None
         self._cluster = cluster
         self.devices = devices
-        self.manifest: dict[str, Any] = {}
+        self.manifest: JsonObject = {}
         self.total_lanes = 0
         self.fallback_reasons: dict[str, None] = {}
         self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
@@ -100,7 +101,7 @@ class Stages:
         self._finished_lanes = 0
         self._manifest_is_damaged = False
         """A damaged manifest is written anew only after a stage has run: the folder is this study's then."""
-        self._early_results: dict[str, Any] = {}
+        self._early_results: JsonObject = {}
         if out is None:
             return
         claim_folder(to_path(out), config, command, overwrite=overwrite)
@@ -152,7 +153,7 @@ class Stages:
             parts.write_part(path, frame, parts.PartHeader(manifest, {}, "", 0, 0, {}))
         return frame
 
-    def run(self, study: Config | dict[str, Any], name: str) -> StudyResult:
+    def run(self, study: Config | JsonObject, name: str) -> StudyResult:
         """Run a stage, or continue one that was interrupted."""
         lanes_before = self._finished_lanes
 
@@ -177,6 +178,6 @@ class Stages:
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result
 
-    def rerun(self, study: Config | dict[str, Any], *names: str) -> pd.DataFrame:
+    def rerun(self, study: Config | JsonObject, *names: str) -> pd.DataFrame:
         """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place."""
         return sweep(study, self.path_of(*names), devices=self.devices, overwrite=True).frame

@@ -17,6 +17,7 @@ import pandas as pd
 from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
+from jaxbl.json_types import JsonObject
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
@@ -46,7 +47,7 @@ class Tuning:
     """
 
     config: Config
-    summary: dict[str, Any]
+    summary: JsonObject
     candidates: dict[str, pd.DataFrame]
     cost: dict[str, float]
     fallback_reasons: tuple[str, ...] = ()

@@ -4,12 +4,12 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 
 import math
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -37,8 +37,8 @@ class Summary:
     def __init__(
         self,
         search: GainSearch,
-        named_rows: list[dict[str, Any]],
-        held_out_rows: list[dict[str, Any]],
+        named_rows: list[JsonObject],
+        held_out_rows: list[JsonObject],
         causes: dict[str, dict[str, float]],
     ):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
@@ -51,7 +51,7 @@ class Summary:
         self.held_out = {side: {row["name"]: row for row in held_out_rows if row["side"] == side} for side in search.sides}
         self.factors = {side: self._compare_with_tuned(side) for side in search.sides}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The content of `tuning.json`."""
         search, table, sides = self.search, self.table, self.search.sides
         first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
@@ -87,7 +87,7 @@ class Summary:
             "remarks": [*self.config.notes, *self._remarks()],
         }
 
-    def _judge_side(self, side: str) -> dict[str, Any]:
+    def _judge_side(self, side: str) -> JsonObject:
         """Judge whether a side's gains matter, what limits the error, and how large the margin is.
 
         Gains do not matter if all of the coarse map that meet the constraints have nearly the least error.
@@ -104,15 +104,15 @@ class Summary:
             | {"nearly_as_good": best.nearly_as_good, "tried": len(candidates)}
         )
 
-    def _achieved_metrics(self, side: str) -> dict[str, Any]:
+    def _achieved_metrics(self, side: str) -> JsonObject:
         names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
         return to_jsonable({name: self.best_candidates[side][name] for name in names} | {"peak_ratio": rho})
 
-    def _front(self, side: str) -> list[dict[str, Any]]:
+    def _front(self, side: str) -> list[JsonObject]:
         names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
         return to_jsonable(pareto_front(self.search.candidates[side])[names].to_dict("records"))
 
-    def _compare_with_tuned(self, side: str) -> dict[str, Any]:
+    def _compare_with_tuned(self, side: str) -> JsonObject:
         """Divide other gains' metrics by the tuned gains', on the held-out input.
 
         There are no factors for gains that do not always converge.

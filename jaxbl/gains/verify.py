@@ -21,6 +21,7 @@ from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable, write_atomic, write_table
+from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.metrics import ROUNDING, no_disturbance_error
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
@@ -59,7 +60,7 @@ class Verdict:
     """
 
     config: Config
-    summary: dict[str, Any]
+    summary: JsonObject
     error_map: ErrorSystemMap
     levels: dict[str, pd.DataFrame]
     counterexamples: pd.DataFrame
@@ -197,7 +198,7 @@ def _idealise_study(config: Config) -> Config:
     return _strip_study(config, encoders={}, observer=observer, axes=axes, sweep=config.to_dict()["sweep"] | {"seeds": 1})
 
 
-def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[dict[str, Any], pd.DataFrame]:
+def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[JsonObject, pd.DataFrame]:
     """Count a level's runs by condition, at the true bound and at the claimed one.
 
     Returns the summary of the level, and its counterexamples.
@@ -211,7 +212,7 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
     least_rows = frame[converged].groupby(other_columns, sort=False)[path].idxmin().to_numpy()
     position = frame.index.get_indexer(least_rows)
     smallest = lambda_.min()
-    summaries: dict[str, list[dict[str, Any]]] = {}
+    summaries: dict[str, list[JsonObject]] = {}
     counterexamples = []
     for bound, column in bounds.items():
         summaries[bound] = []
@@ -258,7 +259,7 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
     return summary, pd.concat(counterexamples, ignore_index=True)
 
 
-def _summarise_by_input(config: Config, converged_runs: pd.DataFrame, bounds: dict[str, str]) -> list[dict[str, Any]]:
+def _summarise_by_input(config: Config, converged_runs: pd.DataFrame, bounds: dict[str, str]) -> list[JsonObject]:
     """Summarise the true and the claimed bound (medians, rad/s^2) of converged runs by input, transmission and drive."""
     kinds = ("excitation.", "transmission.", "drive.")
     keys = [axis.path for axis in config.axes if axis.path.startswith(kinds) and axis.path in converged_runs]

@@ -26,6 +26,7 @@ from scipy import stats
 
 from jaxbl.config import Config, is_boolean
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 
 from .metrics import ROUNDING, find_metric, is_magnitude
 from .store import Store
@@ -94,7 +95,7 @@ class MetricChange:
     size: float
     moved: MeanChange
     where: dict[str, list[Any]]
-    most: dict[str, Any] | None
+    most: JsonObject | None
 
     @property
     def count(self) -> int:
@@ -140,7 +141,7 @@ class Comparison:
         """True if there are enough seeds to estimate the noise."""
         return any(change.differs is not None for change in self.metrics)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The comparison as plain data for `comparison.json`."""
         fields = (field.name for field in dataclasses.fields(self) if not field.name.startswith("_"))
         table = {name: getattr(self, name) for name in fields}
@@ -224,11 +225,11 @@ def _compare_versions(first: StudyResult, second: StudyResult) -> dict[str, tupl
     return _differing_keys(*({"backend": manifest["backend"], **manifest["versions"]} for manifest in manifests))
 
 
-def _config_without(config: Config, keys: tuple[str, ...]) -> dict[str, Any]:
+def _config_without(config: Config, keys: tuple[str, ...]) -> JsonObject:
     return {key: table for key, table in config.to_dict().items() if key not in keys}
 
 
-def _flatten_tables(tree: Any, prefix: str = "") -> dict[str, Any]:
+def _flatten_tables(tree: Any, prefix: str = "") -> JsonObject:
     """Leaves of nested tables by dotted key; a table of a list by its path or kind if that is unique, else by its number."""
     if isinstance(tree, list) and tree and all(isinstance(table, Mapping) for table in tree):
         labels = [str(table.get("path", table.get("kind", i))) for i, table in enumerate(tree)]
@@ -236,13 +237,13 @@ def _flatten_tables(tree: Any, prefix: str = "") -> dict[str, Any]:
         tree = dict(zip(labels, tree, strict=True))
     if not isinstance(tree, Mapping):
         return {prefix: tree}
-    leaves: dict[str, Any] = {}
+    leaves: JsonObject = {}
     for key, branch in tree.items():
         leaves |= _flatten_tables(branch, f"{prefix}.{key}".lstrip("."))
     return leaves
 
 
-def _differing_keys(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _differing_keys(first: JsonObject, second: JsonObject) -> dict[str, tuple[Any, Any]]:
     """Both values of each key that differs; None if it is missing."""
     pairs = {key: (first.get(key), second.get(key)) for key in dict.fromkeys([*first, *second])}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

@@ -20,7 +20,7 @@ import numpy as np
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.fused import program_cache
-from jaxbl.simulate import Experiment, scan
+from jaxbl.simulate import Experiment, TracedArrays, scan
 from jaxbl.workers import announce
 
 from .metrics import MetricNames, metrics_reducer
@@ -215,7 +215,7 @@ _WEIGHTS = {
 def _trace_operations(experiment: Experiment, paths: Sequence[str], names: MetricNames) -> Operations:
     """Trace a run of many lanes, and count its operations for each sample."""
 
-    def run_lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
+    def run_lane(values: TracedArrays, seed: Any) -> TracedArrays:
         return scan(set_leaves(experiment, values), seed, (metrics_reducer(names),))[0]
 
     column = jax.ShapeDtypeStruct((_TRACED_LANES,), jnp.result_type(experiment.run.sample_period))

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, precision, prepare
+from jaxbl.simulate import NamedArrays
 
 from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
 from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
@@ -264,7 +265,7 @@ class Engine:
             columns[name] = padded[: len(chunk.seeds), : len(chunk.points)].ravel()
         return pd.DataFrame(columns)
 
-    def row_labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
+    def row_labels(self, chunk: Chunk) -> NamedArrays:
         """Axis values by path, and seeds, of the rows of a chunk."""
         group = self.points.groups[chunk.group]
         values = group.structural | self.points.columns(chunk.points)
@@ -272,7 +273,7 @@ class Engine:
         columns["seed"] = np.broadcast_to(chunk.seeds[:, None], chunk.shape).ravel()
         return columns
 
-    def _pad_arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
+    def _pad_arguments(self, config: Config, columns: NamedArrays, seeds: np.ndarray) -> tuple[Any, Any]:
         """Arguments of a compiled program, padded to the layout: values by path, and seeds."""
 
         def pad(values: np.ndarray, size: int) -> np.ndarray:
@@ -315,7 +316,7 @@ class Engine:
                 self.fallback_reasons.append(program.fallback_reason)
             return program
 
-    def _complete_metrics(self, metrics: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
+    def _complete_metrics(self, metrics: NamedArrays, gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
         """Metrics of a chunk, with gain metrics if any are requested."""
         return add_gain_metrics(metrics, gains) if needs_gain_metrics(self.config.sweep.requested_metrics) else metrics
 

@@ -20,7 +20,7 @@ from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import AbstractSuperTwisting, conditions
 from jaxbl.registry import Registry, check_subclass, check_text
-from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
+from jaxbl.simulate import Experiment, NamedArrays, Number, Reducer, Signals, State, TracedArrays, TrueSide
 from jaxbl.validation import suggest_word
 
 from .elementwise import apply_elementwise
@@ -433,7 +433,7 @@ def _update_carries(
 
 def _compute_results(
     names: MetricNames, experiment: Experiment, carry: tuple, state: State, side: str, result_names: Iterable[str]
-) -> dict[str, Any]:
+) -> TracedArrays:
     """Metrics of a side by name, from its states so far."""
     run = experiment.run
     parameters = identified_parameters(experiment, state).get(side, {})
@@ -443,7 +443,7 @@ def _compute_results(
     return {name: metrics[name].result(states[metrics[name].carry or name], end) for name in result_names}
 
 
-def _is_finite(results: dict[str, Any]) -> Array:
+def _is_finite(results: TracedArrays) -> Array:
     return jnp.isfinite(sum(results[name] for name in _OVERFLOW_METRICS))
 
 
@@ -505,7 +505,7 @@ def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     return {s: ObserverGains(*(getattr(getattr(experiment.observer, s), f) for f in fields)) for s in experiment.sides}
 
 
-def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> dict[str, np.ndarray]:
+def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> NamedArrays:
     """Metrics by column together with those that follow from gains and f_plus alone: margins and convergence times.
 
     They are computed apart from the loop over time, by programs that all studies share.

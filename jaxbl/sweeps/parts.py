@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jaxbl.files import catch_store_errors, checksum, has_file, is_remote, open_draft
+from jaxbl.json_types import JsonObject
 
 _KEY, _SUM = b"jaxbl.part", b"jaxbl.checksum"
 """Keys of the file's metadata: the header as JSON, and its checksum."""
@@ -38,7 +39,7 @@ class PartHeader(NamedTuple):
         columns: checksum of each column.
     """
 
-    study: dict[str, Any]
+    study: JsonObject
     layout: dict[str, int]
     backend: str
     chunk: int

@@ -18,6 +18,7 @@ from jaxbl.config import KIND, TOLERANCE, AxisTable, Config, numeric_paths, with
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
+from jaxbl.json_types import JsonObject
 from jaxbl.simulate import Experiment
 
 from .metrics import explain_missing_metric, metric_columns
@@ -36,7 +37,7 @@ class Group(NamedTuple):
     """Points that share a compiled program: the config with their structural values, and these values by path."""
 
     config: Config
-    structural: dict[str, Any]
+    structural: JsonObject
 
 
 class Refinement(NamedTuple):

@@ -15,7 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, raising_unsupported
-from jaxbl.simulate import Experiment, scan
+from jaxbl.simulate import Experiment, NamedArrays, TracedArrays, scan
 
 from .metrics import ALL_METRICS, MetricNames, ObserverGains, metric_columns, metrics_reducer, observer_gains
 
@@ -103,7 +103,7 @@ class Program(NamedTuple):
         fallback_reason: what the fused loop does not support, if the scan takes its place.
     """
 
-    run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
+    run: Callable[[NamedArrays, np.ndarray], tuple[NamedArrays, dict[str, ObserverGains]]]
     megabytes: float
     fallback_reason: str | None = None
 
@@ -125,7 +125,7 @@ def compile_program(
     layout: Layout,
     devices: list[Any],
     backend: Backend,
-    columns: dict[str, np.ndarray],
+    columns: NamedArrays,
     *,
     metric_names: MetricNames = None,
     require_backend: bool = False,
@@ -180,7 +180,7 @@ def _compile_fused(
         # compile the program that draws the noise, now and not with the first chunk
         next(simulator.compute_inputs(0))
 
-    def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
+    def run(values: NamedArrays, seeds: np.ndarray) -> tuple[NamedArrays, dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
             # seeds may repeat, as padding of the last chunk; the next chunk has probably the same ones
             unique_seeds = dict.fromkeys(int(seed) for seed in seeds)
@@ -194,8 +194,8 @@ def _compile_fused(
     return Program(run, (simulator.carry_count + len(paths) + column_count) * layout.points * item_size / 1e6)
 
 
-def _compile_scan(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
-    def run_lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
+def _compile_scan(experiment: Experiment, layout: Layout, devices: list[Any], columns: NamedArrays) -> Program:
+    def run_lane(values: TracedArrays, seed: Any) -> tuple[TracedArrays, Any]:
         lane_experiment = set_leaves(experiment, values)
         metrics, _ = scan(lane_experiment, seed, (ALL_METRICS,))
         return metrics, observer_gains(lane_experiment)

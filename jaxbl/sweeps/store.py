@@ -38,6 +38,8 @@ from jaxbl.files import (
     rename_file,
     write_atomic,
 )
+from jaxbl.json_types import JsonObject
+from jaxbl.simulate import NamedArrays
 
 from . import parts
 from .parts import Damaged, PartHeader
@@ -81,14 +83,14 @@ def identity(config: Config, command: str = "sweep") -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
+def _name_by_content(data: JsonObject, excitation: Any) -> None:
     """Replace the file name of a recorded input by a hash of its samples, since the file's path decides no number."""
     if excitation.kind == "recorded":
         record = excitation.build()
         data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
 
 
-def manifest_head(config: Config, command: str) -> dict[str, Any]:
+def manifest_head(config: Config, command: str) -> JsonObject:
     """The first entries of a command's manifest: identity of the study for it and for a single run, and title."""
     return {"identity": identity(config, command), "single_run": identity(config, "simulate"), "title": config.title}
 
@@ -191,7 +193,7 @@ class Store:
         writes_manifest: True if this process writes the manifest while parts are added; only one does.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any], *, writes_manifest: bool = True):
+    def __init__(self, folder: Path, manifest: JsonObject, *, writes_manifest: bool = True):
         self.folder = folder
         self.writes_manifest = writes_manifest
         self.manifest = manifest
@@ -276,7 +278,7 @@ class Store:
         return self.manifest["backend"]
 
     @property
-    def _head(self) -> dict[str, Any]:
+    def _head(self) -> JsonObject:
         return {name: self.manifest[name] for name in ("identity", "single_run")}
 
     def update_manifest(self, **entries: Any) -> None:
@@ -363,7 +365,7 @@ class Store:
         # names with six digits come after those with five
         return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
-    def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
+    def read_part(self, index: int, labels: NamedArrays, columns: list[str]) -> pd.DataFrame | None:
         """Read columns of a chunk; None if the part cannot be read, or has other rows than `labels` (columns by name)."""
         try:
             _, frame = parts.read_part(self.part_path(index), [*labels, *columns])

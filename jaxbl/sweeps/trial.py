@@ -13,9 +13,10 @@ from jaxbl.config import Config, ConfigSource, precision, prepare, read_config, 
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
+from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
+from jaxbl.simulate import Experiment, Reducer, Signals, State, TracedArrays, scan
 
 from .metrics import ALL_METRICS, add_gain_metrics, identified_parameters, observer_gains
 from .programs import Backend
@@ -34,7 +35,7 @@ class Trial(NamedTuple):
 
     config: Config
     trace: pd.DataFrame
-    summary: dict[str, Any]
+    summary: JsonObject
 
 
 def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend | None = None) -> Trial:
@@ -69,15 +70,13 @@ def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend 
     return Trial(config, trace, _summarise(config, last, to_jsonable(results), seed))
 
 
-def run_perturbed(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
+def run_perturbed(study: Config, seed: int, count: int) -> list[JsonObject]:
     """Run a study `count` times with gains λ and motor inertia changed in their last digits, and return the metrics.
 
     Their spread shows how far rounding changes the metrics: noise and a gap may amplify it.
     """
     experiment = study.build()
-    numbers: dict[str, Any] = {
-        f"observer.{side}.lambda": gains.lambda_ for side, gains in observer_gains(experiment).items()
-    }
+    numbers: JsonObject = {f"observer.{side}.lambda": gains.lambda_ for side, gains in observer_gains(experiment).items()}
     numbers["drive.motor_inertia"] = experiment.drive.inertia("motor")
     # eight units in the last place: the first product may lose one bit
     step = 8.0 * float(np.finfo(study.run.precision).eps)
@@ -88,7 +87,7 @@ def run_perturbed(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
     return all_metrics
 
 
-def _run_fused(experiment: Experiment, seed: int, stride: int, *, require_backend: bool) -> tuple[dict[str, Any], Any]:
+def _run_fused(experiment: Experiment, seed: int, stride: int, *, require_backend: bool) -> tuple[Any, Any]:
     """Run the fused loop; if it does not support the experiment, the scan, unless `require_backend`."""
     try:
         with raising_unsupported():
@@ -103,11 +102,11 @@ def _run_fused(experiment: Experiment, seed: int, stride: int, *, require_backen
 
 
 @partial(jax.jit, static_argnums=2)
-def _run_scan(experiment: Experiment, seed: Any, stride: int) -> tuple[dict[str, Any], Any]:
+def _run_scan(experiment: Experiment, seed: Any, stride: int) -> tuple[TracedArrays, Any]:
     return scan(experiment, seed, _REDUCERS, partial(_trace_row, experiment), stride)
 
 
-def _last_results(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
+def _last_results(experiment: Experiment, largest: Any, state: State) -> TracedArrays:
     results = {"last.largest_torque": largest}
     for side, parameters in identified_parameters(experiment, state).items():
         results |= {f"last.{side}.{name}": parameter for name, parameter in parameters.items()}
@@ -123,7 +122,7 @@ _LAST_RESULTS = Reducer(
 _REDUCERS = ALL_METRICS, _LAST_RESULTS
 
 
-def _trace_row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
+def _trace_row(experiment: Experiment, state: State, signals: Signals) -> TracedArrays:
     """The trace's row of a sample, by column."""
     row = {"t": signals.time, "u": signals.input}
     row |= {POSITION_CHANNELS[side]: signals.side(side).measured for side in experiment.sides}
@@ -142,9 +141,9 @@ def _trace_row(experiment: Experiment, state: State, signals: Signals) -> dict[s
     return OrderedDict(row)
 
 
-def _summarise(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
+def _summarise(config: Config, last: JsonObject, metrics: JsonObject, seed: int) -> JsonObject:
     experiment = config.build()
-    parameters: dict[str, Any] = {}
+    parameters: JsonObject = {}
     if experiment.transmission is not None:
         for name, true in experiment.transmission.truth().items():
             sides = {side: last[f"last.{side}.{name}"] for side in experiment.sides}
@@ -165,7 +164,7 @@ def _summarise(config: Config, last: dict[str, Any], metrics: dict[str, Any], se
     }
 
 
-def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
+def _remarks(experiment: Experiment, last: JsonObject, metrics: JsonObject, conditions: JsonObject) -> list[str]:
     """Sentences about convergence, and about the gains beside the gain conditions; adds `torque_bound` to `conditions`."""
     if not metrics["finite"]:
         return ["The run diverged: its metrics are not finite. Check the units; more [run] substeps make it more stable."]

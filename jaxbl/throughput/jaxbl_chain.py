@@ -10,7 +10,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive import set_leaves
 from jaxbl.fused.lane_simulator import HostSimulator
-from jaxbl.simulate import scan
+from jaxbl.simulate import TracedArrays, scan
 
 from .workload import CHAIN_METRICS, RANGES, SEED, ChunkedProgram, Metrics, Workload
 
@@ -24,7 +24,7 @@ class ScanChain(ChunkedProgram):
     def __init__(self, workload: Workload, devices: int):
         experiment = workload.experiment()
 
-        def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
+        def lane(values: TracedArrays, seed: Any) -> TracedArrays:
             return scan(set_leaves(experiment, values), seed, (CHAIN_METRICS,))[0]
 
         lanes, mesh = PartitionSpec("lanes"), Mesh(np.array(jax.local_devices(backend="cpu")[:devices]), ("lanes",))

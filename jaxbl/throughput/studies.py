@@ -2,20 +2,21 @@
 sample, several seeds, every metric of the run. Gain conditions, which follow from the metrics, are left out.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from jaxbl.config import Config, precision, prepare, read_config
-from jaxbl.simulate import Experiment
+from jaxbl.json_types import JsonObject
+from jaxbl.simulate import Experiment, NamedArrays
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Layout, Program, compile_program
 
 from .workload import DRIVE, Metrics
 
 _LAW = {"law": "sigmoid_backlash", "stiffness": 1.0, "dead_zone": 0.02, "slope": 20.0}
-STUDIES: dict[str, dict[str, Any]] = {
+STUDIES: dict[str, JsonObject] = {
     "gain_map": {
         "drive": {"kind": "two_inertia", **DRIVE},
         "transmission": _LAW,
@@ -67,7 +68,7 @@ class BenchStudy(NamedTuple):
     name: str
     config: Config
     experiment: Experiment
-    values: dict[str, np.ndarray]
+    values: NamedArrays
 
     @property
     def seeds(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
 from jaxbl.observer import EquivalentControl, ExplicitSuperTwisting, Identifier, Observers
-from jaxbl.simulate import Experiment, Reducer, Run, State, unit_noise
+from jaxbl.simulate import Experiment, NamedArrays, Reducer, Run, State, TracedArrays, unit_noise
 from jaxbl.sweeps.metrics import window_start
 
 SEED = 0
@@ -42,7 +42,7 @@ _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
 """The paper's drive and law (N m/rad, 1/rad), and the low-pass of the equivalent control (s)."""
 
 
-def _update_sums(experiment: Experiment, sums: dict[str, Any], index: Any, signals: Any) -> dict[str, Any]:
+def _update_sums(experiment: Experiment, sums: TracedArrays, index: Any, signals: Any) -> TracedArrays:
     counts = (index >= window_start(experiment.run.steps)).astype(signals.time.dtype)
     updated = {}
     for side in SIDES:
@@ -51,7 +51,7 @@ def _update_sums(experiment: Experiment, sums: dict[str, Any], index: Any, signa
     return updated
 
 
-def _metrics(experiment: Experiment, sums: dict[str, Any], state: State) -> dict[str, Any]:
+def _metrics(experiment: Experiment, sums: TracedArrays, state: State) -> TracedArrays:
     assert experiment.identifier is not None and experiment.transmission is not None and state.identifier is not None
     count = experiment.run.steps - window_start(experiment.run.steps)
     identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
@@ -91,7 +91,7 @@ class Workload(NamedTuple):
         """First sample of which errors count."""
         return window_start(self.steps)
 
-    def values(self) -> dict[str, np.ndarray]:
+    def values(self) -> NamedArrays:
         """Draw the values of the lanes by config path, `(lanes,)`: a low-discrepancy sequence over `RANGES`.
 
         Fewer lanes have the first values of more lanes.

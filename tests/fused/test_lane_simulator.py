@@ -273,9 +273,9 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         assert len(simulator._pools) == threads
         loop = simulator._loop
 
-        def count_samples(arrays, upto, first, last, loop=loop, **options):
+        def count_samples(arrays, upto, last, loop=loop, **options):
             samples.append((upto - options.get("start", 0)) * last)
-            loop(arrays, upto, first, last, **options)
+            loop(arrays, upto, last, **options)
 
         count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
         monkeypatch.setattr(simulator, "_loop", count_samples)
@@ -319,10 +319,10 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         simulator = HostSimulator(full_experiment, (convergence_reducer,), tuple(values), lanes, threads)
         loop = simulator._loop
 
-        def count_samples(arrays, upto, first, last, loop=loop, **options):
+        def count_samples(arrays, upto, last, loop=loop, **options):
             if upto > options.get("start", 0):
                 samples.append(last)
-            loop(arrays, upto, first, last, **options)
+            loop(arrays, upto, last, **options)
 
         count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
         monkeypatch.setattr(simulator, "_loop", count_samples)

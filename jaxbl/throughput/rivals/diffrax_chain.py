@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbl.drive import set_leaves
-from jaxbl.simulate import advance_sample, compute_metrics, initial_carry
+from jaxbl.simulate import TracedArrays, advance_sample, compute_metrics, initial_carry
 
 from ..jaxbl_chain import LANES
 from ..workload import CHAIN_METRICS, ChunkedProgram, Workload
@@ -29,7 +29,7 @@ class DiffraxChain(ChunkedProgram):
         units = jnp.asarray(noise)
         period = experiment.run.sample_period
 
-        def lane(values: dict[str, Any]) -> dict[str, Any]:
+        def lane(values: TracedArrays) -> TracedArrays:
             lane_experiment = set_leaves(experiment, values)
             start, tree = jax.tree.flatten(initial_carry(lane_experiment, (CHAIN_METRICS,)))
 
