@@ -323,14 +323,10 @@ def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: i
         "causality": variable.causality,
         "variability": variable.variability,
     }
-    if variable.causality != "independent":
-        attributes |= (
-            {"initial": "calculated"}
-            if variable.start is None
-            else {"initial": "exact"}
-            if variable.causality == "parameter"
-            else {}
-        )
+    if variable.causality == "parameter":
+        attributes["initial"] = "exact"
+    elif variable.causality != "independent" and variable.start is None:
+        attributes["initial"] = "calculated"
     number = {"unit": write_unit(variable.unit)} if variable.unit else {}
     number |= {
         key: _write_number(value)
@@ -374,98 +370,94 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
     rows = []
     for variable in variables:
         change_rule = change_rules.get(variable.causality, change_rules.get(variable.variability, "NEVER"))
-        low, high = (_write_limit(value, sign) for value, sign in ((variable.least, "-"), (variable.most, "")))
+        low, high = (
+            f"{sign}ANY" if value is None else _write_number(value)
+            for value, sign in ((variable.least, "-"), (variable.most, ""))
+        )
         start, is_open = _write_number(variable.start or 0.0), int(variable.above is not None)
         rows.append(f'    {{"{variable.name}", {change_rule}, {start}, {low}, {high}, {is_open}}},')
 
-    def read_values(quantities: Sequence[Quantity]) -> list[str]:
+    def write_arguments(quantities: Sequence[Quantity]) -> str:
         places = (
             reference[_to_structured_name(plant.parameters.get(quantity.name, quantity.name))] for quantity in quantities
         )
-        return [f"{single}model->values[{i}]" for i in places]
+        arguments = ["&model->state", *(f"{single}model->values[{i}]" for i in places), "&outputs"]
+        # four a line
+        return ",\n        ".join(", ".join(arguments[i : i + 4]) for i in range(0, len(arguments), 4))
+
+    start_arguments, step_arguments = map(write_arguments, (block.start_inputs, block.inputs))
 
     outputs = [
         f"    model->values[{reference[plant.outputs[variable.name]]}] = {double}outputs.{variable.name};"
         for variable in block.outputs
     ]
-    lines = [
-        "/*",
-        f" * Variables of {name} by value reference, and the calls of its code with them.",
-        " */",
-        "",
-        "#ifndef FMI_MODEL_HEADER",
-        "#define FMI_MODEL_HEADER",
-        "",
-        "#include <math.h>",
-        "",
-        f'#include "{name}.h"',
-        "",
-        f'#define MODEL_TOKEN "{token}"',
-        f"#define MODEL_PERIOD {_write_number(period)}",
-        "#define MODEL_TIME 0u",
-        f"#define MODEL_VARIABLES {len(variables)}u",
-        "",
-        "/* An end of a range that has none. */",
-        "#define ANY ((double)INFINITY)",
-        "",
-        "/* When a variable may be set. */",
-        "enum",
-        "{",
-        "    NEVER,",
-        "    FIXED,",
-        "    ALWAYS",
-        "};",
-        "",
-        "typedef struct",
-        "{",
-        f"    char name[{max(len(variable.name) for variable in variables) + 1}];",
-        "    int change;",
-        "    double start;",
-        "    double least;",
-        "    double most;",
-        "    int open; /* the least value itself is out of range */",
-        "} Variable;",
-        "",
-        "static const Variable variables[MODEL_VARIABLES] = {",
-        *rows,
-        "};",
-        "",
-        "typedef struct",
-        "{",
-        f"    {name}_state state;",
-        "    double values[MODEL_VARIABLES];",
-        "} Model;",
-        "",
-        f"static void model_found(Model *model, const {name}_outputs outputs)",
-        "{",
-        *outputs,
-        "}",
-        "",
-        "static void model_begin(Model *model)",
-        "{",
-        f"    {name}_outputs outputs;",
-        f"    {name}_init({_wrap_arguments(['&model->state', *read_values(block.start_inputs), '&outputs'])});",
-        "    model_found(model, outputs);",
-        "}",
-        "",
-        "static void model_sample(Model *model)",
-        "{",
-        f"    {name}_outputs outputs;",
-        f"    {name}_step({_wrap_arguments(['&model->state', *read_values(block.inputs), '&outputs'])});",
-        "    model_found(model, outputs);",
-        "}",
-        "",
-        "#endif /* FMI_MODEL_HEADER */",
-    ]
-    return to_ascii("\n".join(lines) + "\n")
+    longest_name = max(len(variable.name) for variable in variables)
+    row_lines, output_lines = "\n".join(rows), "\n".join(outputs)
+    return to_ascii(f"""/*
+ * Variables of {name} by value reference, and the calls of its code with them.
+ */
 
+#ifndef FMI_MODEL_HEADER
+#define FMI_MODEL_HEADER
 
-def _wrap_arguments(arguments: Sequence[str]) -> str:
-    """Write arguments of a call, four a line."""
-    rows = (", ".join(arguments[i : i + 4]) for i in range(0, len(arguments), 4))
-    return ",\n        ".join(rows)
+#include <math.h>
 
+#include "{name}.h"
 
-def _write_limit(value: float | None, sign: str) -> str:
-    """Write an end of a range; `ANY` where the range has none."""
-    return f"{sign}ANY" if value is None else _write_number(value)
+#define MODEL_TOKEN "{token}"
+#define MODEL_PERIOD {_write_number(period)}
+#define MODEL_TIME 0u
+#define MODEL_VARIABLES {len(variables)}u
+
+/* An end of a range that has none. */
+#define ANY ((double)INFINITY)
+
+/* When a variable may be set. */
+enum
+{{
+    NEVER,
+    FIXED,
+    ALWAYS
+}};
+
+typedef struct
+{{
+    char name[{longest_name + 1}];
+    int change;
+    double start;
+    double least;
+    double most;
+    int open; /* the least value itself is out of range */
+}} Variable;
+
+static const Variable variables[MODEL_VARIABLES] = {{
+{row_lines}
+}};
+
+typedef struct
+{{
+    {name}_state state;
+    double values[MODEL_VARIABLES];
+}} Model;
+
+static void model_found(Model *model, const {name}_outputs outputs)
+{{
+{output_lines}
+}}
+
+static void model_begin(Model *model)
+{{
+    {name}_outputs outputs;
+    {name}_init({start_arguments});
+    model_found(model, outputs);
+}}
+
+static void model_sample(Model *model)
+{{
+    {name}_outputs outputs;
+    {name}_step({step_arguments});
+    model_found(model, outputs);
+}}
+
+#endif /* FMI_MODEL_HEADER */
+""")

@@ -242,10 +242,6 @@ def _dtype_of(v: Any) -> np.dtype:
     return np.dtype(v.aval.dtype)
 
 
-def _shape_of(v: Any) -> tuple[int, ...]:
-    return v.aval.shape
-
-
 class _Lowering:
     """Writes statements as it goes through equations."""
 
@@ -253,7 +249,7 @@ class _Lowering:
         self.statements: list[Statement] = []
         self._variable_by_operation: dict[Any, Variable] = {}
         """The variable that holds the result of an operation, by the operation's name, type and operands."""
-        self.operation_by_variable: dict[Variable, Operation] = {}
+        self.operation_by_variable: dict[Value, Operation] = {}
         self._numbers = count()
         self._source = ""
 
@@ -283,7 +279,8 @@ class _Lowering:
 
     def lower_equation(self, eqn: JaxprEqn, operands: list[Value], outside: bool = True) -> list[Value]:
         name, all_constant = eqn.primitive.name, all(isinstance(value, Constant) for value in operands)
-        if any(_shape_of(v) for v in (*eqn.invars, *eqn.outvars)):
+        variables: list[Any] = [*eqn.invars, *eqn.outvars]
+        if any(v.aval.shape for v in variables):
             if all_constant:
                 return self._evaluate(eqn, operands)
             raise Unsupported(f"{name} of arrays: what runs in real time should be made of scalars")
@@ -329,7 +326,7 @@ class _Lowering:
             return self.lower_jaxpr(branches[int(np.clip(condition.value, 0, len(branches) - 1))], branch_operands, outside)
         if len(branches) != 2:
             raise Unsupported("cond among more than two")
-        condition, source = self.emit("ne", bool, condition, Constant(np.asarray(0, condition.dtype))), self._source
+        condition, source = self.emit("ne", bool, condition, _make_constant_like(condition, 0)), self._source
         no, yes = (self._lower_body(lambda body=body: self.lower_jaxpr(body, branch_operands, outside)) for body in branches)
         # what is the same on both ways is no choice
         differ = [not are_same(a, b) for a, b in zip(yes[1], no[1], strict=True)]
@@ -372,17 +369,16 @@ class _Lowering:
         a, b = operands[0], operands[-1]
         if name == "mul":
             for factor, other in ((a, b), (b, a)):
-                if isinstance(factor, Constant) and factor.value == 1:
+                if _is_number(factor, 1):
                     return other
-                if isinstance(factor, Constant) and factor.value == -1 and dtype.kind == "f":
+                if _is_number(factor, -1) and dtype.kind == "f":
                     return self.emit("neg", dtype, other)
         if name == "div" and dtype.kind == "f" and isinstance(b, Constant):
             mantissa, exponent = np.frexp(b.value)
             if abs(mantissa) == 0.5 and abs(exponent) < 100:
                 # the reciprocal is exact
-                inverse = self.emit("div", dtype, Constant(np.asarray(1, dtype)), b)
-                assert isinstance(inverse, Constant)
-                return self.emit("mul", dtype, a, _add_formula(inverse, "div", [Constant(np.asarray(1, dtype)), b]))
+                pair = _make_constant_like(b, 1), b
+                return self.emit("mul", dtype, a, _add_formula(self.emit("div", dtype, *pair), "div", pair))
         if name == "sub" and isinstance(b, Constant) and b.value == 0 and not np.signbit(b.value):
             return a
         if name == "select":
@@ -393,16 +389,10 @@ class _Lowering:
                 return yes
         if name == "convert" and a.dtype == dtype:
             return a
-        if (
-            name == "ne"
-            and isinstance(b, Constant)
-            and b.value == 0
-            and isinstance(a, Variable)
-            and a in self.operation_by_variable
-        ):
+        if name == "ne" and _is_number(b, 0):
             # a truth value that became a number
-            inner = self.operation_by_variable[a]
-            if inner.name == "convert" and inner.operands[0].dtype == bool:
+            inner = self.operation_by_variable.get(a)
+            if inner is not None and inner.name == "convert" and inner.operands[0].dtype == bool:
                 return inner.operands[0]
         return None
 
@@ -516,12 +506,12 @@ def _bitcast(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
     """The bits of a number as another one; of an exponent that is put together from an integer, a power of two."""
     new = _dtype_of(eqn.outvars[0])
     bias, bits = (1023, 52) if new == np.float64 else (127, 23)
-    shift = w.operation_by_variable.get(a) if isinstance(a, Variable) and new.kind == "f" else None
+    shift = w.operation_by_variable.get(a) if new.kind == "f" else None
     if shift is not None and shift.name == "shift_left" and _is_number(shift.operands[1], bits):
-        sum_ = w.operation_by_variable.get(shift.operands[0])  # type: ignore[call-overload]
+        sum_ = w.operation_by_variable.get(shift.operands[0])
         if sum_ is not None and sum_.name == "add" and _is_number(sum_.operands[1], bias):
             exponent = sum_.operands[0]
-            before = w.operation_by_variable.get(exponent) if isinstance(exponent, Variable) else None
+            before = w.operation_by_variable.get(exponent)
             if before is not None and before.name == "convert":
                 exponent = before.operands[0]
             return w.emit("power_of_two", new, w.emit("convert", np.int32, exponent))

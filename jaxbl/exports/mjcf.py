@@ -158,7 +158,7 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
     inertia_of_masses = sum(
         mass.torque / _GRAVITY * arm + round_off for mass, arm in zip(parts.pendulums, arms, strict=True)
     )
-    _add_inertia(body, parts, parts.inertia - inertia_of_masses)
+    _add_inertia(body, parts.inertia - inertia_of_masses, parts.slides)
     joint = {"name": side, "type": "slide" if parts.slides else "hinge", "axis": "1 0 0" if parts.slides else "0 1 0"}
     joint["damping"] = (
         f"{_format_number(parts.viscous)} {_format_number(parts.drag)}" if parts.drag else _format_number(parts.viscous)
@@ -183,17 +183,11 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
     for i, (mass, arm) in enumerate(zip(parts.pendulums, arms, strict=True)):
         mass_position = f"{_format_number(arm * math.sin(mass.phase))} 0 {_format_number(-arm * math.cos(mass.phase))}"
         eccentric = ET.SubElement(body, "body", name=f"{side}_mass{i}", pos=mass_position)
-        ET.SubElement(
-            eccentric,
-            "inertial",
-            pos="0 0 0",
-            mass=_format_number(mass.torque / _GRAVITY / arm),
-            diaginertia=_write_diagonal(round_off),
-        )
+        _add_inertia(eccentric, round_off, mass=mass.torque / _GRAVITY / arm)
         ET.SubElement(eccentric, "geom", appearance | {"type": "sphere", "size": "0.02"})
     for i, flexible in enumerate(parts.flexible_inertias):
         flexible_body = ET.SubElement(body, "body", name=_name_behind_spring(side, i))
-        _add_inertia(flexible_body, parts, flexible.inertia)
+        _add_inertia(flexible_body, flexible.inertia, parts.slides)
         joint_attributes = {"name": _name_behind_spring(side, i), "type": joint["type"], "axis": joint["axis"]}
         ET.SubElement(
             flexible_body,
@@ -203,19 +197,10 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
         )
 
 
-def _add_inertia(body: ET.Element, parts: SideParts, inertia: float) -> None:
+def _add_inertia(body: ET.Element, inertia: float, slides: bool = False, mass: float = 1.0) -> None:
     """Add an inertia to a body: a mass along a line, a moment about the axis."""
-    ET.SubElement(
-        body,
-        "inertial",
-        pos="0 0 0",
-        mass=_format_number(inertia) if parts.slides else "1",
-        diaginertia=_write_diagonal(inertia),
-    )
-
-
-def _write_diagonal(inertia: float) -> str:
-    return " ".join([_format_number(inertia)] * 3)
+    diagonal = " ".join([_format_number(inertia)] * 3)
+    ET.SubElement(body, "inertial", pos="0 0 0", mass=_format_number(inertia if slides else mass), diaginertia=diagonal)
 
 
 def _name_behind_spring(side: str, i: int) -> str:

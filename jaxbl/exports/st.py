@@ -9,7 +9,7 @@ from jaxbl.fused import Unsupported
 
 from .block import Program
 from .c import C_INFIX, describe_constant
-from .lowering import Constant, Operation, Value, Variable
+from .lowering import Constant, Operation, Value
 from .writer import Writer, to_ascii, write_shortest
 
 _TYPES = {"float64": "LREAL", "float32": "REAL", "int32": "DINT", "uint32": "UDINT", "int64": "LINT", "uint64": "ULINT",
@@ -38,7 +38,7 @@ class _St(Writer):
     def __init__(self, program: Program):
         super().__init__(program)
         self._temporary: list[tuple[str, np.dtype]] = []
-        self._operation_by_variable: dict[Variable, Operation] = {}
+        self._operation_by_variable: dict[Value, Operation] = {}
         """Operations by the variable that holds their result."""
         for name in ("restart", "started"):
             self.make_unique(name)
@@ -47,7 +47,7 @@ class _St(Writer):
         """Write the file."""
         program, block = self.program, self.program.block
         for quantity, variable in zip(program.state, program.state_variables, strict=True):
-            self.give_name(variable, f"{quantity.name}")
+            self.give_name(variable, quantity.name)
         self._depth = 1
         self.add_line("IF restart OR NOT started THEN")
         self._depth += 1
@@ -73,31 +73,31 @@ class _St(Writer):
         self.add_line(f"FUNCTION_BLOCK {block.name}")
         self._declare_variables(
             "VAR_INPUT",
-            [(quantity.name, quantity.dtype, "", quantity) for quantity in inputs],
+            [(quantity.name, quantity.dtype, quantity) for quantity in inputs],
             "restart: BOOL := FALSE; (* begin anew *)",
         )
-        self._declare_variables("VAR_OUTPUT", [(quantity.name, quantity.dtype, "", quantity) for quantity in block.outputs])
+        self._declare_variables("VAR_OUTPUT", [(quantity.name, quantity.dtype, quantity) for quantity in block.outputs])
         constants = [
             f"{name}: {st_type(quantity.dtype)} := {self.literal(quantity)}; (* {describe_constant(program, quantity)} *)"
             for quantity, name in self.constants.items()
         ]
         self._declare_variables("VAR CONSTANT", [], *constants)
-        states = [(self.name(variable), variable.dtype, "", None) for variable in program.state_variables]
+        states = [(self.name(variable), variable.dtype, None) for variable in program.state_variables]
         self._declare_variables("VAR", states, "started: BOOL := FALSE;")
-        self._declare_variables("VAR_TEMP", [(name, dtype, "", None) for name, dtype in self._temporary])
+        self._declare_variables("VAR_TEMP", [(name, dtype, None) for name, dtype in self._temporary])
         return "\n".join([*self.lines, *body, "END_FUNCTION_BLOCK", ""])
 
     def _declare_variables(self, kind: str, variables: Sequence[tuple], *more_lines: str) -> None:
         if not variables and not more_lines:
             return
         self.add_line(kind)
-        for name, dtype, start, quantity in variables:
+        for name, dtype, quantity in variables:
             remark = (
                 f" (* {quantity.description}{f', {quantity.unit}' if quantity.unit else ''} *)"
                 if quantity is not None
                 else ""
             )
-            self.add_line(f"    {name}: {st_type(dtype)}{start};{remark}")
+            self.add_line(f"    {name}: {st_type(dtype)};{remark}")
         for line in more_lines:
             self.add_line(f"    {line}")
         self.add_line("END_VAR")
@@ -176,9 +176,7 @@ class _St(Writer):
         elif name == "convert" and logical:
             no, yes = (self.literal(Constant(np.asarray(value, out.dtype))) for value in (0, 1))
             self.define(out, f"SEL({texts[0]}, {no}, {yes})")
-        elif name == "convert" and (
-            operands[0].dtype.kind != "f" or out.dtype.kind == "f" or _is_integer(self._operation_by_variable, operands[0])
-        ):
+        elif name == "convert" and (operands[0].dtype.kind != "f" or out.dtype.kind == "f" or self._is_integer(operands[0])):
             self.define(out, f"{st_type(operands[0].dtype)}_TO_{kind}({texts[0]})")
         elif name in ("floor", "ceil", "round_even"):
             self._write_rounding(operation, texts[0])
@@ -187,6 +185,11 @@ class _St(Writer):
         else:
             raise Unsupported(f"{name} of {operands[0].dtype} in structured text")
         self._operation_by_variable[out] = operation
+
+    def _is_integer(self, value: Value) -> bool:
+        """Return True if a value is known to be an integer, which every conversion keeps."""
+        operation = self._operation_by_variable.get(value)
+        return operation is not None and operation.name in ("floor", "ceil", "round_even")
 
     def _add_lines(self, *lines: str) -> None:
         for line in lines:
@@ -242,15 +245,6 @@ class _St(Writer):
             "    END_IF;",
             "END_WHILE;",
         )
-
-
-def _is_integer(operation_by_variable: dict[Variable, Operation], value: Value) -> bool:
-    """Return True if a value is known to be an integer, which every conversion keeps."""
-    return (
-        isinstance(value, Variable)
-        and value in operation_by_variable
-        and operation_by_variable[value].name in ("floor", "ceil", "round_even")
-    )
 
 
 _INFIX = C_INFIX | {"rem": "MOD", "eq": "=", "ne": "<>", "and": "AND", "or": "OR", "xor": "XOR"}

@@ -96,9 +96,9 @@ def _export_c(request: Request) -> Files:
     program, name = _lower_observers(request), request.name
     code = write_c_code(program, _write_head_of_code(request, program, _write_c_call(program)))
     texts = {f"{name}.c": code.source, f"{name}.h": code.header, f"{name}_filter.c": write_filter_code(program)}
-    summary = _summarise(program) | {"state_bytes": count_state_bytes(program)}
+    summary = _summarise(request, program) | {"state_bytes": count_state_bytes(program)}
     lines = [
-        f"{name}.c, {name}.h: {_describe_cost(program)}, and a state of {summary['state_bytes']} bytes.",
+        f"{name}.c, {name}.h: {_describe_cost(request, program)}, and a state of {summary['state_bytes']} bytes.",
         f"{name}_filter.c: an example that reads {','.join(input_columns(program))} as CSV:",
         f"  cc -std=c99 -O2 {name}.c {name}_filter.c -lm -o {name}_filter",
     ]
@@ -111,10 +111,9 @@ def _export_st(request: Request) -> Files:
         "How to call: an instance of the function block once a sample, the first one included. restart begins anew.",
         "Divisions by zero give zero. Where a controller computes as IEEE 754 asks, the numbers are those of --target c.",
     ]
-    lines = [f"{name}.st: function block {name}, {_describe_cost(program)}."]
-    return Files(
-        {f"{name}.st": write_st_code(program, _write_head_of_code(request, program, call_lines))}, _summarise(program), lines
-    )
+    lines = [f"{name}.st: function block {name}, {_describe_cost(request, program)}."]
+    code = write_st_code(program, _write_head_of_code(request, program, call_lines))
+    return Files({f"{name}.st": code}, _summarise(request, program), lines)
 
 
 def _export_mjcf(request: Request) -> Files:
@@ -278,12 +277,8 @@ def _lower_observers(request: Request) -> Program:
     return lower_block(build_observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision])))
 
 
-def _describe_cost(program: Program) -> str:
-    return f"{count_operations(program.step).total()} operations a step in {_name_precision(program)}"
-
-
-def _name_precision(program: Program) -> str:
-    return next(short for short, long in PRECISIONS.items() if program.block.dtype == long)
+def _describe_cost(request: Request, program: Program) -> str:
+    return f"{count_operations(program.step).total()} operations a step in {request.precision}"
 
 
 def _write_head_of_code(request: Request, program: Program, call: list[str]) -> list[str]:
@@ -327,11 +322,11 @@ def _write_c_call(program: Program) -> list[str]:
     ]
 
 
-def _summarise(program: Program) -> JsonObject:
+def _summarise(request: Request, program: Program) -> JsonObject:
     block = program.block
     counts = count_operations(program.step)
     return {
-        "precision": _name_precision(program),
+        "precision": request.precision,
         "sample_period": block.study_numbers["run.sample_period"].value,
         "first": [_describe_quantity(quantity) for quantity in block.start_inputs],
         "inputs": [_describe_quantity(quantity) for quantity in block.inputs],
