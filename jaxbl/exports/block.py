@@ -108,9 +108,10 @@ def trace_block(
     """
     with default_precision(dtype):
         numbers = {path: jax.ShapeDtypeStruct((), dtype) for path in study_numbers}
-        avals = {quantity.name: jax.ShapeDtypeStruct((), quantity.dtype) for quantity in (*start_inputs, *inputs)}
-        start_avals = {quantity.name: avals[quantity.name] for quantity in start_inputs}
-        sample_avals = {quantity.name: avals[quantity.name] for quantity in inputs}
+        start_avals, sample_avals = (
+            {quantity.name: jax.ShapeDtypeStruct((), quantity.dtype) for quantity in quantities}
+            for quantities in (start_inputs, inputs)
+        )
         state = jax.eval_shape(start, numbers, start_avals)
         output_descriptions: dict[str, tuple[str, str]] = {}
 

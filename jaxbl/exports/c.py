@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .block import Program, Quantity
-from .lowering import Constant, Operation, Routine, Value, Variable, find_constants
+from .lowering import Constant, Operation, Value, Variable, find_constants
 from .writer import Writer, find_unread_names, to_ascii, write_shortest
 
 _TYPES = {
@@ -69,28 +69,37 @@ def _write_header(program: Program, head: Sequence[str]) -> str:
     block, name = program.block, program.block.name
     guard = f"{name.upper()}_H"
     start, step = write_signatures(program)
-    lines = [*head, f"#ifndef {guard}", f"#define {guard}", "", "#include <stdbool.h>", "#include <stdint.h>", ""]
-    lines += [
-        "/* What is carried from sample to sample: for init and step alone. */",
-        *_write_struct(f"{name}_state", program.state or [Quantity("unused", "", "", np.dtype(np.int32))]),
-        "/* What step finds. */",
-        *_write_struct(f"{name}_outputs", block.outputs),
-        "/* Before the first sample. */",
-        f"{start};",
-        "",
-        "/* At every sample, at the period of the study. */",
-        f"{step};",
-        "",
-        f"#endif /* {guard} */",
-    ]
-    return "\n".join(lines) + "\n"
+    head_lines = "\n".join(head)
+    state = "\n".join(_write_struct(f"{name}_state", program.state or [Quantity("unused", "", "", np.dtype(np.int32))]))
+    outputs = "\n".join(_write_struct(f"{name}_outputs", block.outputs))
+    return f"""{head_lines}
+#ifndef {guard}
+#define {guard}
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* What is carried from sample to sample: for init and step alone. */
+{state}
+/* What step finds. */
+{outputs}
+/* Before the first sample. */
+{start};
+
+/* At every sample, at the period of the study. */
+{step};
+
+#endif /* {guard} */
+"""
 
 
 def write_signatures(program: Program) -> tuple[str, str]:
     """Write the declarations of init and step, without semicolons."""
     block, name = program.block, program.block.name
-    first = [f"{c_type(quantity.dtype)} {quantity.name}" for quantity in block.start_inputs]
-    inputs = [f"{c_type(quantity.dtype)} {quantity.name}" for quantity in block.inputs]
+    first, inputs = (
+        [f"{c_type(quantity.dtype)} {quantity.name}" for quantity in quantities]
+        for quantities in (block.start_inputs, block.inputs)
+    )
     outputs = f"{name}_outputs *outputs"
     start = ", ".join([f"{name}_state *state", *first, *([outputs] if block.start_gives_outputs else [])])
     step = ", ".join([f"{name}_state *state", *inputs, outputs])
@@ -120,20 +129,20 @@ class _C(Writer):
         """Write init and step."""
         program, block = self.program, self.program.block
         start, step = write_signatures(program)
-        self._write_function(start, 0, program.start, block.start_inputs, ())
+        self._write_function(start, 0, block.start_inputs, ())
         self.add_line()
-        self._write_function(step, 1, program.step, block.inputs, program.state_variables)
+        self._write_function(step, 1, block.inputs, program.state_variables)
 
     def _write_function(
         self,
         head: str,
         routine_index: int,
-        routine: Routine,
         arguments: Sequence[Quantity],
         state_variables: Sequence[Variable],
     ) -> None:
         """One of the two; `state_variables` are variables for the state that it finds."""
         program, block = self.program, self.program.block
+        routine = (program.start, program.step)[routine_index]
         self.add_line(head)
         self.add_line("{")
         self._depth += 1

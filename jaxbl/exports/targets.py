@@ -308,7 +308,7 @@ def _write_c_call(program: Program) -> list[str]:
     first, inputs = (
         ", ".join(quantity.name for quantity in quantities) for quantities in (block.start_inputs, block.inputs)
     )
-    period = program.block.study_numbers["run.sample_period"].value
+    period = block.study_numbers["run.sample_period"].value
     return [
         "How to call:",
         f"    static {name}_state state;",
@@ -328,9 +328,9 @@ def _summarise(request: Request, program: Program) -> JsonObject:
     return {
         "precision": request.precision,
         "sample_period": block.study_numbers["run.sample_period"].value,
-        "first": [_describe_quantity(quantity) for quantity in block.start_inputs],
-        "inputs": [_describe_quantity(quantity) for quantity in block.inputs],
-        "outputs": [_describe_quantity(quantity) for quantity in block.outputs],
+        "first": [*map(_describe_quantity, block.start_inputs)],
+        "inputs": [*map(_describe_quantity, block.inputs)],
+        "outputs": [*map(_describe_quantity, block.outputs)],
         "state": [{"name": quantity.name, "type": str(quantity.dtype)} for quantity in program.state],
         "operations_per_step": dict(sorted(counts.items())),
         "operations": counts.total(),

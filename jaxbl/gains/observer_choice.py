@@ -256,7 +256,7 @@ class _KindSearch:
         config = group.points[0].scenarios.config
         data = stage_tables(config, name, self.table, seeds if held_out else None)
         data["observer"] = _observer_table(kind, data["observer"], columns)
-        data["axes"] = list_axes({"trial": dict(zip(columns, zip(*unique, strict=True), strict=True))})
+        data["axes"] = list_axes({"trial": dict(zip(columns, map(list, zip(*unique, strict=True)), strict=True))})
         error_columns = [f"{side}.{self.table.objective}_rmse" for side in sides]
         time_columns = [f"{side}.convergence_time" for side in sides] if self.table.longest_convergence is not None else []
         frame = self.stages.run(data, name).read([*columns, "seed", *error_columns, *time_columns])

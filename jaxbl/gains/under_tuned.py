@@ -307,12 +307,13 @@ def sine_cycle_simulated(
 
     Returns None if the approximation has no cycle, or if the method does not converge.
     """
-    predicted = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
+    drive = lambda_, alpha, amplitude, frequency, damping
+    predicted = sine_cycle(*drive)
     if predicted is None:
         return None
-    phase = float(np.arcsin(_balance_phase_sine(lambda_, alpha, amplitude, frequency, damping)))
+    phase = float(np.arcsin(_balance_phase_sine(*drive)))
     starts = (predicted.stable, np.pi - phase), (predicted.threshold, phase)
-    stable, threshold = (_find_cycle(lambda_, alpha, amplitude, frequency, damping, start) for start in starts)
+    stable, threshold = (_find_cycle(*drive, start) for start in starts)
     return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
 
 
@@ -329,10 +330,11 @@ def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: flo
     high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
     if not 0.0 < high < np.inf:
         return None
-    predicted = sine_cycle(lambda_, alpha, amplitude, high, damping)
+    drive = lambda_, alpha, amplitude, high, damping
+    predicted = sine_cycle(*drive)
     assert predicted is not None
-    phase = np.pi - float(np.arcsin(_balance_phase_sine(lambda_, alpha, amplitude, high, damping)))
-    last_cycle = _find_cycle(lambda_, alpha, amplitude, high, damping, (predicted.stable, phase))
+    phase = np.pi - float(np.arcsin(_balance_phase_sine(*drive)))
+    last_cycle = _find_cycle(*drive, (predicted.stable, phase))
     if last_cycle is None:
         return None
     low = 0.25 * high

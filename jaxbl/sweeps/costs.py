@@ -192,19 +192,21 @@ _counted_operations: dict[str | None, Operations] = {}
 
 _TRACED_LANES = 1009
 """Lanes of the traced program: a prime, so that arrays with an axis of lanes are told from others by their shape."""
-_FREE_PRIMITIVES = (
-    "broadcast_in_dim",
-    "reshape",
-    "squeeze",
-    "convert_element_type",
-    "slice",
-    "copy",
-    "copy_p",
-    "transpose",
-    "iota",
-)
 _WEIGHTS = {
-    **dict.fromkeys(_FREE_PRIMITIVES, 0.0),
+    **dict.fromkeys(
+        (
+            "broadcast_in_dim",
+            "reshape",
+            "squeeze",
+            "convert_element_type",
+            "slice",
+            "copy",
+            "copy_p",
+            "transpose",
+            "iota",
+        ),
+        0.0,
+    ),
     **dict.fromkeys(("div", "sqrt", "rsqrt", "rem"), 5.0),
     **dict.fromkeys(("exp", "expm1", "exp2", "log", "log1p", "logistic", "tanh", "sin", "cos", "tan", "atan2", "pow"), 20.0),
     **dict.fromkeys(("erf_inv", "random_bits", "threefry2x32"), 40.0),

@@ -153,6 +153,7 @@ class Engine:
         self.fallback_reasons: list[str] = []
         self._programs: OrderedDict[int, Program] = OrderedDict()
         self._gain_metric_dtypes: set[str] = set()
+        self._needs_gain_metrics = needs_gain_metrics(config.sweep.requested_metrics)
 
     def _choose_backend(self) -> Backend:
         """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
@@ -318,11 +319,11 @@ class Engine:
 
     def _complete_metrics(self, metrics: NamedArrays, gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
         """Metrics of a chunk, with gain metrics if any are requested."""
-        return add_gain_metrics(metrics, gains) if needs_gain_metrics(self.config.sweep.requested_metrics) else metrics
+        return add_gain_metrics(metrics, gains) if self._needs_gain_metrics else metrics
 
     def _compile_gain_metrics(self, dtype: str) -> None:
         """Compile the gain metrics for a precision, unless that is done or none are requested."""
-        if dtype not in self._gain_metric_dtypes and needs_gain_metrics(self.config.sweep.requested_metrics):
+        if dtype not in self._gain_metric_dtypes and self._needs_gain_metrics:
             self._gain_metric_dtypes.add(dtype)
             start = time.perf_counter()
             compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)

@@ -15,13 +15,15 @@ from jaxbl.sweeps.programs import Layout, Program, compile_program
 
 from .workload import DRIVE, Metrics
 
-_LAW = {"law": "sigmoid_backlash", "stiffness": 1.0, "dead_zone": 0.02, "slope": 20.0}
+_PLANT = {
+    "drive": {"kind": "two_inertia", **DRIVE},
+    "transmission": {"law": "sigmoid_backlash", "stiffness": 1.0, "dead_zone": 0.02, "slope": 20.0},
+    "encoders": {"noise": 1e-4},
+}
 STUDIES: dict[str, JsonObject] = {
     "gain_map": {
-        "drive": {"kind": "two_inertia", **DRIVE},
-        "transmission": _LAW,
+        **_PLANT,
         "excitation": {"kind": "sine", "amplitude": 0.1, "frequency": 0.16},
-        "encoders": {"noise": 1e-4},
         "observer": {
             "discretisation": "implicit",
             "motor": {"lambda": 4.0, "alpha": 9.0, "velocity_error": 0.5},
@@ -44,10 +46,8 @@ STUDIES: dict[str, JsonObject] = {
         ],
     },
     "dead_zone_noise": {
-        "drive": {"kind": "two_inertia", **DRIVE},
-        "transmission": _LAW,
+        **_PLANT,
         "excitation": {"kind": "multisine", "amplitude": 0.12, "frequency": 0.05, "count": 6},
-        "encoders": {"noise": 1e-4},
         "observer": {"motor": {"lambda": 4.0, "alpha": 9.0}, "load": {"lambda": 0.5, "alpha": 0.4}},
         "equivalent_control": {"time_constant": 0.02},
         "identifier": {"start": 5.0, "regressor_filter": "matched"},
