@@ -19,7 +19,7 @@ _INFINITY = 1e12
 
 
 class Answer(NamedTuple):
-    """How well a MuJoCo model has a part of a study.
+    """An answer to how well a MuJoCo model has a part of a study.
 
     Attributes:
         fidelity: key in `export.json`.
