@@ -286,18 +286,18 @@ class EffectSearch:
 
     def _point(self, values: dict[str, Numbers], theta: np.ndarray, predictor: Predictor) -> _Point:
         """Cost at some numbers, and where the linear step leads; infinite where they cannot be simulated."""
+        found = None
         if any(EFFECTS[name].find_fault(numbers, self.period) for name, numbers in values.items()):
             linear = self.linear({}, theta)
-            return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf, 0.0)
-        linear = self.linear(values, theta)
-        columns = linear.columns((), predictor.smoothness, predictor.deviation)
-        scale, sizes = columns.scale.copy(), {name: linear.size(name) for name in values}
-        for i, one in enumerate(linear.free[len(self.free) :], 1 + len(self.free)):
-            if one.role == "size":
-                scale[i] = sizes[_owner(one)[0]]
-        found = None
-        if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
-            found = evidence_of(dataclasses.replace(columns, scale=scale))
+        else:
+            linear = self.linear(values, theta)
+            columns = linear.columns((), predictor.smoothness, predictor.deviation)
+            scale, sizes = columns.scale.copy(), {name: linear.size(name) for name in values}
+            for i, one in enumerate(linear.free[len(self.free) :], 1 + len(self.free)):
+                if one.role == "size":
+                    scale[i] = sizes[_owner(one)[0]]
+            if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
+                found = evidence_of(dataclasses.replace(columns, scale=scale))
         if found is None:
             return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf, 0.0)
         cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))

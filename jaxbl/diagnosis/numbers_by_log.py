@@ -18,6 +18,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
 from jaxbl.records.least_squares import BLOCKS, rms
 
+from .blocks import multiply_by_blocks, solve_products
 from .diagnosis_task import DiagnosisTask
 from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
@@ -131,25 +132,20 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         beside = np.zeros((len(friction) * len(now), len(missing)))
         beside[i * len(friction) : (i + 1) * len(friction)] = friction[:, moving]
         columns = np.concatenate([slopes, beside, -missing[None]]) / max(rms(every_row), 1e-300)
-        products.append([block @ block.T for block in np.array_split(columns, BLOCKS, axis=1)])
+        products.append(multiply_by_blocks(columns, BLOCKS))
     blocks = np.sum(products, axis=0)
     total = np.sum(blocks, axis=0)
-    size = np.sqrt(np.diag(total)[:-1])
-    there = size > 0.0
-    size = np.where(there, size, np.inf)
-
-    def solved(gram: np.ndarray) -> np.ndarray:
-        return np.linalg.lstsq(gram[:-1, :-1] / np.outer(size, size), gram[:-1, -1] / size, rcond=1e-10)[0] / size
-
     own = slice(len(moved))
-    change, without = solved(total)[own], np.array([solved(total - one)[own] for one in blocks])
+    change, without = solve_products(total)[own], np.array([solve_products(total - one)[own] for one in blocks])
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
-    inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
+    size = np.sqrt(np.diag(total)[:-1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.linalg.pinv(np.nan_to_num(total[:-1, :-1] / np.outer(size, size)), rcond=1e-10, hermitian=True)
     inflation = np.diag(inverse)[own]
-    alone = there[own] & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
+    alone = (size[own] > 0.0) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 
 

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.identification.segments import Segment
 
-from .blocks import SEEN, standard_errors_better
+from .blocks import SEEN, multiply_by_blocks, solve_products, standard_errors_better
 from .candidates import Candidate, Forces, Numbers, are_possible, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .fitted_model import FittedModel
@@ -181,15 +181,15 @@ class _Regression:
             at += one.width + one.offset
         self.base = np.concatenate([np.arange(0), *(self.places[one][0] for one in base)]).astype(int)
         self.grams = [
-            _products(
+            multiply_by_blocks(
                 np.concatenate(
                     [
-                        _behind(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
+                        _with_target(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
                         for force, segment, residual in zip(forces, log.segments, lacking[side], strict=True)
                     ],
                     axis=1,
                 ),
-                np.concatenate([narrowed(one, log.bandwidth[side])[0].torque for one in lacking[side]]),
+                _BLOCKS,
             )
             for i, side in enumerate(self.sides)
         ]
@@ -225,10 +225,10 @@ class _Regression:
         whole = np.sum(total, axis=0)
         squares: list[list[float]] = [[] for _ in self.sides]
         for b in range(_BLOCKS):
-            fit = np.append(-_solved(whole - total[b]), 1.0)
+            fit = np.append(-solve_products(whole - total[b]), 1.0)
             for side, one in zip(squares, products, strict=True):
                 side.append(float(fit @ one[b] @ fit))
-        return [np.array(one) for one in squares], _solved(whole)
+        return [np.array(one) for one in squares], solve_products(whole)
 
 
 def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
@@ -236,15 +236,10 @@ def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
     return forces.on(i, samples) + (forces.on(-1, samples) if i == 0 else 0.0)
 
 
-def _behind(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
-    """Torques as the missing torque of a side is seen; shape (columns, rows)."""
-    return low_passed(as_smoothed(columns, segment.smoothed[side], segment.period), residual, cutoff)
-
-
-def _products(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Products of columns and target with one another, block by block; shape (blocks, columns + 1, columns + 1)."""
-    every = np.concatenate([columns, target[None]])
-    return np.stack([one @ one.T for one in np.array_split(every, _BLOCKS, axis=1)])
+def _with_target(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
+    """Torques as the missing torque of a side is seen, and that torque; shape (columns + 1, rows)."""
+    seen = low_passed(as_smoothed(columns, segment.smoothed[side], segment.period), residual, cutoff)
+    return np.concatenate([seen, narrowed(residual, cutoff)[0].torque[None]])
 
 
 def _less_column(products: np.ndarray) -> np.ndarray:
@@ -254,11 +249,3 @@ def _less_column(products: np.ndarray) -> np.ndarray:
     less[:, :, -1] -= less[:, :, -2]
     kept = [*range(less.shape[1] - 2), -1]
     return less[:, kept][:, :, kept]
-
-
-def _solved(products: np.ndarray) -> np.ndarray:
-    """Coefficients of all columns but the last, the target."""
-    inner, right = products[:-1, :-1], products[:-1, -1]
-    size = np.sqrt(np.diag(inner))
-    size[size <= 0.0] = np.inf
-    return np.linalg.lstsq(inner / np.outer(size, size), right / size, rcond=1e-10)[0] / size
