@@ -60,8 +60,9 @@ def _first_advice(
     from jaxbl.report.diagnose import diagnosis_lines
 
     task = read_diagnosis_task(list(logs), model, holdout=holdout)
-    log_call = LogCall(list(logs), Path("model.toml"), holdout, None)
-    steps = after_diagnosis(task, dict(diagnosis), ["diagnose", *map(str, log_call.words())], Path("diagnosed"), log_call)
+    log_call = LogCall(list(logs), Path("model.toml"), holdout, None, Path("diagnosed"), [])
+    log_call = log_call._replace(again=["diagnose", *map(str, log_call.words())])
+    steps = after_diagnosis(task, dict(diagnosis), log_call)
     lines = [line for line in diagnosis_lines(dict(diagnosis)) if line not in diagnosis["warnings"]]
     return {"first_line": lines[0], "next_step": steps[0].command}
 

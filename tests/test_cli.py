@@ -1036,7 +1036,7 @@ def test_after_logs_what_is_open_by_what_was_found():
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
         return list_commands(
             after_identification(
-                task or make_task(1000), summary, command, folder, LogCall(logs, model, holdout, planned_file)
+                task or make_task(1000), summary, LogCall(logs, model, holdout, planned_file, folder, command)
             )
         )
 
@@ -1059,7 +1059,7 @@ def test_after_logs_what_is_open_by_what_was_found():
 
     def diagnose_steps(planned_file=None, **more):
         return list_commands(
-            after_diagnosis(make_task(1000), DIAGNOSIS | more, command, folder, LogCall(logs, model, None, planned_file))
+            after_diagnosis(make_task(1000), DIAGNOSIS | more, LogCall(logs, model, None, planned_file, folder, command))
         )
 
     assert diagnose_steps() == [simulate]

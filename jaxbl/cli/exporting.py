@@ -7,7 +7,7 @@ import typer
 from jaxbl import workers
 from jaxbl.terminal import show_task
 
-from .options import ConfigArgument, folder_of
+from .options import ConfigArgument, folder_of, option
 from .outcome import Outcome
 
 _TARGETS = (
@@ -19,27 +19,15 @@ _TARGETS = (
 def export(
     context: typer.Context,
     config: ConfigArgument,
-    target: Annotated[str, typer.Option(metavar="TARGET", help=_TARGETS)] = "c",
-    out: Annotated[
-        str | None, typer.Option(metavar="DIR", help="folder for the files [default: results/<config name>_<target>]")
-    ] = None,
-    precision: Annotated[
-        str | None,
-        typer.Option(metavar="TYPE", help="of code: double or float [default: as the study computes]", show_default=False),
-    ] = None,
-    name: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="of the code's functions and files [default: the config's]", show_default=False),
-    ] = None,
+    target: Annotated[str, option("TARGET", _TARGETS)] = "c",
+    out: Annotated[str | None, option("DIR", "folder for the files [default: results/<config name>_<target>]")] = None,
+    precision: Annotated[str | None, option("TYPE", "of code: double or float [default: as the study computes]")] = None,
+    name: Annotated[str | None, option("NAME", "of the code's functions and files [default: the config's]")] = None,
     linear: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="SIDE", help="of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"
-        ),
+        option("SIDE", "of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"),
     ] = None,
-    fmi: Annotated[
-        int | None, typer.Option(metavar="2|3", help="version of an FMU [default: 3]", show_default=False)
-    ] = None,
+    fmi: Annotated[int | None, option("2|3", "version of an FMU [default: 3]")] = None,
 ) -> Outcome:
     """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator."""
     workers.start_jax()

@@ -1,6 +1,7 @@
 """Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,6 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep
 from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
@@ -22,9 +22,12 @@ from .options import (
     MaxTorqueOption,
     MaxTravelOption,
     SchedulerOption,
+    argument,
     check_doubts,
     check_new,
+    flag,
     folder_of,
+    option,
 )
 from .outcome import Outcome
 
@@ -38,13 +41,8 @@ ALARM = 3
 
 def inspect(
     log: LogArgument,
-    model: Annotated[
-        Path | None, typer.Option(metavar="TOML", help="study, or a file with [log] alone: how to read the log")
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option(metavar="NEW.toml", help="propose [log] and a nominal model for identify and diagnose"),
-    ] = None,
+    model: Annotated[Path | None, option("TOML", "study, or a file with [log] alone: how to read the log")] = None,
+    write: Annotated[Path | None, option("NEW.toml", "propose [log] and a nominal model for identify and diagnose")] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
@@ -88,17 +86,12 @@ def inspect(
 
 def identify(
     context: typer.Context,
-    log: Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{FORMATS}s of one machine", show_default=False)],
-    model: Annotated[
-        Path, typer.Option(metavar="TOML", help="study with nominal parameters, and [log]", show_default=False)
-    ],
-    holdout: Annotated[Path | None, typer.Option(metavar="LOG2", help="log of the same machine to test the fit on")] = None,
-    profile: Annotated[
-        bool | None, typer.Option("--profile", help="add profile-likelihood intervals", show_default=False)
-    ] = None,
+    log: Annotated[list[Path], argument("LOG...", f"{FORMATS}s of one machine")],
+    model: Annotated[Path, option("TOML", "study with nominal parameters, and [log]")],
+    holdout: Annotated[Path | None, option("LOG2", "log of the same machine to test the fit on")] = None,
+    profile: Annotated[bool | None, flag("--profile", "add profile-likelihood intervals")] = None,
     next_experiment: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.csv", help="write an input that shows a gap which the motor's encoder alone does not"),
+        Path | None, option("FILE.csv", "write an input that shows a gap which the motor's encoder alone does not")
     ] = None,
     max_torque: MaxTorqueOption = None,
     max_travel: MaxTravelOption = None,
@@ -133,17 +126,14 @@ def identify(
 
         check_gap_sought(task)
     folder = folder_of(log[0], "identified", out)
-    log_call = LogCall(log, model, holdout, next_experiment)
-
-    def steps(summary: JsonObject) -> list[NextStep]:
-        return after_identification(task, summary, repeat_call(context, folder), folder, log_call)
-
+    log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
+    propose = partial(after_identification, task, log_call=log_call)
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "identification.json",
-            lambda task: run_identification(task, progress),
-            lambda result, folder: write_identification_report(result, folder, steps(result.summary)),
+            partial(run_identification, progress=progress),
+            lambda result, folder: write_identification_report(result, folder, propose(result.summary)),
             overwrite=overwrite,
         )
     lines = identification_lines(summary)
@@ -151,7 +141,7 @@ def identify(
         from jaxbl.diagnosis.next_experiment import write_gap_experiment
 
         lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary, steps=steps(summary))
+    return Outcome(lines, folder, summary=summary, steps=propose(summary))
 
 
 def _identify_element(
@@ -169,24 +159,18 @@ def _identify_element(
 
 def diagnose(
     context: typer.Context,
-    log: Annotated[
-        list[Path] | None, typer.Argument(metavar="[LOG...]", help=f"{FORMATS}s of one machine", show_default=False)
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]")
-    ] = None,
+    log: Annotated[list[Path] | None, argument("[LOG...]", f"{FORMATS}s of one machine")] = None,
+    model: Annotated[Path | None, option("TOML", "study with nominal parameters, [uncertainty] and [log]")] = None,
     holdout: Annotated[
-        Path | None,
-        typer.Option(metavar="LOG2", help="log of the same machine for the test [default: the last quarter of the log]"),
+        Path | None, option("LOG2", "log of the same machine for the test [default: the last quarter of the log]")
     ] = None,
     batch: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"),
+        Path | None, option("FOLDER", "diagnose every log of a folder; NAME.toml beside NAME.csv is its model")
     ] = None,
-    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="processes for --batch [default: one a core]")] = None,
+    jobs: Annotated[int | None, option("N", "processes for --batch [default: one a core]", min=1)] = None,
     scheduler: SchedulerOption = None,
     next_experiment: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="write an input that separates the effects this log cannot")
+        Path | None, option("FILE.csv", "write an input that separates the effects this log cannot")
     ] = None,
     max_torque: MaxTorqueOption = None,
     max_travel: MaxTravelOption = None,
@@ -217,17 +201,14 @@ def diagnose(
     task = read_diagnosis_task(log, model, holdout=holdout)
     check_doubts(filter(None, (task.record, task.holdout)), force)
     folder = folder_of(log[0], "diagnosed", out)
-    log_call = LogCall(log, model, holdout, next_experiment)
-
-    def steps(summary: JsonObject) -> list[NextStep]:
-        return after_diagnosis(task, summary, repeat_call(context, folder), folder, log_call)
-
+    log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
+    propose = partial(after_diagnosis, task, log_call=log_call)
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "diagnosis.json",
-            lambda task: run_diagnosis(task, progress),
-            lambda result, folder: write_diagnosis_report(result, folder, steps(result.summary)),
+            partial(run_diagnosis, progress=progress),
+            lambda result, folder: write_diagnosis_report(result, folder, propose(result.summary)),
             overwrite=overwrite,
         )
     lines = diagnosis_lines(summary)
@@ -236,7 +217,7 @@ def diagnose(
 
         write = write_gap_experiment if "backlash" in summary else write_next_experiment
         lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary, steps=steps(summary))
+    return Outcome(lines, folder, summary=summary, steps=propose(summary))
 
 
 def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:
@@ -269,27 +250,19 @@ def _diagnose_batch(
 
 def watch(
     context: typer.Context,
-    source: Annotated[
-        str, typer.Argument(metavar="LOG|udp://HOST:PORT", help=f"{FORMATS}, or where to listen", show_default=False)
-    ],
-    model: Annotated[
-        Path, typer.Option(metavar="TOML", help="study with the drive's numbers, observers and [log]", show_default=False)
-    ],
+    source: Annotated[str, argument("LOG|udp://HOST:PORT", f"{FORMATS}, or where to listen")],
+    model: Annotated[Path, option("TOML", "study with the drive's numbers, observers and [log]")],
     alarm_gap: Annotated[
-        float | None,
-        typer.Option(metavar="RAD", help="half gap beyond which there is an alarm: rad at the motor (m on a linear axis)"),
+        float | None, option("RAD", "half gap beyond which there is an alarm: rad at the motor (m on a linear axis)")
     ] = None,
-    window: Annotated[float, typer.Option(metavar="S", help="seconds that each value is from")] = 10.0,
-    interval: Annotated[float, typer.Option("--every", metavar="S", help="seconds between values")] = 1.0,
-    follow: Annotated[
-        bool, typer.Option("--follow", help="wait for more rows at the end of a text file, until Ctrl+C")
-    ] = False,
+    window: Annotated[float, option("S", "seconds that each value is from")] = 10.0,
+    interval: Annotated[float, option("S", "seconds between values", "--every")] = 1.0,
+    follow: Annotated[bool, flag("--follow", "wait for more rows at the end of a text file, until Ctrl+C")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>_watched; of a socket: none]"),
+        Path | None, option("DIR", "folder for the results [default: results/<log name>_watched; of a socket: none]")
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="write into a folder that holds other results of a log or stream")
+        bool, flag("--overwrite", "write into a folder that holds other results of a log or stream")
     ] = False,
 ) -> Outcome:
     """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm."""

@@ -65,22 +65,18 @@ def after_proposal(log: Path, model: Path) -> list[NextStep]:
     return [NextStep(command_line("identify", log, "--model", model), answers)]
 
 
-def after_identification(
-    task: "LogTask", summary: JsonObject, again: Sequence[str], folder: Path, log_call: "LogCall"
-) -> list[NextStep]:
+def after_identification(task: "LogTask", summary: JsonObject, log_call: "LogCall") -> list[NextStep]:
     """Propose commands after an identification.
 
     Args:
         task: the log and its model.
         summary: its `identification.json`.
-        again: the words of this call, with the folder of its results.
-        folder: of the results.
-        log_call: logs, model and hold-out log of the call.
+        log_call: the call.
     """
     from jaxbl.diagnosis.diagnosis_task import can_hold_out
     from jaxbl.identification.search import is_noise
 
-    steps = []
+    steps, folder = [], log_call.folder
     if not all(map(is_noise, summary["residual"].values())):
         if log_call.holdout is not None or can_hold_out(task.record):
             words = ("diagnose", *log_call.words(), "--out", f"{folder}_diagnosed")
@@ -90,25 +86,22 @@ def after_identification(
         steps.append(
             NextStep(command_line(*words), "How does the drive move with these numbers, and what do observers see?")
         )
-    return [*steps, *_propose_gap_experiment(summary, again, folder, log_call), _explore_log(folder)]
+    return [*steps, *_propose_gap_experiment(summary, log_call), _explore_log(folder)]
 
 
-def after_diagnosis(
-    task: "LogTask", summary: JsonObject, again: Sequence[str], folder: Path, log_call: "LogCall"
-) -> list[NextStep]:
+def after_diagnosis(task: "LogTask", summary: JsonObject, log_call: "LogCall") -> list[NextStep]:
     """Propose commands after a diagnosis. Arguments as for :func:`after_identification`."""
     from jaxbl.diagnosis.diagnosis_summary import tied
 
-    steps, model = _propose_gap_experiment(summary, again, folder, log_call), folder / "model.toml"
+    steps, folder = _propose_gap_experiment(summary, log_call), log_call.folder
     pair = None if "backlash" in summary or log_call.next_experiment else tied(summary)
     if pair is not None:
-        words = (*again, "--next-experiment", f"{folder}_next.csv")
-        steps.append(NextStep(command_line(*words), f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
+        steps.append(log_call.propose_experiment(f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
     if summary["verdict"] == "no_discrepancy":
         words = ("identify", *log_call.words(), "--out", f"{folder}_identified")
         steps.append(NextStep(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
     if summary["findings"] and _has_input(task):
-        words = ("simulate", model, "--out", f"{folder}_run")
+        words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
         steps.append(NextStep(command_line(*words), "How does the drive move with what was found? The extended study, run."))
     return [*steps, _explore_log(folder)]
 
@@ -127,29 +120,34 @@ def after_watch(task: "WatchTask", summary: JsonObject, model: Path) -> list[Nex
 
 
 class LogCall(NamedTuple):
-    """Logs, model, hold-out log, and file for the next experiment of a call."""
+    """Logs, model, hold-out log, file for the next experiment, folder of the results, and all words of a call."""
 
     logs: Sequence[Path]
     model: Path
     holdout: Path | None
     next_experiment: Path | None
+    folder: Path
+    again: Sequence[str]
 
     def words(self) -> list[object]:
         """Logs and model on a command line."""
         return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
+
+    def propose_experiment(self, question: str) -> NextStep:
+        """Propose the same call with an experiment that answers a question."""
+        return NextStep(command_line(*self.again, "--next-experiment", f"{self.folder}_next.csv"), question)
 
 
 def _explore_log(folder: Path) -> NextStep:
     return NextStep(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
 
 
-def _propose_gap_experiment(summary: JsonObject, again: Sequence[str], folder: Path, log_call: LogCall) -> list[NextStep]:
+def _propose_gap_experiment(summary: JsonObject, log_call: LogCall) -> list[NextStep]:
     """The move that would show a gap to the motor's encoder alone, where the log does not."""
     backlash = summary.get("backlash")
     if backlash is None or backlash["shown"] or log_call.next_experiment is not None:
         return []
-    words = (*again, "--next-experiment", f"{folder}_next.csv")
-    return [NextStep(command_line(*words), "Is there a gap? A move that shows it to the motor's encoder.")]
+    return [log_call.propose_experiment("Is there a gap? A move that shows it to the motor's encoder.")]
 
 
 def _has_input(task: "LogTask") -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,43 +14,45 @@ if TYPE_CHECKING:
     from jaxbl.identification.logs import SealedRecord
     from jaxbl.records import Record
 
-ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
+
+def argument(metavar: str, text: str, *, show_default: bool | str = False, **rules: Any) -> Any:
+    """Declare an argument by its name in the usage line and its help; `rules` are typer's."""
+    return typer.Argument(metavar=metavar, help=text, show_default=show_default, **rules)
+
+
+def option(metavar: str, text: str, *names: str, **rules: Any) -> Any:
+    """Declare an option with a value: the value's name, and the help; `names` where it is not called as the parameter is."""
+    return typer.Option(*names, metavar=metavar, help=text, **rules)
+
+
+def flag(name: str, text: str) -> Any:
+    """Declare an option without a value by its name and its help."""
+    return typer.Option(name, help=text)
+
+
+ConfigArgument = Annotated[Path, argument("CONFIG", "TOML study")]
 OutOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>_<what it holds>]"
-    ),
+    option("DIR", "folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>_<what it holds>]"),
 ]
-FolderArgument = Annotated[str, typer.Argument(metavar="DIR", help="folder of a sweep, verify or tune", show_default=False)]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
+FolderArgument = Annotated[str, argument("DIR", "folder of a sweep, verify or tune")]
+OverwriteOption = Annotated[bool, flag("--overwrite", "remove the results of another study from the folder")]
 BackendOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"),
+    str | None, option("NAME", "fused: one compiled loop; scan: XLA's own loop [default: the faster here]")
 ]
 SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS", help="Dask cluster that computes: tcp://HOST:PORT, its scheduler's .json file, or local:N"
-    ),
+    str | None, option("ADDRESS", "Dask cluster that computes: tcp://HOST:PORT, its scheduler's .json file, or local:N")
 ]
 FORMATS = "CSV, Parquet, MATLAB or JSON file"
-ResultsArgument = Annotated[
-    str, typer.Argument(metavar="DIR", help="folder of a sweep, identify or diagnose", show_default=False)
-]
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=FORMATS, show_default=False)]
-LogOutOption = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>_<what it holds>]")
-]
-MaxTorqueOption = Annotated[
-    float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
-]
+ResultsArgument = Annotated[str, argument("DIR", "folder of a sweep, identify or diagnose")]
+LogArgument = Annotated[Path, argument("LOG", FORMATS)]
+LogOutOption = Annotated[Path | None, option("DIR", "folder for the results [default: results/<log name>_<what it holds>]")]
+MaxTorqueOption = Annotated[float | None, option("N·m", "limit of the next experiment's input [default: the log's]")]
 MaxTravelOption = Annotated[
-    float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
+    float | None, option("RAD", "limit of its motor travel (m on a linear axis) [default: the log's]")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="search although a unit or a sign of the log is doubtful")]
-LogOverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
-]
+ForceOption = Annotated[bool, flag("--force", "search although a unit or a sign of the log is doubtful")]
+LogOverwriteOption = Annotated[bool, flag("--overwrite", "write into a folder that holds results of another log")]
 
 
 def folder_of(source: Path, result: str, out: str | Path | None) -> Path:

@@ -15,8 +15,10 @@ from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep, format_steps
 from jaxbl.terminal import INTERRUPTED
 
-QuietOption = Annotated[bool, typer.Option("--quiet", help="print neither progress nor what was found, errors alone")]
-JsonOption = Annotated[bool, typer.Option("--json", help="print what was found as one JSON object")]
+from .options import flag
+
+QuietOption = Annotated[bool, flag("--quiet", "print neither progress nor what was found, errors alone")]
+JsonOption = Annotated[bool, flag("--json", "print what was found as one JSON object")]
 
 
 class Outcome(NamedTuple):

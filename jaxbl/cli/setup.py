@@ -25,12 +25,12 @@ from jaxbl.lines import format_descriptions
 from jaxbl.terminal import can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
-from .options import BackendOption, OutOption, check_new
+from .options import BackendOption, OutOption, argument, check_new, flag, option
 from .outcome import Outcome, with_options
 from .studies import compute, read_study
 
 T = TypeVar("T")
-NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
+NewArgument = Annotated[Path, argument("[NEW.toml]", "file to be written", show_default="drive.toml")]
 
 _KINDS_HELP = "; ".join(f"{name}: {kind.description}" for name, kind in KINDS.items()) + " [default: asked for, or geared]"
 
@@ -38,8 +38,8 @@ _KINDS_HELP = "; ".join(f"{name}: {kind.description}" for name, kind in KINDS.it
 def init(
     context: typer.Context,
     file: NewArgument = Path("drive.toml"),
-    kind: Annotated[str | None, typer.Option(metavar="KIND", help=_KINDS_HELP, show_default=False)] = None,
-    title: Annotated[str, typer.Option(metavar="TEXT", help="headline of its report")] = "",
+    kind: Annotated[str | None, option("KIND", _KINDS_HELP)] = None,
+    title: Annotated[str, option("TEXT", "headline of its report")] = "",
     **options: str | None,
 ) -> Outcome:
     """Write a first study from a drive's data sheet: what no option says is asked for.
@@ -136,14 +136,14 @@ def _make_option(items: list[tuple[str, Item]]) -> object:
         kinds_by_text.setdefault(f"{item.question}, such as '{item.example}'{other}{default}", []).append(kind)
     is_common = len(kinds_by_text) == 1 and len(items) == len(KINDS)
     help_text = ". ".join(text if is_common else f"{', '.join(kinds)}: {text}" for text, kinds in kinds_by_text.items())
-    return Annotated[str | None, typer.Option(items[0][1].option, metavar="VALUE", help=help_text, show_default=False)]
+    return Annotated[str | None, option("VALUE", help_text, items[0][1].option)]
 
 
 with_options(init, init, {name: _make_option(items) for name, items in items_by_name().items()}, None)
 
 
 def schema(
-    out: Annotated[Path | None, typer.Option(metavar="NEW.json", help="file to be written [default: stdout]")] = None,
+    out: Annotated[Path | None, option("NEW.json", "file to be written [default: stdout]")] = None,
 ) -> None:
     """Print the JSON schema of a study, by which editors complete and check its keys."""
     import json
@@ -199,10 +199,8 @@ def _find_shipped_study(name: str) -> Path:
 
 def bench(
     context: typer.Context,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="take less than a minute: shorter runs, the others in one precision")
-    ] = False,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the results")] = Path("results/bench"),
+    quick: Annotated[bool, flag("--quick", "take less than a minute: shorter runs, the others in one precision")] = False,
+    out: Annotated[Path, option("DIR", "folder for the results")] = Path("results/bench"),
 ) -> Outcome:
     """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json."""
     workers.start_jax()

@@ -34,7 +34,10 @@ from .options import (
     OverwriteOption,
     ResultsArgument,
     SchedulerOption,
+    argument,
+    flag,
     folder_of,
+    option,
 )
 from .outcome import Outcome
 
@@ -50,7 +53,7 @@ def simulate(
     config: ConfigArgument,
     out: OutOption = None,
     seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0, max=2**31 - 1)] = 0,
-    every: Annotated[int, typer.Option(help="keep every N-th sample of the trace", min=1, metavar="N")] = 1,
+    every: Annotated[int, option("N", "keep every N-th sample of the trace", min=1)] = 1,
     overwrite: OverwriteOption = False,
 ) -> Outcome:
     """Simulate a study once: trace, figures, summary."""
@@ -74,17 +77,16 @@ def sweep(
     context: typer.Context,
     config: ConfigArgument,
     out: OutOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="print the expected cost, and stop")] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "print the expected cost, and stop")] = False,
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
     verify_store: Annotated[
-        bool, typer.Option("--verify-store", help="read every stored part first, and compute damaged ones anew")
+        bool, flag("--verify-store", "read every stored part first, and compute damaged ones anew")
     ] = False,
     scheduler: SchedulerOption = None,
-    detach: Annotated[bool, typer.Option("--detach", help="leave the cluster at work; see 'jaxbl status DIR'")] = False,
+    detach: Annotated[bool, flag("--detach", "leave the cluster at work; see 'jaxbl status DIR'")] = False,
     share: Annotated[
-        str | None,
-        typer.Option(metavar="I/N", help="compute the I-th of N shares into a folder that other processes write into, too"),
+        str | None, option("I/N", "compute the I-th of N shares into a folder that other processes write into, too")
     ] = None,
 ) -> Outcome:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
@@ -289,9 +291,7 @@ def compute(
 def plot(
     context: typer.Context,
     folder: FolderArgument,
-    config: Annotated[
-        Path | None, typer.Option(metavar="CONFIG", help="take title, notes and figures from this study")
-    ] = None,
+    config: Annotated[Path | None, option("CONFIG", "take title, notes and figures from this study")] = None,
 ) -> Outcome:
     """Draw figures and report of a sweep again from its stored points, without simulating."""
     workers.start_jax()
@@ -317,14 +317,10 @@ def explore(
     context: typer.Context,
     folder: ResultsArgument,
     static: Annotated[
-        Path | None,
-        typer.Option("--static", metavar="OUT", help="write the page into this folder, new or ours, and do not serve it"),
+        Path | None, option("OUT", "write the page into this folder, new or ours, and do not serve it", "--static")
     ] = None,
-    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="port to serve on; 0: one that is free")] = 0,
-    browser: Annotated[
-        bool | None,
-        typer.Option("--browser/--no-browser", help="open the page [default: on a terminal]", show_default=False),
-    ] = None,
+    port: Annotated[int, option("N", "port to serve on; 0: one that is free", min=0, max=65535)] = 0,
+    browser: Annotated[bool | None, flag("--browser/--no-browser", "open the page [default: on a terminal]")] = None,
 ) -> Outcome:
     """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python."""
     if static is not None and (port or browser is not None):
@@ -358,11 +354,9 @@ def explore(
 
 def compare(
     context: typer.Context,
-    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=to_path, help="folder of a sweep", show_default=False)],
-    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=to_path, help="of another one", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
-    ] = None,
+    first: Annotated[Path, argument("DIR1", "folder of a sweep", parser=to_path)],
+    second: Annotated[Path, argument("DIR2", "of another one", parser=to_path)],
+    out: Annotated[Path | None, option("DIR", "folder for the results [default: results/compare-DIR1-DIR2]")] = None,
 ) -> Outcome:
     """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
     workers.start_jax()

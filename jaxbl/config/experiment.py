@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, create_model, model_validator
 
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
@@ -23,17 +23,17 @@ from jaxbl.records.files import read_log_file
 from jaxbl.simulate import Run
 from jaxbl.validation import table_error
 
-from .tables import Table, table_for, tagged_union
+from .tables import Table, declare_key, table_for, tagged_union
 
 
 class RecordedTable(Table):
     """Input from a CSV or Parquet file (or a log file of another kind), played back with zero-order hold."""
 
     kind: Literal["recorded"]
-    file: str = Field(description="CSV or Parquet file; relative to the config file")
-    time_column: str = Field(default="t", description="column of times in s")
-    torque_column: str = Field(default="u", description="column of torques in N m")
-    gain: float = Field(default=1.0, description="factor on the recorded torque")
+    file: str = declare_key("CSV or Parquet file; relative to the config file")
+    time_column: str = declare_key("column of times in s", "t")
+    torque_column: str = declare_key("column of torques in N m", "u")
+    gain: float = declare_key("factor on the recorded torque", 1.0)
 
     def build(self) -> Recorded:
         times, torques = self._columns()
@@ -79,9 +79,8 @@ _GAINS = {field.name: config_key(field.name) for cls in OBSERVERS.values() for f
 class _ObserverTable(Table):
     """Observers of both sides."""
 
-    discretisation: Literal[tuple(DISCRETISATIONS)] = Field(
-        default="implicit",
-        description="of kind super_twisting. implicit: proximal backward Euler; explicit: forward Euler of (7)",
+    discretisation: Literal[tuple(DISCRETISATIONS)] = declare_key(
+        "of kind super_twisting. implicit: proximal backward Euler; explicit: forward Euler of (7)", "implicit"
     )
 
     @property
@@ -100,16 +99,16 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
     """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
     keys = {field.name for field, _ in parameters(cls)}
     other_keys: dict[str, Any] = {
-        name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHER_KINDS))
+        name: (float | None, declare_key(OTHER_KINDS, None, alias=key if key != name else None))
         for name, key in _GAINS.items()
         if name not in keys
     }
     gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **other_keys))
     sides: dict[str, Any] = {
-        "motor": (gains, Field(description="gains of the motor observer")),
-        "load": (gains | None, Field(default=None, description="gains of the load observer; none on a rigid drive")),
+        "motor": (gains, declare_key("gains of the motor observer")),
+        "load": (gains | None, declare_key("gains of the load observer; none on a rigid drive", None)),
     }
-    tag: Any = (Literal[kind], Field(kind if kind == _USUAL else ..., description="kind of observer"))
+    tag: Any = (Literal[kind], declare_key("kind of observer", kind if kind == _USUAL else ...))
     return create_model(f"{cls.__name__}Table", __base__=_ObserverTable, __doc__=cls.__doc__, kind=tag, **sides)
 
 
@@ -127,8 +126,8 @@ _MOST_STEPS = 2e9
 class _RunTable(Table):
     """The keys of a run from which its number of samples and the type of its numbers follow."""
 
-    duration: float = Field(default=20.0, gt=0.0, description="length of the run", json_schema_extra={"unit": "s"})
-    precision: Literal["float64", "float32"] = Field(default="float64", description="floating-point type of the run")
+    duration: float = declare_key("length of the run", 20.0, unit="s", gt=0.0)
+    precision: Literal["float64", "float32"] = declare_key("floating-point type of the run", "float64")
 
     @property
     def steps(self) -> int:

@@ -13,7 +13,7 @@ from jaxbl.errors import InputError
 from jaxbl.validation import suggest_word
 
 from .study import Config
-from .sweep import FigureTable
+from .sweep import AxisTable, FigureTable
 
 
 def check_selection(config: Config, figure: FigureTable, index: int) -> None:
@@ -57,14 +57,10 @@ def resolve_where(config: Config, figure: FigureTable, index: int = 0) -> dict[s
     Raises:
         InputError: no such axis, or no such value of it.
     """
-    axes = {axis.path: axis for axis in config.axes}
     fixed = {}
     for path, choice in (figure.where or {}).items():
         key = f"figures[{index}].where"
-        if path not in axes:
-            hint = suggest_word(path, axes) if axes else "the study has no axes"
-            raise InputError(f"{key}: '{path}' is not an axis of this study; {hint}")
-        axis = axes[path]
+        axis = find_axis(config, path, key)
         if axis.values is None and axis.num is None:
             raise InputError(
                 f"{key}: '{path}' is sampled quasi-randomly and repeats no value; fix an axis with num or values"
@@ -84,6 +80,15 @@ def resolve_where(config: Config, figure: FigureTable, index: int = 0) -> dict[s
                 raise InputError(f"{key}: '{path}' has no value {choice:g}; the nearest is {nearest:g}")
             fixed[path] = nearest
     return fixed
+
+
+def find_axis(config: Config, path: str, key: str) -> AxisTable:
+    """Return the axis with a path that the figure's `key` names. Raises `InputError` if the study has no such axis."""
+    axes = {axis.path: axis for axis in config.axes}
+    if path not in axes:
+        hint = suggest_word(path, axes) if axes else "the study has no axes"
+        raise InputError(f"{key}: '{path}' is not an axis of this study; {hint}")
+    return axes[path]
 
 
 def filter_rows(frame: pd.DataFrame, fixed: dict[str, Any]) -> pd.DataFrame:

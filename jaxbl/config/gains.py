@@ -10,7 +10,7 @@ from jaxbl.validation import suggest_word, table_error
 
 from .experiment import ExcitationTable
 from .sweep import AxisTable
-from .tables import Table
+from .tables import Table, declare_key
 
 
 class _SpanTable(Table):
@@ -27,70 +27,69 @@ class _SpanTable(Table):
 class AlphaRatioTable(_SpanTable):
     """Range of alpha / f⁺ that is searched, in equal ratios."""
 
-    start: float = Field(default=1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
-    stop: float = Field(default=100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
+    start: float = declare_key("least alpha / f⁺; no observer converges below 1", 1.1, gt=1.0, le=1e9)
+    stop: float = declare_key("largest alpha / f⁺", 100.0, gt=1.0, le=1e9)
 
 
 class LambdaRatioTable(_SpanTable):
     """Range of lambda / √f⁺ that is searched, in equal ratios."""
 
-    start: float = Field(default=0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
-    stop: float = Field(default=50.0, gt=0.0, le=1e9, description="largest lambda / √f⁺")
+    start: float = declare_key("least lambda / √f⁺", 0.3, gt=0.0, le=1e9)
+    stop: float = declare_key("largest lambda / √f⁺", 50.0, gt=0.0, le=1e9)
 
 
 class GainPairTable(Table):
     """Gains of one observer."""
 
-    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
-    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
+    lambda_: float = declare_key("gain lambda", unit="√rad/s", alias="lambda", ge=0.0)
+    alpha: float = declare_key("gain alpha", unit="rad/s²", ge=0.0)
 
 
 class CompareTable(Table):
     """Other gains that tuned ones are compared with."""
 
-    name: str = Field(min_length=1, max_length=100, description="how tables and figures call them")
-    motor: GainPairTable = Field(description="gains of the motor observer")
-    load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
+    name: str = declare_key("how tables and figures call them", min_length=1, max_length=100)
+    motor: GainPairTable = declare_key("gains of the motor observer")
+    load: GainPairTable | None = declare_key("gains of the load observer; none on a rigid drive", None)
 
 
 class SideCertificateTable(Table):
     """Assumptions of a certificate for one observer, and limits that its gains must provably keep."""
 
-    noise: float | None = Field(
-        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
-        description="bound of the error of a reading; left out: half a count and five times the rms noise of [encoders]",
-    )  # fmt: skip
-    f_plus: float | None = Field(
-        default=None, gt=0.0, json_schema_extra={"unit": "rad/s²"},
-        description="bound of the acceleration that the nominal model lacks; left out: the f⁺ that tune finds",
-    )  # fmt: skip
-    velocity_error: float | None = Field(
-        default=None, ge=0.0, json_schema_extra={"unit": "rad/s"},
-        description="largest velocity error at the start; left out: that of tune's runs",
-    )  # fmt: skip
-    position_error: float | None = Field(
-        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
-        description="largest position error at the start; left out: the study's, at least that of a reading",
-    )  # fmt: skip
-    acceleration: float | None = Field(
-        default=None, ge=0.0, json_schema_extra={"unit": "rad/s²"},
-        description="bound of the nominal acceleration, for the explicit form; left out: largest of the pilot run, and f⁺",
-    )  # fmt: skip
-    accuracy: float | None = Field(
-        default=None, gt=0.0, description="velocity error that must provably not be exceeded",
-        json_schema_extra={"unit": "rad/s"},
-    )  # fmt: skip
-    reaching_time: float | None = Field(
-        default=None, gt=0.0, description="time after which that must hold", json_schema_extra={"unit": "s"}
+    noise: float | None = declare_key(
+        "bound of the error of a reading; left out: half a count and five times the rms noise of [encoders]",
+        None,
+        unit="rad",
+        ge=0.0,
     )
+    f_plus: float | None = declare_key(
+        "bound of the acceleration that the nominal model lacks; left out: the f⁺ that tune finds",
+        None,
+        unit="rad/s²",
+        gt=0.0,
+    )
+    velocity_error: float | None = declare_key(
+        "largest velocity error at the start; left out: that of tune's runs", None, unit="rad/s", ge=0.0
+    )
+    position_error: float | None = declare_key(
+        "largest position error at the start; left out: the study's, at least that of a reading", None, unit="rad", ge=0.0
+    )
+    acceleration: float | None = declare_key(
+        "bound of the nominal acceleration, for the explicit form; left out: largest of the pilot run, and f⁺",
+        None,
+        unit="rad/s²",
+        ge=0.0,
+    )
+    accuracy: float | None = declare_key("velocity error that must provably not be exceeded", None, unit="rad/s", gt=0.0)
+    reaching_time: float | None = declare_key("time after which that must hold", None, unit="s", gt=0.0)
 
 
 class CertificateTable(Table):
     """Bounds that gains provably hold for all noise and disturbance within limits; super-twisting observers only."""
 
     motor: SideCertificateTable = Field(default_factory=SideCertificateTable)
-    load: SideCertificateTable | None = Field(default=None, description="as motor; none on a rigid drive")
-    runs: int = Field(default=1_000_000, ge=1, le=10**9, description="adversarial runs that look for a counterexample")
+    load: SideCertificateTable | None = declare_key("as motor; none on a rigid drive", None)
+    runs: int = declare_key("adversarial runs that look for a counterexample", 1_000_000, ge=1, le=10**9)
 
 
 TUNE_NAMES = ("tuned", "usual rule", "config")
@@ -103,47 +102,41 @@ class TuneTable(Table):
     Left out, `observers` is the study's own kind, super_twisting, whose lambda and alpha are searched on a map.
     """
 
-    objective: Literal["velocity", "torque"] = Field(
-        default="velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
+    objective: Literal["velocity", "torque"] = declare_key(
+        "rms error over the last quarter of the run that is made least, worst over the seeds", "velocity"
     )
-    worst_over_uncertainty: bool = Field(
-        default=False,
-        description="worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)",
+    worst_over_uncertainty: bool = declare_key(
+        "worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)", False
     )
-    margin_exact: float = Field(
-        default=1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
+    margin_exact: float = declare_key(
+        "least lambda over what the exact condition asks at the true f⁺ along each run", 1.1, ge=1.0
     )
-    margin_alpha: float = Field(default=1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
-    longest_convergence: float | None = Field(
-        default=None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
-        json_schema_extra={"unit": "s"},
-    )  # fmt: skip
+    margin_alpha: float = declare_key("least alpha over the true f⁺ along each run", 1.1, gt=1.0)
+    longest_convergence: float | None = declare_key(
+        "convergence time allowed; left out: the first three quarters of the run", None, unit="s", gt=0.0
+    )
     alpha_ratio: AlphaRatioTable = Field(default_factory=AlphaRatioTable)
     lambda_ratio: LambdaRatioTable = Field(default_factory=LambdaRatioTable)
-    num: int = Field(default=16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
-    refine: int = Field(default=2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
-    holdout: ExcitationTable | None = Field(  # pyright: ignore[reportInvalidTypeForm]
-        default=None,
-        description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
+    num: int = declare_key("values of each gain in the coarse map and in each zoom", 16, ge=3, le=1000)
+    refine: int = declare_key("zooms around the best cell; each spans two cells of the last", 2, ge=0, le=10)
+    holdout: ExcitationTable | None = declare_key(  # pyright: ignore[reportInvalidTypeForm]
+        "a table as [excitation]: input that gains are compared on; left out: the study's, with other noise", None
     )
-    compare: list[CompareTable] = Field(default=[], max_length=50, description="named gains to compare with")
-    observers: list[str] = Field(
-        default=[],
-        max_length=50,
-        description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, "
+    compare: list[CompareTable] = declare_key("named gains to compare with", [], max_length=50)
+    observers: list[str] = declare_key(
+        "kinds of observer to choose from: each is tuned by the same search on the same runs; margins, "
         "alpha_ratio, lambda_ratio, num, compare and certificate do not apply",
+        [],
+        max_length=50,
     )
-    trials: int = Field(
-        default=256,
-        ge=8,
-        le=65536,
-        description="of observers: gains tried of each kind, over its whole range and in each zoom",
+    trials: int = declare_key(
+        "of observers: gains tried of each kind, over its whole range and in each zoom", 256, ge=8, le=65536
     )
-    axes: list[AxisTable] = Field(
-        default=[], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
+    axes: list[AxisTable] = declare_key(
+        "of observers: [[axes]] of a grid over which the best kind is mapped", [], max_length=10
     )
-    certificate: CertificateTable | None = Field(
-        default=None, description="a table, which may be empty: prove bounds for the gains; left out: none"
+    certificate: CertificateTable | None = declare_key(
+        "a table, which may be empty: prove bounds for the gains; left out: none", None
     )
 
     @model_validator(mode="after")
@@ -162,9 +155,10 @@ class TuneTable(Table):
     def _check_observers(self) -> None:
         """Kinds that exist, and keys that go with them."""
         changed = [
-            name for name, field in type(self).model_fields.items()
+            name
+            for name, field in type(self).model_fields.items()
             if getattr(self, name) != field.get_default(call_default_factory=True)
-        ]  # fmt: skip
+        ]
         if not self.observers:
             for key in ("trials", "axes"):
                 if key in changed:
@@ -188,9 +182,9 @@ class TuneTable(Table):
 class RangeTable(_SpanTable):
     """Values between two ends, evenly spaced on a log scale."""
 
-    start: float = Field(gt=0.0, description="first value")
-    stop: float = Field(gt=0.0, description="last value")
-    num: int = Field(ge=2, le=8192, description="number of values")
+    start: float = declare_key("first value", gt=0.0)
+    stop: float = declare_key("last value", gt=0.0)
+    num: int = declare_key("number of values", ge=2, le=8192)
 
     def values(self) -> np.ndarray:
         """The values, shape (num,)."""
@@ -200,26 +194,26 @@ class RangeTable(_SpanTable):
 class MarkTable(GainPairTable):
     """A pair of gains to be marked in the atlas, run once on the study's drive."""
 
-    name: str = Field(max_length=100, description="label")
-    side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
+    name: str = declare_key("label", max_length=100)
+    side: Literal["motor", "load"] = declare_key("observer that has these gains", "motor")
 
 
 class VerifyTable(Table):
     """Settings of `jaxbl verify` besides the study's own points: the normalised error system, and marks."""
 
-    q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
-    alpha_ratio: RangeTable = Field(
-        default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512), description="alpha / f_plus of the atlas"
+    q: float | None = declare_key("q of condition (32); left out: its limit q → 0", None, gt=0.0, lt=1.0)
+    alpha_ratio: RangeTable = declare_key(
+        "alpha / f_plus of the atlas", default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512)
     )
-    lambda_ratio: RangeTable = Field(
-        default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
+    lambda_ratio: RangeTable = declare_key(
+        "lambda / √f_plus of the atlas", default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512)
     )
-    damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
-        default=[0.1, 0.3, 1.0],
+    damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = declare_key(
+        "dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
+        [0.1, 0.3, 1.0],
         max_length=100,
-        description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
     )
-    marks: list[MarkTable] = Field(default=[], max_length=100, description="gains to be marked")
+    marks: list[MarkTable] = declare_key("gains to be marked", [], max_length=100)
 
     @model_validator(mode="after")
     def _possible(self) -> "VerifyTable":

@@ -2,47 +2,42 @@
 
 from typing import Literal
 
-from pydantic import Field
-
-from .tables import Table
+from .tables import Table, declare_key
 
 
 class UncertaintyTable(Table):
     """Uncertainty of the drive's numbers. Accepted in every study; simulate and sweep do not use it, tune can."""
 
-    relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
-    exact: list[str] = Field(
-        default=["drive.gear_ratio"],
-        description="dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
+    relative: float = declare_key("relative standard deviation of every number not in exact", 0.02, gt=0.0)
+    exact: list[str] = declare_key(
+        "dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
+        ["drive.gear_ratio"],
     )
 
 
 class IdentifyTable(Table):
     """Settings of `jaxbl identify`."""
 
-    parameters: list[str] | None = Field(
-        default=None,
-        description="dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
+    parameters: list[str] | None = declare_key(
+        "dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
         "uncertainty.exact and have a value to start from",
+        None,
     )
-    method: Literal["output_error", "prediction_error"] = Field(
-        default="output_error",
-        description="output_error: the model runs freely over each window; prediction_error: each reading corrects it, "
+    method: Literal["output_error", "prediction_error"] = declare_key(
+        "output_error: the model runs freely over each window; prediction_error: each reading corrects it, "
         "which is better where disturbances act that the model does not know",
+        "output_error",
     )
-    window: float | None = Field(
-        default=None,
+    window: float | None = declare_key(
+        "length of the windows that the model runs over; left out: chosen by the width of the intervals",
+        None,
+        unit="s",
         gt=0.0,
-        description="length of the windows that the model runs over; left out: chosen by the width of the intervals",
-        json_schema_extra={"unit": "s"},
     )
-    starts: int = Field(default=8, ge=1, le=1000, description="starts of the fit, the first at the nominal numbers")
-    spread: float = Field(default=2.0, gt=1.0, le=100.0, description="the others lie within this factor of them")
-    seed: int = Field(default=0, ge=0, description="seed of the starts")
-    profile: bool = Field(default=False, description="whether to compute profile-likelihood intervals as well")
-    bandwidth: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="of the torques in the equations of motion; left out: a twentieth of the sampling rate",
-        json_schema_extra={"unit": "Hz"},
+    starts: int = declare_key("starts of the fit, the first at the nominal numbers", 8, ge=1, le=1000)
+    spread: float = declare_key("the others lie within this factor of them", 2.0, gt=1.0, le=100.0)
+    seed: int = declare_key("seed of the starts", 0, ge=0)
+    profile: bool = declare_key("whether to compute profile-likelihood intervals as well", False)
+    bandwidth: float | None = declare_key(
+        "of the torques in the equations of motion; left out: a twentieth of the sampling rate", None, unit="Hz", gt=0.0
     )

@@ -41,40 +41,40 @@ from .experiment import (
 from .gains import TuneTable, VerifyTable
 from .logs import IdentifyTable, UncertaintyTable
 from .sweep import AxisTable, FigureTable, SweepTable
-from .tables import Table
+from .tables import Table, declare_key
 
 
 class Config(Table):
     """A study: everything that a run needs, validated."""
 
-    include: str | list[str] = Field(
-        default=[],
-        exclude=True,
-        description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
+    include: str | list[str] = declare_key(
+        "TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
         "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
+        [],
+        exclude=True,
     )
-    title: str = Field(default="", max_length=500, description="headline of the report")
-    notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
-    drive: DriveTable = Field(description="what is driven")
-    transmission: TransmissionTable | None = Field(default=None, description="law of the gear; none on a rigid drive")
-    effects: list[EffectTable] = Field(default=[], max_length=100, description="effects beyond the nominal drive")
-    initial: InitialTable = Field(default_factory=InitialTable, description="state at t = 0")
-    excitation: ExcitationTable = Field(description="input torque")
-    encoders: EncodersTable = Field(default_factory=EncodersTable, description="position sensors")
+    title: str = declare_key("headline of the report", "", max_length=500)
+    notes: list[str] = declare_key("remarks of the author, repeated in summary and report", [])
+    drive: DriveTable = declare_key("what is driven")
+    transmission: TransmissionTable | None = declare_key("law of the gear; none on a rigid drive", None)
+    effects: list[EffectTable] = declare_key("effects beyond the nominal drive", [], max_length=100)
+    initial: InitialTable = declare_key("state at t = 0", default_factory=InitialTable)
+    excitation: ExcitationTable = declare_key("input torque")
+    encoders: EncodersTable = declare_key("position sensors", default_factory=EncodersTable)
     observer: ObserverTable
-    equivalent_control: EquivalentControlTable = Field(
-        default_factory=EquivalentControlTable, description="low-pass on the equivalent control"
+    equivalent_control: EquivalentControlTable = declare_key(
+        "low-pass on the equivalent control", default_factory=EquivalentControlTable
     )
-    identifier: IdentifierTable = Field(default_factory=IdentifierTable, description="recursive least squares")
+    identifier: IdentifierTable = declare_key("recursive least squares", default_factory=IdentifierTable)
     run: RunTable = Field(default_factory=RunTable)
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
-    tune: TuneTable | None = Field(default=None)
+    tune: TuneTable | None = None
     log: LogTable = Field(default_factory=LogTable)
     identify: IdentifyTable = Field(default_factory=IdentifyTable)
     verify: VerifyTable = Field(default_factory=VerifyTable)
-    axes: list[AxisTable] = Field(default=[], max_length=50)
-    figures: list[FigureTable] = Field(default=[], max_length=200)
+    axes: list[AxisTable] = Field([], max_length=50)
+    figures: list[FigureTable] = Field([], max_length=200)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":

@@ -3,11 +3,11 @@
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from jaxbl.validation import table_error
 
-from .tables import Table
+from .tables import Table, declare_key
 
 DEFAULT_TOLERANCE = 0.1
 """Relative difference of a numeric metric beyond which neighbours disagree, unless the study says otherwise."""
@@ -21,38 +21,34 @@ def is_boolean(column: str) -> bool:
 class SweepTable(Table):
     """Combination and repetition of the axes."""
 
-    seeds: int = Field(
-        default=1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
+    seeds: int = declare_key(
+        "noise seeds first_seed, first_seed + 1, ..., each run at every point", 1, ge=1, le=1_000_000_000
     )
-    first_seed: int = Field(default=0, ge=0, le=2**31 - 1, description="first of the noise seeds")
-    design: Literal["grid", "sobol", "latin_hypercube"] = Field(
-        default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
+    first_seed: int = declare_key("first of the noise seeds", 0, ge=0, le=2**31 - 1)
+    design: Literal["grid", "sobol", "latin_hypercube"] = declare_key(
+        "grid: all combinations; else quasi-random points over the axes without num or values", "grid"
     )
-    points: int | None = Field(default=None, ge=1, le=100_000_000, description="number of quasi-random points")
-    design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
-    metrics: list[str] | None = Field(
-        default=None,
-        description="metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
+    points: int | None = declare_key("number of quasi-random points", None, ge=1, le=100_000_000)
+    design_seed: int = declare_key("seed of the quasi-random design", 0, ge=0)
+    metrics: list[str] | None = declare_key(
+        "metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
         "left out: all; `finite` then counts what overflowed before all of these were known",
+        None,
     )
-    chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
-    refine: int | None = Field(
-        default=None,
+    chunk: int | None = declare_key("lanes computed at once; left out: chosen for the machine", None, ge=1)
+    refine: int | None = declare_key(
+        "how often to halve the grid where neighbours disagree, along the axes with start, stop and num; left out: never",
+        None,
         ge=1,
         le=30,
-        description="how often to halve the grid where neighbours disagree, along the axes with start, stop and num; "
-        "left out: never",
     )
-    refine_metric: str | None = Field(
-        default=None,
-        description="metric that decides where to refine; left out: converged, of the observer whose gains vary, otherwise "
-        "of both",
+    refine_metric: str | None = declare_key(
+        "metric that decides where to refine; left out: converged, of the observer whose gains vary, otherwise of both", None
     )
-    refine_tolerance: float | None = Field(
-        default=None,
+    refine_tolerance: float | None = declare_key(
+        f"relative difference beyond which they disagree in a numeric refine_metric; left out: {DEFAULT_TOLERANCE:g}",
+        None,
         gt=0.0,
-        description="relative difference beyond which they disagree in a numeric refine_metric; "
-        f"left out: {DEFAULT_TOLERANCE:g}",
     )
 
     @model_validator(mode="after")
@@ -80,15 +76,13 @@ class SweepTable(Table):
 class AxisTable(Table):
     """One axis: a dotted path and its values."""
 
-    path: str = Field(description="dotted path of the number to vary, e.g. observer.motor.alpha")
-    values: list[float | int | str] | None = Field(default=None, description="listed values")
-    start: float | None = Field(default=None, description="first value")
-    stop: float | None = Field(default=None, description="last value")
-    num: int | None = Field(
-        default=None, ge=1, le=10_000_000, description="number of values; left out in quasi-random designs"
-    )
-    scale: Literal["linear", "log"] = Field(default="linear", description="spacing")
-    zip: str | None = Field(default=None, description="axes with the same label advance together")
+    path: str = declare_key("dotted path of the number to vary, e.g. observer.motor.alpha")
+    values: list[float | int | str] | None = declare_key("listed values", None)
+    start: float | None = declare_key("first value", None)
+    stop: float | None = declare_key("last value", None)
+    num: int | None = declare_key("number of values; left out in quasi-random designs", None, ge=1, le=10_000_000)
+    scale: Literal["linear", "log"] = declare_key("spacing", "linear")
+    zip: str | None = declare_key("axes with the same label advance together", None)
 
     @model_validator(mode="after")
     def _complete(self) -> "AxisTable":
@@ -132,22 +126,21 @@ class AxisTable(Table):
 class FigureTable(Table):
     """One figure of the report."""
 
-    kind: Literal["heatmap", "line"] = Field(description="heatmap over two axes, or lines over one")
-    x: str = Field(description="axis path")
-    y: str | None = Field(default=None, description="axis path (heatmap)")
-    value: str = Field(description="metric, e.g. motor.velocity_rmse")
-    facet: str | None = Field(default=None, description="axis path: one panel for each value")
-    series: str | None = Field(default=None, description="axis path: one line for each value (line)")
-    where: dict[str, float | int | str] | None = Field(
-        default=None,
-        description="axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them",
+    kind: Literal["heatmap", "line"] = declare_key("heatmap over two axes, or lines over one")
+    x: str = declare_key("axis path")
+    y: str | None = declare_key("axis path (heatmap)", None)
+    value: str = declare_key("metric, e.g. motor.velocity_rmse")
+    facet: str | None = declare_key("axis path: one panel for each value", None)
+    series: str | None = declare_key("axis path: one line for each value (line)", None)
+    where: dict[str, float | int | str] | None = declare_key(
+        "axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them", None
     )
-    theory: float | None = Field(
-        default=None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
+    theory: float | None = declare_key(
+        "exponent of x that theory gives; asks for the fitted one (line; report, laws.json)", None
     )
-    scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
-    overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
-        default=[], description="gain conditions drawn over a map of alpha and lambda"
+    scale: Literal["auto", "linear", "log"] = declare_key("scale of the value", "auto")
+    overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = declare_key(
+        "gain conditions drawn over a map of alpha and lambda", []
     )
 
     @model_validator(mode="after")

@@ -33,6 +33,18 @@ class Table(StrictTable):
         )
 
 
+def declare_key(doc: str, default: Any = ..., *, unit: str = "", **rules: Any) -> Any:
+    """Declare a key of a table.
+
+    Args:
+        doc: what it means, one line.
+        default: its value where a study lacks it; left out, the key is required.
+        unit: SI unit; "" if it has none.
+        **rules: those of pydantic's `Field`: `gt`, `ge`, `le`, `max_length`, `alias`, ...
+    """
+    return Field(default, description=doc, json_schema_extra={"unit": unit} if unit else None, **rules)
+
+
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
     """Generate the config table of a module class from its declared parameters (:mod:`jaxbl.drive.parameters`).
 
@@ -47,11 +59,11 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
         optional = field.default is None
         fields[field.name] = (
             kind | None if optional else kind,
-            Field(
-                default=... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
+            declare_key(
+                parameter.doc,
+                ... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
+                unit=parameter.unit,
                 alias=config_key(field.name) if config_key(field.name) != field.name else None,
-                description=parameter.doc,
-                json_schema_extra={"unit": parameter.unit} if parameter.unit else None,
                 ge=parameter.minimum,
                 gt=parameter.above,
                 le=parameter.maximum,

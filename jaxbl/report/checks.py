@@ -1,11 +1,10 @@
 """What is wrong with the figures that a study asks for, said before anything is computed, and without loading what draws."""
 
 from jaxbl.config import AxisTable, Config, FigureTable
-from jaxbl.config.figures import check_selection
+from jaxbl.config.figures import check_selection, find_axis
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import signal_size_columns
 from jaxbl.sweeps.metrics import explain_missing_metric
-from jaxbl.validation import suggest_word
 
 
 def has_words(axis: AxisTable) -> bool:
@@ -26,7 +25,6 @@ def values_of(config: Config, axis: AxisTable) -> int:
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
     """Raise `InputError` where a figure names an axis that does not exist, or needs a metric that is not there."""
-    axes = {axis.path: axis for axis in config.axes}
     parts = {"x": None, "y": None, "facet": "panel", "series": "line"}
     for i, figure in enumerate(figures):
         for key, part in parts.items():
@@ -34,19 +32,17 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
             if path is None:
                 continue
             place = f"figures[{i}].{key}: '{path}'"
-            if path not in axes:
-                hint = suggest_word(path, axes) if axes else "the study has no axes"
-                raise InputError(f"{place} is not an axis of this study; {hint}")
+            axis = find_axis(config, path, f"figures[{i}].{key}")
             if part is None:
-                if has_words(axes[path]):
+                if has_words(axis):
                     other = "facet" if figure.kind == "heatmap" else "facet or series"
                     raise InputError(f"{place} has no numeric values; use it as {other}")
-            elif (count := values_of(config, axes[path])) > MOST_PARTS:
+            elif (count := values_of(config, axis)) > MOST_PARTS:
                 raise InputError(
                     f"{place} has {count} values, each of which would be a {part}; at most "
                     f"{MOST_PARTS} can be drawn; name another axis, or give it fewer values"
                 )
-        metrics = [column for column in columns if column not in (*axes, "seed")]
+        metrics = [column for column in columns if column not in (*(axis.path for axis in config.axes), "seed")]
         needs = [("value", figure.value)]
         if figure.overlays:
             side = figure.x.split(".")[1]
