@@ -67,11 +67,11 @@ class Item(NamedTuple):
 
     Attributes:
         name: as an option, with _ for -.
-        asked: what it is, in words.
+        question: what it is, in words.
         units: that it may be given in; the first is SI.
         example: as a data sheet may say it.
         default: what is taken if it is left out; "" where it has to be given.
-        least: smallest possible SI value; `above`: whether it has to be larger than that.
+        is_above: whether it has to be larger than 0; otherwise it may be 0, too.
         key: the number that it gives, by the name that it has on a geared drive; "" for the same name.
         absent: whether there may be none of what it describes: the answer is "none".
     """
@@ -81,7 +81,6 @@ class Item(NamedTuple):
     units: Units
     example: str
     default: str = ""
-    least: float = 0.0
     is_above: bool = True
     key: str = ""
     absent: bool = False
@@ -114,12 +113,10 @@ class Item(NamedTuple):
             value = factor(number) if callable(factor) else factor * number
         except (ZeroDivisionError, OverflowError):
             value = math.nan
-        if not (self.least < value < 1e30 or (value == self.least and not self.is_above)):
-            raise InputError(
-                f"{self.option} '{text}': should be {'more than' if self.is_above else 'at least'} {self.least:g} "
-                f"{next(iter(self.units))}".rstrip()
-                + f", such as '{self.example}'"
-            )
+        if not (0.0 < value < 1e30 or (value == 0.0 and not self.is_above)):
+            unit = f" {next(iter(self.units))}".rstrip()
+            limit = f"{'more than' if self.is_above else 'at least'} 0{unit}"
+            raise InputError(f"{self.option} '{text}': should be {limit}, such as '{self.example}'")
         return Answer(value, f"given: {match[1]} {name}".rstrip())
 
     def default_answer(self) -> "Answer":

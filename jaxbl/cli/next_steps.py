@@ -14,12 +14,17 @@ if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult
 
 
+def _propose(question: str, *words: object) -> NextStep:
+    """Propose the command of these words, which answers a question."""
+    return NextStep(command_line(*words), question)
+
+
 def after_init(file: Path) -> list[NextStep]:
     """Propose commands for a first study from a data sheet."""
     return [
-        NextStep(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
-        NextStep(command_line("sweep", file), "Which gains of the motor observer work? A map."),
-        NextStep(command_line("tune", file), "Which gains have the least error, and how large is it?"),
+        _propose("How do the drive and the estimates of its observers move? One run.", "simulate", file),
+        _propose("Which gains of the motor observer work? A map.", "sweep", file),
+        _propose("Which gains have the least error, and how large is it?", "tune", file),
     ]
 
 
@@ -27,24 +32,22 @@ def after_demo(result: "StudyResult", folder: Path) -> list[NextStep]:
     """Propose commands after a sweep, and a study of the user's own drive."""
     steps, own_study = after_sweep(result, folder), Path("drive.toml")
     if not own_study.exists():
-        steps.append(
-            NextStep(command_line("init", own_study), "And my own drive? A study of it, from the numbers of its data sheet.")
-        )
+        steps.append(_propose("And my own drive? A study of it, from the numbers of its data sheet.", "init", own_study))
     return steps
 
 
 def after_sweep(result: "StudyResult", folder: Path) -> list[NextStep]:
     """Propose commands for a sweep's folder, and for the study in it."""
     study = folder / "study.toml"
-    steps = [NextStep(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
+    steps = [_propose("How do other metrics look, over other axes? Maps in the browser.", "explore", folder)]
     if is_remote(study):
         return steps
     gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
-    if gains & {axis.path for axis in result.config.axes} and _all_converge_somewhere(result):
-        answers = "Which gains have the least error, and are they better than the usual rule?"
-        steps.append(NextStep(command_line("tune", study, "--out", f"{folder}_gains"), answers))
-    answers = "What happens over time? One run, with the numbers that the study itself has."
-    return [*steps, NextStep(command_line("simulate", study, "--out", f"{folder}_run"), answers)]
+    if gains & {*result.config.axis_paths} and _all_converge_somewhere(result):
+        question = "Which gains have the least error, and are they better than the usual rule?"
+        steps.append(_propose(question, "tune", study, "--out", f"{folder}_gains"))
+    question = "What happens over time? One run, with the numbers that the study itself has."
+    return [*steps, _propose(question, "simulate", study, "--out", f"{folder}_run")]
 
 
 def _all_converge_somewhere(result: "StudyResult") -> bool:
@@ -61,8 +64,7 @@ def _all_converge_somewhere(result: "StudyResult") -> bool:
 
 def after_proposal(log: Path, model: Path) -> list[NextStep]:
     """Propose the command that takes a proposed model."""
-    answers = "Which numbers does the machine have, and how sure are they?"
-    return [NextStep(command_line("identify", log, "--model", model), answers)]
+    return [_propose("Which numbers does the machine have, and how sure are they?", "identify", log, "--model", model)]
 
 
 def after_identification(task: "LogTask", summary: JsonObject, log_call: "LogCall") -> list[NextStep]:
@@ -79,13 +81,11 @@ def after_identification(task: "LogTask", summary: JsonObject, log_call: "LogCal
     steps, folder = [], log_call.folder
     if not all(map(is_noise, summary["residual"].values())):
         if log_call.holdout is not None or can_hold_out(task.record):
-            words = ("diagnose", *log_call.words(), "--out", f"{folder}_diagnosed")
-            steps.append(NextStep(command_line(*words), "What does the model lack? Its errors are larger than noise."))
+            words = "diagnose", *log_call.words(), "--out", f"{folder}_diagnosed"
+            steps.append(_propose("What does the model lack? Its errors are larger than noise.", *words))
     elif _has_input(task):
-        words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
-        steps.append(
-            NextStep(command_line(*words), "How does the drive move with these numbers, and what do observers see?")
-        )
+        question = "How does the drive move with these numbers, and what do observers see?"
+        steps.append(_propose(question, "simulate", folder / "model.toml", "--out", f"{folder}_run"))
     return [*steps, *_propose_gap_experiment(summary, log_call), _explore_log(folder)]
 
 
@@ -98,11 +98,11 @@ def after_diagnosis(task: "LogTask", summary: JsonObject, log_call: "LogCall") -
     if pair is not None:
         steps.append(log_call.propose_experiment(f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
     if summary["verdict"] == "no_discrepancy":
-        words = ("identify", *log_call.words(), "--out", f"{folder}_identified")
-        steps.append(NextStep(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
+        words = "identify", *log_call.words(), "--out", f"{folder}_identified"
+        steps.append(_propose("How sure are the model's numbers? 95 % intervals of each.", *words))
     if summary["findings"] and _has_input(task):
-        words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
-        steps.append(NextStep(command_line(*words), "How does the drive move with what was found? The extended study, run."))
+        question = "How does the drive move with what was found? The extended study, run."
+        steps.append(_propose(question, "simulate", folder / "model.toml", "--out", f"{folder}_run"))
     return [*steps, _explore_log(folder)]
 
 
@@ -111,11 +111,9 @@ def after_watch(task: "WatchTask", summary: JsonObject, model: Path) -> list[Nex
     if task.record is None:
         return []
     if summary["contradictions"]:
-        return [NextStep(command_line("diagnose", task.name, "--model", model), "Which effect does the model lack?")]
+        return [_propose("Which effect does the model lack?", "diagnose", task.name, "--model", model)]
     if summary["alarm"]:
-        return [
-            NextStep(command_line("identify", task.name, "--model", model), "How large are gap and stiffness, by a fit?")
-        ]
+        return [_propose("How large are gap and stiffness, by a fit?", "identify", task.name, "--model", model)]
     return []
 
 
@@ -135,11 +133,11 @@ class LogCall(NamedTuple):
 
     def propose_experiment(self, question: str) -> NextStep:
         """Propose the same call with an experiment that answers a question."""
-        return NextStep(command_line(*self.again, "--next-experiment", f"{self.folder}_next.csv"), question)
+        return _propose(question, *self.again, "--next-experiment", f"{self.folder}_next.csv")
 
 
 def _explore_log(folder: Path) -> NextStep:
-    return NextStep(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
+    return _propose("Where along the log do model and machine differ? In the browser.", "explore", folder)
 
 
 def _propose_gap_experiment(summary: JsonObject, log_call: LogCall) -> list[NextStep]:

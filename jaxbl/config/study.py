@@ -89,6 +89,11 @@ class Config(Table):
                 raise table_error(f"uncertainty.exact: unknown path '{path}'; {suggest_path(path, paths)}")
         return self
 
+    @property
+    def axis_paths(self) -> list[str]:
+        """Paths of the axes, in their order."""
+        return [axis.path for axis in self.axes]
+
     def build(self) -> Experiment:
         """Build the experiment that the config describes, with Python numbers as leaves.
 

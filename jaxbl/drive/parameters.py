@@ -117,24 +117,31 @@ def _members_by_name(members: tuple) -> dict[str, Any]:
     return {name if names.count(name) == 1 else str(i): members[i] for i, name in enumerate(names)}
 
 
+def _first_key(tree: Any, path: str) -> tuple[str, str]:
+    """Return the name of the member that a dotted path begins with, and the path within it. Raises `KeyError`."""
+    if isinstance(tree, tuple):
+        members, keys = _members_by_name(tree), path.split(".")
+        # the name of a member may have dots (`load.coulomb_friction`)
+        for count in range(1, len(keys) + 1):
+            if (name := ".".join(keys[:count])) in members:
+                return name, ".".join(keys[count:])
+    else:
+        name, _, subpath = path.partition(".")
+        name = f"{name}_" if keyword.iskeyword(name) else name
+        if hasattr(tree, name):
+            return name, subpath
+    raise KeyError(path)
+
+
 def get_leaf(tree: Any, path: str) -> Any:
     """Return the leaf at a dotted path. Raises `KeyError` if there is none."""
-    keys = path.split(".")
-    while keys:
-        if isinstance(tree, tuple):
-            members = _members_by_name(tree)
-            # the name of a member may have dots (`load.coulomb_friction`)
-            for count in range(1, len(keys) + 1):
-                if (name := ".".join(keys[:count])) in members:
-                    tree, keys = members[name], keys[count:]
-                    break
-            else:
-                raise KeyError(path)
-        else:
-            name = f"{keys[0]}_" if keyword.iskeyword(keys[0]) else keys[0]
-            if not hasattr(tree, name):
-                raise KeyError(path)
-            tree, keys = getattr(tree, name), keys[1:]
+    remaining = path
+    while remaining:
+        try:
+            name, remaining = _first_key(tree, remaining)
+        except KeyError:
+            raise KeyError(path) from None
+        tree = _members_by_name(tree)[name] if isinstance(tree, tuple) else getattr(tree, name)
     return tree
 
 
@@ -145,32 +152,16 @@ def set_leaves(tree: Tree, values: Mapping[str, Any]) -> Tree:
         >>> stiffer = set_leaves(experiment, {"transmission.stiffness": 2.0, "observer.motor.alpha": 30.0})
     """
     by_member: dict[str, dict[str, Any]] = {}
-    members = _members_by_name(tree) if isinstance(tree, tuple) else None
     for path, value in values.items():
-        if members is None:
-            key, _, subpath = path.partition(".")
-            key = f"{key}_" if keyword.iskeyword(key) else key
-            if not hasattr(tree, key):
-                raise KeyError(path)
-        else:
-            # the name of a member may have dots (`load.coulomb_friction`)
-            keys = path.split(".")
-            splits = ((".".join(keys[:count]), ".".join(keys[count:])) for count in range(1, len(keys) + 1))
-            key, subpath = next((split for split in splits if split[0] in members), ("", ""))
-            if not key:
-                raise KeyError(path)
-        by_member.setdefault(key, {})[subpath] = value
+        name, subpath = _first_key(tree, path)
+        by_member.setdefault(name, {})[subpath] = value
     if not by_member:
         return tree
-
-    def change(member: Any, new: Mapping[str, Any]) -> Any:
-        return new[""] if "" in new else set_leaves(member, new)
-
-    if members is None:
-        changed = {key: change(getattr(tree, key), new) for key, new in by_member.items()}
-        return dataclasses.replace(tree, **changed)  # type: ignore[type-var]
-    changed = {key: change(members[key], new) for key, new in by_member.items()}
-    return tuple((members | changed).values())  # type: ignore[return-value]
+    members = _members_by_name(tree) if isinstance(tree, tuple) else {name: getattr(tree, name) for name in by_member}
+    changed = {name: new[""] if "" in new else set_leaves(members[name], new) for name, new in by_member.items()}
+    if isinstance(tree, tuple):
+        return tuple((members | changed).values())  # type: ignore[return-value]
+    return dataclasses.replace(tree, **changed)  # type: ignore[type-var]
 
 
 def as_arrays(tree: Tree, dtype: Any) -> Tree:

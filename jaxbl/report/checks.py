@@ -42,7 +42,7 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
                     f"{place} has {count} values, each of which would be a {part}; at most "
                     f"{MOST_PARTS} can be drawn; name another axis, or give it fewer values"
                 )
-        metrics = [column for column in columns if column not in (*(axis.path for axis in config.axes), "seed")]
+        metrics = [column for column in columns if column not in (*config.axis_paths, "seed")]
         needs = [("value", figure.value)]
         if figure.overlays:
             side = figure.x.split(".")[1]

@@ -11,12 +11,30 @@ from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, NextStep
 
-from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
+from .figures import (
+    BLACK,
+    BLUE,
+    FAINT,
+    MISSING,
+    ORANGE,
+    VERMILION,
+    Drawn,
+    decades,
+    draw_zero,
+    legend,
+    missing_label,
+    missing_quantity,
+    stacked,
+    style,
+    subplots,
+    with_unit,
+    write_inside,
+)
 from .motor_alone_figures import draw_motor_alone
 from .page import PageTable, write_results
-from .residuals import draw_residuals, missing_quantity, plot_torque
+from .residuals import draw_residuals, plot_torque
 
-_BEFORE, _AFTER, _FLOOR, _HELD = COLOURS[1], COLOURS[0], COLOURS[6], COLOURS[4]
+_BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
     "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
     "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
@@ -30,8 +48,9 @@ def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextS
     terminal.
     """
     summary = found.summary
-    tables = [*_finding_tables(summary), *_history_tables(summary), _gap_table(summary["gap"]), _number_table(summary)]
-    lead, remarks = _headline(found.summary), _remarks(found.summary)
+    tables = [table for table in (_finding_table(summary), _history_table(summary)) if table.rows]
+    tables += [_gap_table(summary["gap"]), _number_table(summary)]
+    lead, remarks = _headline(summary), _remarks(summary)
     title = found.config.title or f"Diagnosis of {found.record.path.name}"
     return write_results(found, folder, "diagnosis", title, lead, draw_diagnosis(found), tables, remarks, steps)
 
@@ -46,38 +65,37 @@ _FAR = 10.0
 
 
 def _headline(summary: JsonObject) -> Lines:
-    gains = [1.0 + one["parameters"]["relative"]["value"] for one in summary["findings"] if "relative" in one["parameters"]]
-    lines = [
-        f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
-        for gain in gains
-        if not 1.0 / _FAR < gain < _FAR
-    ]
-    lines = [*_contradiction_lines(summary), *summary["warnings"], *lines, verdict_sentence(summary)]
-    for one in summary["findings"]:
-        numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
+    doubts, lines = [], [verdict_sentence(summary)]
+    for finding in summary["findings"]:
+        numbers, others = finding["parameters"], finding["alternatives"]
+        gain = 1.0 + numbers["relative"]["value"] if "relative" in numbers else 1.0
+        if not 1.0 / _FAR < gain < _FAR:
+            doubts.append(
+                f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
+            )
         lines.append(
-            f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}; {_percent(one['share'])} of the "
-            "driving torque."
+            f"{finding['effect']} (confidence {probability(finding['confidence'])}): "
+            f"{', '.join(map(_number, numbers.items()))}; {_percent(finding['share'])} of the driving torque."
         )
-        if one["alternatives"]:
-            others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
-            lines.append(f"  Not ruled out by this log: {others}.")
+        if others:
+            names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
+            lines.append(f"  Not ruled out by this log: {names}.")
+    lines = [*_contradiction_lines(summary), *summary["warnings"], *doubts, *lines]
     return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
 
 
 def _contradiction_lines(summary: JsonObject) -> Lines:
     """Numbers that the logs do not agree on."""
-    found = []
-    for one in summary["contradictions"]:
-        unit = f" {one['unit']}" if one["unit"] else ""
-        said = [f"{by['value']:.3g} ± {by['standard_error']:.1g}{unit} by {by['log']}" for by in one["logs"]]
-        found.append(f"{one['parameter']} is {' and '.join(said)}")
-    if not found:
-        return []
-    return [
-        f"The logs contradict each other: {'; '.join(found)}. One model cannot hold for both: was the load, the controller "
-        "(a feedforward that u does not contain) or a unit another one?"
-    ]
+    numbers = []
+    for number in summary["contradictions"]:
+        unit = f" {number['unit']}" if number["unit"] else ""
+        values = [f"{by['value']:.3g} ± {by['standard_error']:.1g}{unit} by {by['log']}" for by in number["logs"]]
+        numbers.append(f"{number['parameter']} is {' and '.join(values)}")
+    sentence = (
+        f"The logs contradict each other: {'; '.join(numbers)}. One model cannot hold for both: was the load, the "
+        "controller (a feedforward that u does not contain) or a unit another one?"
+    )
+    return [sentence] if numbers else []
 
 
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
@@ -85,15 +103,15 @@ _NO_MORE = "no more is left on data not used for the fit than noise and the unce
 
 def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
-    names = _listed([one["effect"] for one in summary["findings"]])
+    names, verdict = _names(summary), summary["verdict"]
     them = "it" if len(summary["findings"]) == 1 else "them"
-    if summary["verdict"] == "explained":
+    if verdict == "explained":
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
-    if summary["verdict"] == "no_discrepancy":
+    if verdict == "no_discrepancy":
         return f"No discrepancy: {_NO_MORE}."
-    if summary["verdict"] == "not_tested":
+    if verdict == "not_tested":
         return _not_tested(summary)
-    where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
+    where = "; ".join(side["sentence"] for side in summary.get("where_after", summary["where"]).values())
     alone, test = summary.get("backlash"), summary["gap"]["test"]
     complete = not test["failed"] and not test["remainder"]
     gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
@@ -105,38 +123,37 @@ def verdict_sentence(summary: JsonObject) -> str:
         return (
             f"Contradicted: by the log the model lacks {names}; data not used for the fit are predicted worse with {them}."
         )
-    share, rest = _share(summary["explained_share"]), ", but not in a way that can be right"
-    if not complete:
-        rest = f". The rest is none of the known effects: {where}"
+    share = _share(summary["explained_share"])
+    remainder = ", but not in a way that can be right" if complete else f". The rest is none of the known effects: {where}"
     what = "missing torque" if "backlash" not in summary else "squared prediction error of the motor beyond noise"
     return (
         f"Partly explained: the model lacks {names}; with {them}, {share} of the {what} is explained on data not "
-        f"used for the fit{rest}."
+        f"used for the fit{remainder}."
     )
 
 
 def _not_tested(summary: JsonObject) -> str:
     """What the proof could not test, and what to record."""
-    gap = summary["gap"]
-    names, units = [one["effect"] for one in summary["findings"]], gap["units"]
-    found = f"by the log the model lacks {_listed(names)}" if names else "the log shows nothing that the model lacks"
+    gap, names = summary["gap"], _names(summary)
+    units = gap["units"]
+    lead = f"by the log the model lacks {names}" if names else "the log shows nothing that the model lacks"
     effects = {name: torque for name, torque in gap["test"]["untested"].items() if torque}
     torques = [
         f"{name} is {rms_text(torque['torque'])} {units['torque_motor']} rms there, {rms_text(torque['on_log'])} on the log"
         for name, torque in effects.items()
     ]
-    found = f"Not tested: {found}; data not used for the fit cannot show it"
+    lead = f"Not tested: {lead}; data not used for the fit cannot show it"
     # it acts there, but less than a complete model may leave
     if effects and all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
         more = "Hold out a motion in which it is a larger part of the torque, or one that is read with less noise"
-        return f"{found} (a model without it would pass, too; {'; '.join(torques)}). {more}."
+        return f"{lead} (a model without it would pass, too; {'; '.join(torques)}). {more}."
     why = "a model without it would pass, too" if torques else "even a complete model may leave as much as moves there"
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
         for name, reach in gap["range"].items()
     )
-    return f"{found} ({'; '.join([why, *torques])}). Hold out a log that reaches as far: {reached}."
+    return f"{lead} ({'; '.join([why, *torques])}). Hold out a log that reaches as far: {reached}."
 
 
 def _percent(share: float) -> str:
@@ -150,17 +167,23 @@ def _table_lines(summary: JsonObject) -> Lines:
     """What tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
-    found, gap = summary["torque_tables"], summary["gap"]
-    which = _listed(
-        [f"{side} torque over {_listed([_OVER[one['over']] for one in tables])}" for side, tables in found["tables"].items()]
-    )
-    errors = "; ".join(
-        f"{name} {rms_text(gap['holdout_rmse_after'][name])} -> {rms_text(value)} {gap['units'][name]}"
-        for name, value in found["holdout_rmse"].items()
+    added, gap = summary["torque_tables"], summary["gap"]
+    torques = [
+        f"{side} torque over {_listed([_OVER[table['over']] for table in tables])}"
+        for side, tables in added["tables"].items()
+    ]
+    errors = "; ".join(_changes(gap, gap["holdout_rmse_after"], added["holdout_rmse"]).values())
+    than = "" if added["holdout_z"] > 0.0 else ", which is no better"
+    return [f"Not named, but added to model.toml as a table: {_listed(torques)}. On held-out data it takes {errors}{than}."]
+
+
+def _changes(gap: JsonObject, before: Mapping[str, float | None], after: Mapping[str, float | None]) -> dict[str, str]:
+    """Say how the errors of positions and torques change, by channel."""
+    return {
+        name: f"{name} {rms_text(before[name])} -> {rms_text(value)} {gap['units'][name]}"
+        for name, value in after.items()
         if not name.startswith("velocity")
-    )
-    than = "" if found["holdout_z"] > 0.0 else ", which is no better"
-    return [f"Not named, but added to model.toml as a table: {which}. On held-out data it takes {errors}{than}."]
+    }
 
 
 def _share(value: float | None) -> str:
@@ -169,13 +192,18 @@ def _share(value: float | None) -> str:
     return "more than 99.9 %" if value > 0.999 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
 
 
+def _names(summary: JsonObject) -> str:
+    """Names of the effects that were found, as in a sentence."""
+    return _listed([finding["effect"] for finding in summary["findings"]])
+
+
 def _listed(words: Sequence[str]) -> str:
-    """As in a sentence: a, b and c."""
+    """Join words as in a sentence: a, b and c."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _reasons(summary: JsonObject) -> Lines:
-    """Why a model does not count as complete, one line each."""
+    """Say why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
         over = [
@@ -201,10 +229,9 @@ def _reasons(summary: JsonObject) -> Lines:
 
 
 def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:
-    """Of each channel the failed test that shows it best, its error and limit: a torque may fail at several bandwidths."""
-    slow = gap.get("slow_torques", {})
-    tested = {name: (slow[name]["after"], slow[name]["limit"]) for name in slow}
-    tested |= {name: (gap["holdout_rmse_after"][name], one["limit"]) for name, one in gap["expected"].items()}
+    """Return each channel's failed test that shows it best, its error and limit: a torque may fail at several bandwidths."""
+    tested = {name: (torque["after"], torque["limit"]) for name, torque in gap.get("slow_torques", {}).items()}
+    tested |= {name: (gap["holdout_rmse_after"][name], error["limit"]) for name, error in gap["expected"].items()}
 
     def excess(name: str) -> float:
         value, limit = tested[name]
@@ -217,10 +244,11 @@ def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:
     return [(name, *tested[name]) for name in best.values()]
 
 
-def _number(leaf: str, one: JsonObject) -> str:
-    unit = f" {one['unit']}" if one.get("unit") else ""
-    error = f" ± {one['standard_error']:.2g}" if one["standard_error"] else ""
-    return f"{leaf} = {one['value']:.5g}{error}{unit}"
+def _number(item: tuple[str, JsonObject]) -> str:
+    leaf, number = item
+    unit = f" {number['unit']}" if number.get("unit") else ""
+    error = f" ± {number['standard_error']:.2g}" if number["standard_error"] else ""
+    return f"{leaf} = {number['value']:.5g}{error}{unit}"
 
 
 def probability(value: float) -> str:
@@ -229,27 +257,19 @@ def probability(value: float) -> str:
 
 
 def _gap_lines(gap: JsonObject) -> Lines:
-    before, after, floor, units = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor", "units"))
-    if gap["holdout"]["separate"]:
-        place = f"On {Path(gap['holdout']['file']).name}"
-    else:
-        place = f"On the last part of the log ({gap['holdout']['from']:.4g} to {gap['holdout']['to']:.4g} s), held out"
-
-    def change(name: str, before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
-        return f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]}"
-
+    holdout, run = gap["holdout"], gap["free_run"]
+    place = f"On the last part of the log ({holdout['from']:.4g} to {holdout['to']:.4g} s), held out"
+    if holdout["separate"]:
+        place = f"On {Path(holdout['file']).name}"
     errors = [
-        f"{change(name, before, after)} ({rms_text(floor[name])}; {rms_text(gap['expected'][name]['limit'])})"
-        for name in before
-        if not name.startswith("velocity")
+        f"{change} ({rms_text(gap['noise_floor'][name])}; {rms_text(gap['expected'][name]['limit'])})"
+        for name, change in _changes(gap, gap["holdout_rmse_before"], gap["holdout_rmse_after"]).items()
     ]
-    window = gap["holdout"]["window"]
+    window = holdout["window"]
     how = "predicted one sample ahead" if window is None else f"over windows of {window:.2g} s"
     lines = [f"{place}, {how}, rms (noise; most that a complete model leaves): {', '.join(errors)}."]
-    run = gap["free_run"]
     if "after" in run:
-        changes = [change(name, run["before"], run["after"]) for name in run["after"] if not name.startswith("velocity")]
-        lines.append(f"In one free run: {'; '.join(changes)}.")
+        lines.append(f"In one free run: {'; '.join(_changes(gap, run['before'], run['after']).values())}.")
     elif run:
         lines.append(f"No free run is compared: {run['why_not']}.")
     return lines
@@ -261,51 +281,53 @@ def rms_text(value: float | None) -> str:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines = []
+    lines, where, gap = [], summary["where"], summary["gap"]
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
-        lines += [f"Residual of the model as given: {one['sentence']}." for one in summary["where"].values()]
-    observed = [text for name, one in summary["where"].items() if (text := _by_observer(name, one, summary["gap"]["units"]))]
+        lines += [f"Residual of the model as given: {side['sentence']}." for side in where.values()]
+    observed = "; ".join(filter(None, (_by_observer(name, side, gap["units"]) for name, side in where.items())))
     if observed:
-        lines.append(f"By the observers' equivalent control: {'; '.join(observed)}.")
-    left = {name: one for name, one in summary["rest"].items() if one["evidence"] is not None and one["evidence"] > 0.0}
-    for name, one in sorted(left.items(), key=lambda pair: -pair[1]["evidence"]):
+        lines.append(f"By the observers' equivalent control: {observed}.")
+    remaining = [(name, torque) for name, torque in summary["rest"].items() if (torque["evidence"] or 0.0) > 0.0]
+    for name, torque in sorted(remaining, key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
         lines.append(
-            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({100.0 * one['share']:.2g} % of the driving torque, "
-            f"evidence {one['evidence']:.3g} nats)."
+            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({100.0 * torque['share']:.2g} % of the driving torque, "
+            f"evidence {torque['evidence']:.3g} nats)."
         )
-    after = summary["gap"]["holdout_rmse_after"]
-    for name, control in summary["gap"]["controls"].items():
+    after = gap["holdout_rmse_after"]
+    for name, control in gap["controls"].items():
+        errors, z = control["rmse"], control["z"]
+        channel = max(gap["expected"], key=lambda name: _ratio(errors[name], after[name]))
+        outcome = "diverges"
+        if errors[channel] is not None:
+            outcome = (
+                f"leaves {rms_text(errors[channel])} {gap['units'][channel]} in {channel} in place of "
+                f"{rms_text(after[channel])}; it is {abs(z):.1f} standard errors {'worse' if z > 0.0 else 'better'}"
+            )
         effect = f" ({control['effect']})" if "effect" in control else ""
-        channel = max(summary["gap"]["expected"], key=lambda name: _worse(control["rmse"], after, name))
-        what = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}[name]
-        left = control["rmse"][channel]
-        error = "diverges"
-        if left is not None:
-            beaten = f"{abs(control['z']):.1f} standard errors {'worse' if control['z'] > 0.0 else 'better'}"
-            unit = summary["gap"]["units"][channel]
-            error = f"leaves {rms_text(left)} {unit} in {channel} in place of {rms_text(after[channel])}; it is {beaten}"
-        lines.append(f"Control: {what}{effect} {error}.")
+        lines.append(f"Control: {_CONTROLS[name]}{effect} {outcome}.")
     return [*lines, *summary["notes"]]
 
 
-def _worse(control: Mapping[str, float | None], after: Mapping[str, float | None], name: str) -> float:
-    """How much larger a control's error is; most where it diverges."""
-    one, other = control[name], after[name]
-    return np.inf if one is None or other is None else one / max(other, np.finfo(float).tiny)
+_CONTROLS = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}
+
+
+def _ratio(error: float | None, other: float | None) -> float:
+    """Say how many times an error is larger than another one; infinitely many where a model diverges."""
+    return np.inf if error is None or other is None else error / max(other, np.finfo(float).tiny)
 
 
 def _by_observer(side: str, where: JsonObject, units: Mapping[str, str]) -> str:
-    """The residual by a side's observer; empty where there is none or it does not converge."""
-    one = where.get("observed")
-    if not one or not one["converged"]:
+    """Say what a side's observer has of the residual; "" where there is none or it does not converge."""
+    observed = where.get("observed")
+    if not observed or not observed["converged"]:
         return ""
-    unit = units[f"torque_{side}"]
-    if one["rms"] < _BEYOND * one["noise"]:
-        return f"{side} side, no more than its noise ({rms_text(one['noise'])} {unit} rms)"
+    size, noise, unit = observed["rms"], rms_text(observed["noise"]), units[f"torque_{side}"]
+    if size < _BEYOND * observed["noise"]:
+        return f"{side} side, no more than its noise ({noise} {unit} rms)"
     return (
-        f"{side} side, {rms_text(one['rms'])} {unit} rms (its noise {rms_text(one['noise'])}), correlation "
-        f"{one['correlation']:.2f} with the smoother's"
+        f"{side} side, {rms_text(size)} {unit} rms (its noise {noise}), correlation {observed['correlation']:.2f} with the "
+        "smoother's"
     )
 
 
@@ -317,52 +339,60 @@ _FREE = {
 }  # fmt: skip
 
 
-def _finding_tables(summary: JsonObject) -> list[PageTable]:
+def _finding_table(summary: JsonObject) -> PageTable:
     rows: list[list[object]] = []
-    for one in summary["findings"]:
-        for leaf, number in one["parameters"].items():
-            error = number["standard_error"] or None
-            rows.append([one["effect"], probability(one["confidence"]), leaf, number["value"], error, number["unit"]])
-        for other in one["alternatives"]:
-            rows.append([f"or {other['effect']}", probability(other["confidence"]), "", "", "", ""])
-    if not rows:
-        return []
-    return [PageTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)]
+    for name, finding, is_found in _candidates(summary):
+        lead = [name, probability(finding["confidence"])]
+        if not is_found:
+            rows.append([*lead, "", "", "", ""])
+            continue
+        for leaf, number in finding["parameters"].items():
+            rows.append([*lead, leaf, number["value"], number["standard_error"] or None, number["unit"]])
+    return PageTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)
 
 
-def _history_tables(summary: JsonObject) -> list[PageTable]:
+def _candidates(summary: JsonObject) -> list[tuple[str, JsonObject, bool]]:
+    """Effects that were found, each followed by those that the log does not rule out instead: name, result, and which."""
+    candidates: list[tuple[str, JsonObject, bool]] = []
+    for finding in summary["findings"]:
+        candidates.append((finding["effect"], finding, True))
+        candidates += [(f"or {other['effect']}", other, False) for other in finding["alternatives"]]
+    return candidates
+
+
+def _history_table(summary: JsonObject) -> PageTable:
     """Every model that was tried, in order."""
-    rows: list[list[object]] = [
+    rows = [
         [number, step["tried"], step["nats"], step["standard_errors"], "kept" if step["kept"] else "dropped", step["why"]]
         for number, step in enumerate(summary["history"], 1)
     ]
-    if not rows:
-        return []
     head = ["step", "tried", "gain on the log (nats)", "by blocks of the log (standard errors)", "", "why"]
-    return [PageTable("How the name was found", head, rows)]
+    return PageTable("How the name was found", head, rows)
 
 
 def _gap_table(gap: JsonObject) -> PageTable:
-    controls = gap["controls"]
+    controls, units = gap["controls"], gap["units"]
     rows: list[list[Any]] = [
-        [_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
-        + [gap["expected"].get(name, {}).get("limit")]
-        + [one["rmse"].get(name) for one in controls.values()]
+        [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
+        + [error.get(name) for error in (_limits(gap), *(control["rmse"] for control in controls.values()))]
         for name, before in gap["holdout_rmse_before"].items()
     ]
-    for name, one in gap.get("slow_torques", {}).items():
+    for name, torque in gap.get("slow_torques", {}).items():
         channel, _, below = name.partition(" ")
-        row = [f"{_CHANNELS[channel]}, {below}", gap["units"][channel], one["before"], one["after"], one["noise"]]
-        rows.append([*row, one["limit"], *(None for _ in controls)])
+        numbers = (torque[key] for key in ("before", "after", "noise", "limit"))
+        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers, *(None for _ in controls)])
     head = ["channel", "unit", "before", "after", "noise", "complete model at most", *controls]
     return PageTable("Held-out data, rms", head, rows)
 
 
+def _limits(gap: JsonObject) -> dict[str, float | None]:
+    """The most that a complete model leaves of each channel."""
+    return {name: error["limit"] for name, error in gap["expected"].items()}
+
+
 def _number_table(summary: JsonObject) -> PageTable:
-    rows = [
-        [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
-        for path, one in summary["parameters"].items()
-    ]
+    keys = "nominal", "value", "standard_error", "unit"
+    rows = [[path, *(number[key] for key in keys)] for path, number in summary["parameters"].items()]
     return PageTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
 
 
@@ -380,18 +410,18 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
 def _tables(found: Diagnosis) -> Drawn:
     """Torques without a name, over position and speed, with their standard errors."""
     sides = found.summary["torque_tables"]["tables"]
-    each = [(side, one) for side, tables in sides.items() for one in tables]
-    figure, axes = subplots(11.0, 3.6, columns=len(each))
-    for ax, (side, one) in zip(axes, each, strict=True):
-        kind = "velocity" if one["over"] == "speed" else "position"
-        points, torques, errors = (np.array(one[key]) for key in ("points", "torques", "errors"))
+    panels = [(side, table) for side, tables in sides.items() for table in tables]
+    figure, axes = subplots(11.0, 3.6, columns=len(panels))
+    for ax, (side, table) in zip(axes, panels, strict=True):
+        kind = "velocity" if table["over"] == "speed" else "position"
+        points, torques, errors = (np.array(table[key]) for key in ("points", "torques", "errors"))
         ax.fill_between(points, torques - 2.0 * errors, torques + 2.0 * errors, color=FAINT, alpha=0.35, lw=0.0)
         ax.plot(points, torques, "o-", color=_AFTER, ms=4, lw=1.4)
-        ax.axhline(0.0, color=FAINT, lw=0.8)
+        draw_zero(ax)
         unit = found.record.unit_of(f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
         force = found.record.unit_of(f"{side}.torque", "N m")
         ax.set(
-            xlabel=with_unit(f"{side} {_OVER[one['over']]}", unit),
+            xlabel=with_unit(f"{side} {_OVER[table['over']]}", unit),
             ylabel=with_unit(f"{side}: resisting {missing_quantity(force)}", force),
         )
     caption = (
@@ -403,13 +433,11 @@ def _tables(found: Diagnosis) -> Drawn:
 
 def _verdict(summary: JsonObject) -> Drawn:
     """Each channel's error over its noise, before and after, with the controls; and the probability of each effect."""
-    gap = summary["gap"]
-    names = list(gap["holdout_rmse_before"])
-    bars = _bars(summary)
-    height = max(0.55 * len(names) + 1.9, 0.42 * len(bars) + 1.9)
+    gap, candidates = summary["gap"], _candidates(summary)
+    height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.9, 0.42 * len(candidates) + 1.9)
     figure, (left, right) = subplots(11.0, height, columns=2, width_ratios=[2.3, 1.0])
-    _gap_panel(left, gap, names)
-    _chances_panel(right, bars)
+    _gap_panel(left, gap)
+    _chances_panel(right, candidates)
     caption = (
         f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
         "as given to the model with the missing effects. Black line: noise; bars: the most that noise, the uncertainty of "
@@ -420,7 +448,8 @@ def _verdict(summary: JsonObject) -> Drawn:
     return Drawn("gap", figure, caption)
 
 
-def _gap_panel(ax: Axes, gap: JsonObject, names: list[str]) -> None:
+def _gap_panel(ax: Axes, gap: JsonObject) -> None:
+    names = list(gap["holdout_rmse_before"])
     floor = np.array([gap["noise_floor"][name] for name in names])
 
     def over(errors: Mapping[str, float | None]) -> np.ndarray:
@@ -434,18 +463,17 @@ def _gap_panel(ax: Axes, gap: JsonObject, names: list[str]) -> None:
             ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.2})
     ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
     ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
-    ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
-    limits = np.array([gap["expected"].get(name, {}).get("limit", np.nan) for name in names], float) / floor
-    ax.plot(limits, rows, "|", color=_FLOOR, ms=16, mew=2.0, ls="none", label="a complete model at most", zorder=3)
+    ax.axvline(1.0, color=BLACK, lw=1.6, label="noise")
+    limits = over(_limits(gap))
+    ax.plot(limits, rows, "|", color=BLACK, ms=16, mew=2.0, ls="none", label="a complete model at most", zorder=3)
     markers = {"wrong": ("x", "another effect"), "permuted": ("+", "shuffled in time")}
-    every = [before, after, limits]
+    points = [before, after, limits]
     for name, control in gap["controls"].items():
         marker, label = markers[name]
-        if "effect" in control:
-            label = f"{label} ({control['effect']})"
-        every.append(over(control["rmse"]))
-        ax.plot(every[-1], rows + 0.24, marker, color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}")
-    values = np.concatenate(every)
+        effect = f" ({control['effect']})" if "effect" in control else ""
+        points.append(over(control["rmse"]))
+        ax.plot(points[-1], rows + 0.24, marker, color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}{effect}")
+    values = np.concatenate(points)
     values = values[np.isfinite(values) & (values > 0.0)]
     ax.set(
         xscale="log",
@@ -462,28 +490,16 @@ def _gap_panel(ax: Axes, gap: JsonObject, names: list[str]) -> None:
     legend(ax, 3, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2)
 
 
-def _bars(summary: JsonObject) -> list[tuple[str, float, bool]]:
-    """Effects, their probabilities, and whether they are findings."""
-    bars: list[tuple[str, float, bool]] = []
-    for one in summary["findings"]:
-        bars.append((one["effect"], one["confidence"], True))
-        bars += [(f"or {other['effect']}", other["confidence"], False) for other in one["alternatives"]]
-    return bars
-
-
-def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
-    ax.set_xlim(0.0, 1.0)
-    ax.set_xlabel("confidence")
-    if not bars:
-        ax.set_yticks([])
-        ax.text(0.5, 0.5, "no effect named", transform=ax.transAxes, ha="center", va="center", color=FAINT)
+def _chances_panel(ax: Axes, candidates: list[tuple[str, JsonObject, bool]]) -> None:
+    ax.set(xlim=(0.0, 1.0), xlabel="confidence", yticks=[])
+    if not candidates:
+        write_inside(ax, "no effect named", va="center", color=FAINT)
         return
-    rows = np.arange(len(bars))
-    ax.barh(rows, [chance for _, chance, _ in bars], 0.3, color=[_AFTER if sure else MISSING for _, _, sure in bars])
-    for row, (name, chance, _) in zip(rows, bars, strict=True):
+    for row, (name, effect, is_found) in enumerate(candidates):
+        chance = effect["confidence"]
+        ax.barh(row, chance, 0.3, color=_AFTER if is_found else MISSING)
         ax.text(0.0, row - 0.22, f" {name}: {probability(chance)}", ha="left", va="bottom", fontsize=9)
-    ax.set_yticks([])
-    ax.set_ylim(max(len(bars), 3) - 0.4, -0.8)
+    ax.set_ylim(max(len(candidates), 3) - 0.4, -0.8)
     ax.grid(visible=False, axis="y")
 
 
@@ -497,12 +513,12 @@ def _over_time(found: Diagnosis) -> Drawn:
             plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=2.6, alpha=0.6, label="before")
             plot_torque(ax, after, bandwidth, color=_AFTER, lw=0.9, label="after")
             if held and not all(other for _, _, other in pieces):
-                ax.axvspan(before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0, label="held out")
-        ax.set_ylabel(with_unit(f"{side}:\nmissing {missing_quantity(unit)}", unit))
+                ax.axvspan(before.time[0], before.time[-1], color=ORANGE, alpha=0.18, lw=0.0, zorder=0, label="held out")
+        ax.set_ylabel(missing_label(f"{side}:\n", unit))
         legend(ax, 4)
-    which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
+    lead = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
-        f"{which}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
+        f"{lead}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
         "most clearly. A complete model stays within the grey band."
     )
     return Drawn("before_after", figure, caption)

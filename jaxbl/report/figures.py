@@ -85,6 +85,11 @@ def missing_quantity(unit: str) -> str:
     return "force" if unit == "N" else "torque"
 
 
+def missing_label(lead: str, unit: str) -> str:
+    """The label of what a model lacks of torques or forces."""
+    return with_unit(f"{lead}missing {missing_quantity(unit)}", unit)
+
+
 _LONGEST_NAME = 40
 """Characters of a name in a figure: a legend with more leaves no room for the axes."""
 
@@ -187,6 +192,11 @@ def colour_bar(figure: Figure, axes: Any, norm: Normalize, label: str = "", colo
 def draw_zero(ax: Axes, zorder: float = 2.0) -> None:
     """Draw a faint line at y = 0."""
     ax.axhline(0.0, color=FAINT, lw=0.8, zorder=zorder)
+
+
+def shade_gap(ax: Axes, half: float, label: str) -> None:
+    """Shade the gap of a transmission over its twist, behind all else; `half` of it lies on either side of 0."""
+    ax.axvspan(-half, half, color="#F3E3A1", alpha=0.6, lw=0.0, zorder=0, label=label)
 
 
 def write_inside(ax: Axes, text: str, **how: Any) -> None:

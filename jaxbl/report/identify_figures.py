@@ -31,6 +31,7 @@ from .figures import (
     limits,
     missing_quantity,
     outline,
+    shade_gap,
     stacked,
     style,
     subplots,
@@ -45,7 +46,7 @@ _CLOUD = 4000
 """Points of a cloud; of more than these, which would cover each other, the density is drawn."""
 _CYCLE_POINTS = 30_000
 """Points of a limit cycle that is drawn as a line; a longer one would fill its area, and its density is drawn."""
-_MODEL, _MEASURED, _GAP = BLACK, GREEN, "#F3E3A1"
+_MODEL, _MEASURED = BLACK, GREEN
 _GROWING, _FALLING = GREEN, PURPLE
 _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
 
@@ -242,8 +243,7 @@ def _shade_gap(ax: Axes, log: LogSignals) -> None:
     """The fitted gap, shaded, with its edges."""
     half = log.plant.half_gap
     if half:
-        label = f"fitted gap: half width {half:.4g} {log.unit['motor']}"
-        ax.axvspan(-half, half, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=label)
+        shade_gap(ax, half, f"fitted gap: half width {half:.4g} {log.unit['motor']}")
         for edge in (-half, half):
             ax.axvline(edge, color=ORANGE, lw=1.0, zorder=0.5)
 

@@ -123,7 +123,7 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points | None, dots:
     config = result.config
     metrics = {f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus", "margin_alpha")}
     metrics |= {figure.value, "finite"}
-    columns = [*_paths(config), *(name for name in result.columns if name in metrics)]
+    columns = [*config.axis_paths, *(name for name in result.columns if name in metrics)]
 
     def select(frame: DataFrame) -> DataFrame:
         if points is not None:
@@ -134,10 +134,6 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points | None, dots:
 
     needs = [*(figure.where or {}), *([] if dots is None else [dots.name]), *([] if points is None else columns)]
     return Rows(result, columns, select, needs)
-
-
-def _paths(config: Config) -> list[str]:
-    return [axis.path for axis in config.axes]
 
 
 def _dots(result: StudyResult, figure: FigureTable) -> Series | None:
@@ -271,7 +267,7 @@ def _map_panels(
 ) -> tuple[list[_Panel], Filling | None, set[str]]:
     """The panels of a map, of a refined study what fills its places, and the axes that varied."""
     assert spec.y is not None
-    keys, paths = [spec.y, spec.x], _paths(config)
+    keys, paths = [spec.y, spec.x], config.axis_paths
     group_paths = keys if spec.facet is None else [spec.facet, *keys]
     simulated = groups = Groups(rows, group_paths, paths)
     filling, filled, varied = None, rows, groups.varied
@@ -558,7 +554,7 @@ def least_lambdas(condition: Condition, alphas: Array, bound: float) -> Array:
 
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[Figure, str]:
     keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
-    groups = Groups(rows, keys, [axis.path for axis in config.axes])
+    groups = Groups(rows, keys, config.axis_paths)
     column = _drawn_column(spec.value)
     spread = groups.spread(column)
     table = groups.means({"middle": column}).assign(least=spread.least, largest=spread.largest)

@@ -6,11 +6,10 @@ import numpy as np
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.identify import Identification
 
-from .figures import BLACK, BLUE, FAINT, VERMILION, Drawn, legend, limits, style, subplots
+from .figures import BLACK, BLUE, FAINT, VERMILION, Drawn, legend, limits, shade_gap, style, subplots
 
 _CLOUD = 6000
 """Points of a cloud at most."""
-_GAP = "#F3E3A1"
 
 
 @style()
@@ -32,7 +31,7 @@ def _hysteresis(result: Identification | Diagnosis) -> Drawn:
     ax.plot(twist, law, ".", ms=2.0, mew=0.0, color=BLACK, label="model")
     half = result.summary["backlash"]["half_gap"]
     if half:
-        ax.axvspan(-half, half, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=f"gap: half width {half:.4g} {unit}")
+        shade_gap(ax, half, f"gap: half width {half:.4g} {unit}")
     ax.set(xlabel=f"twist θe − N₀ θs, the load's position by the model ({unit})", xlim=limits(twist))
     ax.set(ylabel=f"torque in the gear ({torque_unit})", ylim=limits(by_motor, law))
     legend(ax, 3, markerscale=4.0)

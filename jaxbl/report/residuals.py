@@ -23,7 +23,7 @@ from .figures import (
     decades,
     draw_zero,
     legend,
-    missing_quantity,
+    missing_label,
     outline,
     stacked,
     style,
@@ -86,7 +86,7 @@ def _over_time(
             for part in estimates:
                 plot_torque(ax, part.residual, bandwidth, noise=False, color=_MEAN, lw=0.5, label=label, zorder=4)
         draw_zero(ax, 1)
-        ax.set_ylabel(with_unit(f"{name}:\nmissing {missing_quantity(unit)}", unit))
+        ax.set_ylabel(missing_label(f"{name}:\n", unit))
         ax.set_title(f"{fill(sentence_of(located[name], unit), _WIDTH)}\n", loc="left", fontsize=9)
         legend(ax, 3)
     caption = (
@@ -125,7 +125,7 @@ def _over_coordinates(
         ax.set_xlabel(with_unit(f"{panel.name} {panel.symbol}".rstrip(), panel.unit))
         weight = "bold" if panel is best and panel.explained > 0.0 else "normal"
         ax.set_title(f"explains {100.0 * panel.explained:.0f} %\n", loc="left", fontsize=10, fontweight=weight)
-    axes[0].set_ylabel(with_unit(f"{located.name}: missing {missing_quantity(unit)}", unit))
+    axes[0].set_ylabel(missing_label(f"{located.name}: ", unit))
     limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
     axes[0].set_ylim(-limit, limit)
     legend(axes[-1], 2)

@@ -86,7 +86,7 @@ class _Survey:
 
     def __init__(self, result: StudyResult):
         config = result.config
-        paths = [axis.path for axis in config.axes]
+        paths = config.axis_paths
         metrics = [f"{side}.{name}" for side in SIDES for name in ("converged", "velocity_rmse", "margin_alpha")]
         metrics = [name for name in metrics if name in result.columns]
         self.sides = [side for side in SIDES if f"{side}.converged" in metrics]

@@ -397,7 +397,7 @@ def _mark_table(marks: list[JsonObject]) -> PageTable:
 
 def _counterexample_table(verdict: Verdict) -> PageTable:
     wrong = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
-    paths = [axis.path for axis in verdict.config.axes if axis.path in wrong]
+    paths = [path for path in verdict.config.axis_paths if path in wrong]
     keys = ["level", "side", "condition", "cause"]
     parts = sorted(wrong.groupby(keys, sort=False), key=lambda pair: -len(pair[1]))
     rows = [[*key, len(part), *(to_jsonable(part[path].iloc[0]) for path in paths)] for key, part in parts]

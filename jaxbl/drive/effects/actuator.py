@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ..parameters import Scalar, parameter
-from .base import EFFECTS, ActuatorEffect, shape, size
+from .base import EFFECTS, ActuatorEffect, multiples, shape, size
 
 _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
 """Trial values of a torque limit, over the largest commanded torque."""
@@ -22,9 +22,7 @@ class Delay(ActuatorEffect):
     kind = "delay"
     state_from_input = True
     rank = 0
-    delay: Scalar = shape(
-        "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0
-    )
+    delay: Scalar = shape("s", "dead time T", multiples("period", _DELAYS), neutral=1e-30, minimum=0.0)
 
     def init(self):
         return (jnp.zeros_like(self.delay),) * DELAY_SAMPLES
@@ -73,9 +71,7 @@ class Saturation(ActuatorEffect):
 
     kind = "saturation"
     rank = 2
-    limit: Scalar = shape(
-        "N m", "largest torque", lambda log: [share * log.torque for share in _LIMITS], neutral=1e30, above=0.0
-    )
+    limit: Scalar = shape("N m", "largest torque", multiples("torque", _LIMITS), neutral=1e30, above=0.0)
 
     def actuate(self, state, torque, step):
         return state, jnp.clip(torque, -self.limit, self.limit)
@@ -88,9 +84,7 @@ class Lag(ActuatorEffect):
     kind = "lag"
     state_from_measurement = True
     rank = 3
-    time_constant: Scalar = shape(
-        "s", "time constant T", lambda log: [samples * log.period for samples in _LAGS], neutral=1e-30, above=0.0
-    )
+    time_constant: Scalar = shape("s", "time constant T", multiples("period", _LAGS), neutral=1e-30, above=0.0)
 
     def init(self):
         return (jnp.zeros_like(self.time_constant),)

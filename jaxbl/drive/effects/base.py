@@ -75,6 +75,11 @@ class Scales(NamedTuple):
     frequencies: tuple[float, ...] = ()
 
 
+def multiples(scale: str, factors: Sequence[float]) -> Callable[[Scales], list[float]]:
+    """Return a function that gives trial values: multiples of one of the :class:`Scales` of a log."""
+    return lambda log: [factor * getattr(log, scale) for factor in factors]
+
+
 class Role(NamedTuple):
     """The part that a number plays in its effect.
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from ..parameters import Scalar
-from .base import EFFECTS, SideEffect, held, shape, size
+from .base import EFFECTS, SideEffect, held, multiples, shape, size
 
 
 @EFFECTS.add
@@ -35,7 +35,7 @@ class StribeckFriction(SideEffect):
         "rad/s",
         "speed v_s over which friction falls",
         # from a fall that shows only where motion starts to one that shows in all of the motion
-        lambda log: [share * log.speed for share in (0.05, 0.1, 0.2, 0.3, 0.45, 0.7, 1.0)],
+        multiples("speed", (0.05, 0.1, 0.2, 0.3, 0.45, 0.7, 1.0)),
         above=0.0,
     )
 
@@ -79,7 +79,7 @@ class PreslidingFriction(SideEffect):
     length: Scalar = shape(
         "rad",
         "pre-sliding length l = F_c over the stiffness of the contacts",
-        lambda log: [share * log.spread for share in _LENGTHS],
+        multiples("spread", _LENGTHS),
         above=0.0,
     )
     # these numbers show only where a drive comes to rest or starts to move
@@ -134,7 +134,7 @@ class DriftingFriction(SideEffect):
         "s",
         "time constant tau of the change",
         # from a change at the beginning of the log to one that is nearly linear in time
-        lambda log: [share * log.duration for share in (0.1, 0.3, 1.0)],
+        multiples("duration", (0.1, 0.3, 1.0)),
         above=0.0,
     )
 

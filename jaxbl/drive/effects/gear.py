@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ..parameters import Scalar
-from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, shape, size
+from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, multiples, shape, size
 
 _GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
 """Trial values of the half gap, over the largest twist: a larger gap leaves no contact, a smaller one hardly any play."""
@@ -24,7 +24,7 @@ class Backlash(TransmissionEffect):
     half_gap: Scalar = shape(
         "rad",
         "half of the free play, on the motor side",
-        lambda log: [share * log.largest_twist for share in _GAPS],
+        multiples("largest_twist", _GAPS),
         neutral=0.0,
         minimum=0.0,
     )
@@ -74,7 +74,7 @@ class Hysteresis(TransmissionEffect):
     length: Scalar = shape(
         "rad",
         "deflection over which it builds up",
-        lambda log: [share * log.largest_twist for share in (0.03, 0.08, 0.2, 0.4, 0.8)],
+        multiples("largest_twist", (0.03, 0.08, 0.2, 0.4, 0.8)),
         above=0.0,
     )
 

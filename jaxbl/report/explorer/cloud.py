@@ -23,8 +23,7 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str,
     """
     config, rows = result.config, 0
     words = {axis.path: list(axis.values or ()) for axis in config.axes if has_words(axis)}
-    axes = [axis.path for axis in config.axes]
-    types = dict.fromkeys([*axes, "seed"], np.float64) | dict.fromkeys(metrics, np.float32)
+    types = dict.fromkeys([*config.axis_paths, "seed"], np.float64) | dict.fromkeys(metrics, np.float32)
     with points_writer(out, types) as write:
         for frame in result.batches():
             places = {path: frame[path].map(values.index) for path, values in words.items()}

@@ -103,7 +103,7 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
         InputError: other values than those, or such as the study may not have.
     """
     values, seed = (asked.get(name) if isinstance(asked, dict) else None for name in ("values", "seed"))
-    paths = {axis.path for axis in config.axes}
+    paths = {*config.axis_paths}
     if not isinstance(values, dict) or set(values) != paths:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
     if not isinstance(seed, int) or not 0 <= seed < 2**31:
@@ -149,7 +149,7 @@ def nearby(config: Config, asked: Any) -> JsonObject:
 
 def _about(config: Config, columns: list[str]) -> JsonObject:
     """The page's account of a study and its columns."""
-    axes, experiment = {"seed", *(axis.path for axis in config.axes)}, config.build()
+    axes, experiment = {"seed", *config.axis_paths}, config.build()
     names = [name for name in columns if name not in axes]
     return {
         "title": config.title or "Study",
