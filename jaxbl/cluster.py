@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from threading import Lock
@@ -121,8 +122,7 @@ class Cluster:
         # a name of its own for each call: an earlier one may have been given up; Dask takes equal priorities in their order
         token = f"jaxbl-{socket.gethostname()}-{os.getpid()}-{time.time_ns()}"
         keys = [f"{token}-{index:07d}" for index in range(len(jobs))]
-        call = _Call(function, version("jaxbl"))
-        return self._client.map(call, jobs, key=keys, pure=False, batch_size=1000)
+        return self._client.map(partial(_call, function, version("jaxbl")), jobs, key=keys, pure=False, batch_size=1000)
 
     def _result(self, future: Any) -> Any:
         from distributed import KilledWorker
@@ -146,22 +146,16 @@ class Cluster:
 _LOST = "the connection to the scheduler is lost; what is finished is kept, and the same command goes on from there"
 
 
-class _Call:
-    """A function for a worker, which has to have the version of jaxbl that asks."""
+def _call(function: Callable[[Job], Result], asking: str, job: Job) -> Result:
+    """Call a function on a worker, which has to have the version of jaxbl that is `asking`."""
+    here = version("jaxbl")
+    if here != asking:
+        raise InputError(f"--scheduler: worker {socket.gethostname()} has jaxbl {here}; install {asking} there")
+    from distributed import get_worker
 
-    def __init__(self, function: Callable[[Any], Any], asking: str):
-        self.function, self.asking = function, asking
-        self.__name__ = getattr(function, "__name__", "job")
-
-    def __call__(self, job: Any) -> Any:
-        here = version("jaxbl")
-        if here != self.asking:
-            raise InputError(f"--scheduler: worker {socket.gethostname()} has jaxbl {here}; install {self.asking} there")
-        from distributed import get_worker
-
-        with _ONE_AT_A_TIME:
-            start_jax(get_worker().state.nthreads)
-            return self.function(job)
+    with _ONE_AT_A_TIME:
+        start_jax(get_worker().state.nthreads)
+        return function(job)
 
 
 @contextmanager

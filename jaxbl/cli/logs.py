@@ -132,7 +132,7 @@ def identify(
         summary = run_or_read(
             task,
             folder / "identification.json",
-            partial(run_identification, progress=progress),
+            lambda task: run_identification(task, progress),
             lambda result, folder: write_identification_report(result, folder, propose(result.summary)),
             overwrite=overwrite,
         )
@@ -207,7 +207,7 @@ def diagnose(
         summary = run_or_read(
             task,
             folder / "diagnosis.json",
-            partial(run_diagnosis, progress=progress),
+            lambda task: run_diagnosis(task, progress),
             lambda result, folder: write_diagnosis_report(result, folder, propose(result.summary)),
             overwrite=overwrite,
         )
@@ -273,15 +273,16 @@ def watch(
 
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
+    steps = []
     if folder is None:
         result = _watch_and_print(context, task, None)
-        code = ALARM if result.summary["alarm"] else 0
-        return Outcome(watch_lines(result.summary), summary=result.summary, code=code, compact=True)
-    with remove_if_empty_on_error(folder), lock_folder(folder):
-        _claim_watch(folder, task, overwrite)
-        result = _watch_and_print(context, task, folder)
-        steps = after_watch(task, result.summary, model)
-        lines = write_watch_report(result, folder, steps)
+        lines = watch_lines(result.summary)
+    else:
+        with remove_if_empty_on_error(folder), lock_folder(folder):
+            _claim_watch(folder, task, overwrite)
+            result = _watch_and_print(context, task, folder)
+            steps = after_watch(task, result.summary, model)
+            lines = write_watch_report(result, folder, steps)
     code = ALARM if result.summary["alarm"] else 0
     return Outcome(lines, folder, summary=result.summary, code=code, steps=steps, compact=True)
 
@@ -305,7 +306,7 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
     from jaxbl.monitoring.watch import format_values, run_watch
     from jaxbl.report.watch import values_file
 
-    quiet, as_json = is_quiet(context), bool(context.params.get("json"))
+    quiet, as_json = is_quiet(context), context.params.get("json")
 
     def remark(text: str) -> None:
         if not quiet:

@@ -107,39 +107,25 @@ class Config(Table):
                 f"{table.file}: ends after {table.length:g} s, and the run only after {run.duration:g} s; "
                 f"run.duration should be at most {table.length:g}"
             )
-        rigid = self.drive.kind == "rigid"
+        names = "drive", "initial", "excitation", "encoders", "observer", "equivalent_control", "run"
         return Experiment(
-            drive=self.drive.build(),
+            **{name: getattr(self, name).build() for name in names},
             transmission=None if self.transmission is None else self.transmission.build(),
             effects=tuple(effect.build() for effect in self.effects),
-            initial=self.initial.build(),
-            excitation=self.excitation.build(),
-            encoders=self.encoders.build(),
-            observer=self.observer.build(),
-            equivalent_control=self.equivalent_control.build(),
-            identifier=None if rigid else self.identifier.build(),
-            run=self.run.build(),
+            identifier=None if self.drive.kind == "rigid" else self.identifier.build(),
         )
 
     def nominal_drive(self) -> NominalDrive:
         """Return the nominal numbers that a log of the drive is checked against."""
-        drive, law = self.drive, None if self.transmission is None else self.transmission.build()
+        # those of the drive have the same names
+        numbers = self.drive.model_dump(exclude={"kind"})
+        law = None if self.transmission is None else self.transmission.build()
         effects = [effect.build() for effect in self.effects]
         # what remembers its input acts late
         acts_late = any(effect.place == "actuator" and jax.tree.leaves(effect.init()) for effect in effects)
-        dead_time = "modelled" if acts_late else "no"
-        if law is None or drive.kind != "two_inertia":
-            return NominalDrive(drive.motor_inertia, drive.motor_viscous, dead_time=dead_time)
-        return NominalDrive(
-            dead_time=dead_time,
-            motor_inertia=drive.motor_inertia,
-            motor_viscous=drive.motor_viscous,
-            load_inertia=drive.load_inertia,
-            load_viscous=drive.load_viscous,
-            gear_ratio=drive.gear_ratio,
-            stiffness=float(getattr(law, "stiffness", None) or math.inf),
-            half_gap=float(law.half_gap),
-        )
+        if law is not None:
+            numbers |= {"stiffness": float(getattr(law, "stiffness", None) or math.inf), "half_gap": float(law.half_gap)}
+        return NominalDrive(**numbers, dead_time="modelled" if acts_late else "no")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain data with defaults filled in."""

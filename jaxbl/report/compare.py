@@ -20,7 +20,7 @@ from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
 from .figures import COLOURS, MISSING, Axes, Drawn, Figure, Patch, colour_bar, legend_below, style, subplots, with_unit
-from .maps import axis_label, hatch_failures, is_log, set_up_map
+from .maps import axis_label, color_norm, hatch_failures, is_log, set_up_map
 from .page import save_all
 
 _FIGURE = "comparison"
@@ -256,9 +256,7 @@ def _line(ax: Axes, config: Config, frame: pd.DataFrame, path: str) -> None:
     ax.set(xlabel=axis_label(config, path))
     if _is_drawn_log(config, path, x):
         ax.set_xscale("log")
-    drawn = medians.to_numpy(float)
-    drawn = drawn[np.isfinite(drawn)]
-    if len(drawn) and drawn.min() > 0.0 and drawn.max() / drawn.min() > 30.0:
+    if isinstance(color_norm(medians.to_numpy(float), "auto"), LogNorm):
         ax.set_yscale("log")
 
 

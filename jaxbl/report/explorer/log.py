@@ -18,7 +18,6 @@ from jaxbl.report.diagnose import diagnosis_lines
 from jaxbl.report.element import element_lines
 from jaxbl.report.figures import missing_quantity
 from jaxbl.report.identify import identification_lines
-from jaxbl.units import on_a_line
 
 from .folder import Source, colours_of, points_writer, write_page
 
@@ -107,7 +106,7 @@ def _units(summary: JsonObject) -> dict[str, str]:
 
 
 def _force(unit: str) -> str:
-    return on_a_line("N m") if unit == "m" else "N m"
+    return "N" if unit == "m" else "N m"
 
 
 def _turns(trace: DataFrame, units: Mapping[str, str]) -> dict[str, np.ndarray]:
