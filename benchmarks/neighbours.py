@@ -41,7 +41,7 @@ def draw_machine(rng: np.random.Generator, period: float, **special: float) -> M
     """A direct drive with viscous and dry friction, and its exact numbers as a model without the latter."""
     inertia = _between(rng, 3e-5, 3e-2)
     friction = inertia * _between(rng, 20.0, 200.0)
-    axis = Axis(inertia, 0.02 * friction, friction, length=1e-4, **{key: value * friction for key, value in special.items()})
+    axis = Axis(inertia, 0.02 * friction, friction, length=1e-5, **{key: value * friction for key, value in special.items()})
     bandwidth = _between(rng, 15.0, 60.0)
     gain, step = inertia * bandwidth, 2.0 * math.pi / 2 ** int(rng.choice([14, 16, 18]))
     most = 4.0 * friction + axis.gravity + axis.amplitude + 20.0 * gain
@@ -91,7 +91,7 @@ def try_contradiction(rng: np.random.Generator, folder: Path) -> tuple[bool, str
 
     period = 2e-3
     machine = draw_machine(rng, period, gravity=_between(rng, 0.5, 3.0))
-    machine.model["effects"] = [{"kind": "load.gravity", "torque": machine.axis.gravity, "angle": 0.0}]
+    machine.model["effects"] = [{"kind": "load.gravity", "torque": machine.axis.gravity, "phase": 0.0}]
     speeds = rng.uniform(0.5, 6.0, 4)
     logs = [
         write_log(machine, wave(float(speed), 8.0, float(rng.uniform(0.15, 0.6)), period), folder / f"log{i}.csv", i)
