@@ -11,7 +11,7 @@ import numpy as np
 from jaxbl.config import Config
 from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.json_types import JsonObject
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
@@ -43,7 +43,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.statistics.channels[POSITION_CHANNELS[side]].unit
+        unit = record.unit_of(f"{side}.position", "rad")
         position[side] = {"rms": after, "nominal_rms": before, "noise": noise[side], "unit": unit}
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
@@ -80,7 +80,7 @@ def _derived(experiment: Experiment, found: Found) -> JsonObject:
 
 def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, JsonObject]:
     """Values with standard errors and 95 % intervals, by path."""
-    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
+    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(width.covariance))
     return {
         parameter.path: {
             "value": float(parameter.value(theta[i])),
@@ -136,7 +136,7 @@ def by_trajectories(found: Found, record: Record) -> JsonObject:
 def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> JsonObject:
     """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
     noise = {side: float(one) for side, one in found.windows.noise.items()}
-    record, width = task.record, np.asarray(found.spread.covariance)
+    record, width = task.record, found.spread.covariance
     deviation = np.sqrt(np.diag(width))
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
@@ -150,7 +150,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         side: {
             "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
             "noise": noise[side],
-            "unit": record.statistics.channels[POSITION_CHANNELS[side]].unit,
+            "unit": record.unit_of(f"{side}.position", "rad"),
         }
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }

@@ -47,9 +47,8 @@ class Spread(NamedTuple):
 
     def with_error(self, *changes: np.ndarray) -> "Spread":
         """Count changes of theta, each of shape (parameters,), as further errors."""
-        covariance = np.asarray(self.covariance)
-        wide = covariance + sum(np.outer(change, change) for change in changes)
-        more = np.sqrt(np.diag(wide) / np.diag(covariance))
+        wide = self.covariance + sum(np.outer(change, change) for change in changes)
+        more = np.sqrt(np.diag(wide) / np.diag(self.covariance))
         return self._replace(covariance=wide, inflation=self.inflation * more)
 
 
@@ -129,10 +128,9 @@ def refusals(free: Sequence[FreeParameter], found: Spread) -> tuple[list[Refusal
 
     Directions are eigenvectors of the covariance, components below a tenth of the largest left out.
     """
-    information = np.asarray(found.information)
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = np.linalg.eigh(found.information)
     condition = float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
-    inflation = float(np.max(np.nan_to_num(np.asarray(found.inflation), nan=1.0)))
+    inflation = float(np.max(np.nan_to_num(found.inflation, nan=1.0)))
     refused = []
     for value, vector in zip(values, vectors.T, strict=True):
         deviation = max(inflation, 1.0) / np.sqrt(value) if value > 0.0 else float("inf")
@@ -167,10 +165,10 @@ def profile(
     :func:`spread`.
     """
     count, limit = len(free), float(chdtri(1.0, 0.05))
-    centre, covariance = np.asarray(best.theta), np.asarray(width.covariance)
+    centre, covariance = np.asarray(best.theta), width.covariance
     deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
-    worth = float(width.variance) * np.asarray(width.inflation) ** 2
+    worth = float(width.variance) * width.inflation**2
 
     which = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)

@@ -19,6 +19,7 @@ from jaxbl.drive.excitation import Sine
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
+from jaxbl.records.signal_quality import segments_before
 from jaxbl.records.table import TorqueTable
 from jaxbl.simulate import Experiment
 
@@ -213,7 +214,7 @@ def _from_zero_of(first: Record, record: Record, config: Config, share: float) -
         assert one.torque is not None
         load = ratio * one.positions["load"] if two else None
         end = round(share * len(one.time)) if one is record else len(one.time)
-        segments = [slice(part.start, min(part.stop, end)) for part in one.segments if part.start < end]
+        segments = segments_before(one.segments, end)
         motions.append(TurningLog(one.torque, one.positions["motor"], load, segments, one.sample_period))
     found = find_zero_shift(*motions)
     if found is None:

@@ -71,24 +71,19 @@ class Windows(eqx.Module):
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
-        return self._of(jax.tree.map(lambda x: np.asarray(x)[which], self._columns))
+        columns, common = eqx.partition(self, _IN_COLUMNS)
+        return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[which], columns), common)
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
         """Windows of several parts of a record, with the noise and gain of the first."""
-        return parts[0]._of(jax.tree.map(lambda *x: np.concatenate(x), *(part._columns for part in parts)))
-
-    @property
-    def _columns(self) -> tuple[Any, ...]:
-        """What has a row a window."""
-        return self.torque, self.measured, self.time, self.start, self.rest, self.finer
-
-    def _of(self, columns: tuple[Any, ...]) -> "Windows":
-        torque, measured, time, start, rest, finer = columns
-        return Windows(torque, measured, time, start, self.noise, rest, finer, self.gain)
+        columns, common = zip(*(eqx.partition(part, _IN_COLUMNS) for part in parts), strict=True)
+        return eqx.combine(jax.tree.map(lambda *pieces: np.concatenate(pieces), *columns), common[0])
 
 
-_MAPPED = Windows(0, 0, 0, 0, None, 0, 0, None)  # type: ignore[arg-type]
+_IN_COLUMNS = Windows(True, True, True, True, False, True, True, False)  # type: ignore[arg-type]
+"""What has a row a window."""
+_MAPPED = jax.tree.map(lambda has_rows: 0 if has_rows else None, _IN_COLUMNS)
 
 
 class Fit(eqx.Module):
@@ -122,6 +117,16 @@ def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Flo
     simulated = plant_trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
     return jnp.stack(sides, axis=-1) - window.finer
+
+
+def _differentiate(function: Callable[[Array], Array], point: Array) -> tuple[Array, Array]:
+    """Derivative and value of a function, by one run of it."""
+
+    def twice(point: Array) -> tuple[Array, Array]:
+        value = function(point)
+        return value, value
+
+    return jax.jacfwd(twice, has_aux=True)(point)
 
 
 class _Eliminated(NamedTuple):
@@ -161,12 +166,11 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     )
     known, _ = ravel_pytree(PlantState(free.position, moving, effects))
 
-    def residual(start: Array) -> tuple[Array, Array]:
-        value = _residual(experiment, unravel(start), window).ravel()
-        return value, value
+    def residual(start: Array) -> Array:
+        return _residual(experiment, unravel(start), window).ravel()
 
     def attempt(i: Array, best: _Inner) -> _Inner:
-        slope, value = jax.jacfwd(residual, has_aux=True)(best.tried)
+        slope, value = _differentiate(residual, best.tried)
         slope = slope * known[None, :]
         cost = jnp.sum(value**2)
         better = (cost < best.cost) | ~jnp.isfinite(best.cost)
@@ -226,11 +230,10 @@ def _sloped(
     def one(window: Windows) -> tuple[Array, PlantState, Array]:
         found = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
 
-        def residual(theta: Array) -> tuple[Array, Array]:
-            value = _residual(set_free_parameters(experiment, free, theta), found.start, window)
-            return value, value
+        def residual(theta: Array) -> Array:
+            return _residual(set_free_parameters(experiment, free, theta), found.start, window)
 
-        slope, value = jax.jacfwd(residual, has_aux=True)(theta)
+        slope, value = _differentiate(residual, theta)
         return _without(found.basis, value), found.start, _without(found.basis, slope)
 
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
@@ -301,6 +304,11 @@ class _Solved(NamedTuple):
     whole: tuple[Array, PlantState, Array]
 
 
+def _zeros_of(function: Callable[..., _Point], *arguments: Any) -> _Point:
+    """Zeros in the shapes of a result."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
+
+
 def _converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
     """Whether neither theta nor the residuals changed by more than the tolerances, absolute and relative."""
     within = [jnp.abs(a - b) < _ATOL + _RTOL * jnp.abs(a) for a, b in zip(new, old, strict=True)]
@@ -321,8 +329,7 @@ def _solve(
     import optimistix as optx
 
     descent, region = optx.DampedNewtonDescent(linear_solver=lineax.QR()), optx.ClassicalTrustRegion()
-    shapes = jax.eval_shape(point, theta, guess)
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    none = _zeros_of(point, theta, guess)
 
     def going(carry: Any) -> Array:
         *_, steps, _, ended = carry
@@ -402,7 +409,7 @@ def fit(
         left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
         return theta, found.start, left, round + 1, converged, found.whole, on & (rounds <= 1), on
 
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(reduced, theta, windows.start).whole)
+    none = _zeros_of(reduced, theta, windows.start).whole
     no, yes = jnp.asarray(False), jnp.asarray(True)
     first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), no, none, no, yes
     # all that simulates stands in the program once: it takes long to compile

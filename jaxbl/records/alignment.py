@@ -10,9 +10,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .gearing import Gearing
-from .least_squares import fit_with_jackknife, rms, scale_columns
+from .least_squares import fit_with_jackknife, residual_mean_square, rms
 from .resampling import Grid
-from .signal_quality import find_bandwidth, interpolate_spline, long_segments, longest_segment, low_pass, trim_filter_ends
+from .signal_quality import (
+    find_bandwidth,
+    interpolate_spline,
+    long_segments,
+    longest_segment,
+    low_pass,
+    low_pass_motion,
+    trim_filter_ends,
+)
 
 _SURE_ERRORS = 6.0
 """Standard errors from which on an estimate is sure: errors from 12 blocks are themselves known to 20 %."""
@@ -195,14 +203,18 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     """Regress the twist, with theta_s shifted by a skew (s); None if the motion is too small."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
     width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, differentiate=True)
-    segments = long_segments(grid.segments)
+    segments, cutoff = long_segments(grid.segments), 4.0 * width
     if not width or not segments or "u" not in grid.values:
         return None
     parts = []
     for s in segments:
         moved = interpolate_spline(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
-        parts.append(_low_pass_motion(motor[s], moved, grid.values["u"][s], nominal, 4.0 * width, grid.period))
-    twist, torque, place, velocity, acceleration, motor_velocity, motor_acceleration = np.concatenate(parts).T
+        motor_motion, load_motion = (low_pass_motion(x, cutoff, grid.period) for x in (motor[s], moved))
+        torque = low_pass(grid.values["u"][s], cutoff, grid.period)
+        inner = trim_filter_ends(len(torque), cutoff, grid.period)
+        parts.append(np.stack([torque, *motor_motion, *load_motion], axis=1)[inner])
+    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts).T
+    twist = motor_place - nominal.gear_ratio * place
     shaft_torque = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
     target = twist - shaft_torque / nominal.stiffness
     constant = np.ones(len(target))
@@ -213,18 +225,18 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
         if is_clear.sum() < 0.25 * len(is_clear) or not 0.05 < share < 0.95:
             continue
         rows = np.column_stack([constant, np.sign(flank), velocity, acceleration])[is_clear]
-        mean_square = _residual_mean_square(target[is_clear], rows)
+        mean_square = residual_mean_square(target[is_clear], rows)
         if best is None or mean_square < best[0]:
             best = (mean_square, is_clear, rows)
     flanks = best is not None
     if best is None:
         rows = np.column_stack([constant, velocity, acceleration])
-        best = (_residual_mean_square(target, rows), constant > 0.0, rows)
+        best = (residual_mean_square(target, rows), constant > 0.0, rows)
     mean_square, is_clear, rows = best
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
     harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
     with_harmonics = np.column_stack([rows, *harmonics])
-    if _residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
+    if residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
         rows = with_harmonics
     values, errors = fit_with_jackknife(target[is_clear], rows)
     if not np.isfinite(values).all():
@@ -234,21 +246,3 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
     motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
     return _Regression(values, errors, *motion, flanks, twist_range)
-
-
-def _low_pass_motion(
-    motor: np.ndarray, load: np.ndarray, torque: np.ndarray, nominal: NominalDrive, cutoff: float, period: float
-) -> np.ndarray:
-    """Return low-passed twist, torque, load position, and velocity and acceleration of load and motor, (samples, 7)."""
-    smooth = low_pass(np.column_stack([motor, load, torque]), cutoff, period)
-    rates = np.gradient(smooth[:, :2], period, axis=0)
-    accelerations = np.gradient(rates, period, axis=0)
-    twist = smooth[:, 0] - nominal.gear_ratio * smooth[:, 1]
-    columns = [twist, smooth[:, 2], smooth[:, 1], rates[:, 1], accelerations[:, 1], rates[:, 0], accelerations[:, 0]]
-    return np.column_stack(columns)[trim_filter_ends(len(motor), cutoff, period)]
-
-
-def _residual_mean_square(target: np.ndarray, rows: np.ndarray) -> float:
-    """Return the mean square of the residuals of a least-squares fit."""
-    scaled = scale_columns(rows)
-    return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))

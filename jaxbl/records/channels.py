@@ -9,7 +9,7 @@ from jaxbl.validation import suggest_word
 
 from .files import LogFile
 from .libraries import ColumnName
-from .signal_quality import find_resolution
+from .signal_quality import find_resolution, find_runs
 from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
@@ -217,8 +217,7 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
     The value is 0, or the least or largest. Two samples on each side of a dropout lie on a line that is far from it.
     """
     for filler in (0.0, values.min(), values.max()):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], values == filler, [False]]).astype(int)))
-        starts, stops = edges[::2], edges[1::2]
+        starts, stops = find_runs(values == filler)
         is_inside = (stops - starts <= _MAX_DROPOUT) & (starts >= 2) & (stops <= len(values) - 2)
         starts, stops = starts[is_inside], stops[is_inside]
         beside = values[np.stack([starts - 2, starts - 1, stops, stops + 1])]

@@ -71,6 +71,15 @@ class Number(NamedTuple):
     interval: tuple[float, float]
     unit: str
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the number as result files hold it."""
+        return {
+            "value": self.value,
+            "standard_error": self.error,
+            "interval": list(self.interval),
+            "unit": self.unit,
+        }
+
 
 @dataclass(frozen=True)
 class Element:
@@ -103,22 +112,31 @@ class Element:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `inspection.json`."""
-        numbers = {
-            name: {
-                "value": number.value,
-                "standard_error": number.error,
-                "interval": list(number.interval),
-                "unit": number.unit,
-            }
-            for name, number in self.numbers.items()
-        }
         return {
-            "numbers": numbers,
+            "numbers": {name: number.to_dict() for name, number in self.numbers.items()},
             "open": list(self.open),
             "gains": self.gains,
             "residual": self.residual,
             "share": self.share,
         }
+
+
+class RigLog(NamedTuple):
+    """Log of a transmission.
+
+    Attributes:
+        position: displacement of one side against the other, rad (m), shape (samples,).
+        torque: through the transmission, N m (N), shape (samples,).
+        segments: contiguous parts.
+        period: of sampling, s.
+        noise: of the displacement, rad (m) rms.
+    """
+
+    position: np.ndarray
+    torque: np.ndarray
+    segments: Sequence[slice]
+    period: float
+    noise: float
 
 
 @dataclass(frozen=True)
@@ -185,20 +203,9 @@ class _Rig:
         return h
 
 
-def fit_element(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, *, noise: float, linear: bool
-) -> Element | None:
-    """Fit a transmission to its displacement and torque; None if the displacement never turns back, or hardly moves.
-
-    Args:
-        position: displacement of one side against the other, rad (m), shape (samples,).
-        torque: through the transmission, N m (N), shape (samples,).
-        segments: contiguous parts.
-        period: of sampling, s.
-        noise: of the displacement, rad (m) rms.
-        linear: True for a displacement in m.
-    """
-    rig = _prepare_rig(*_average_samples(position, torque, segments, period, noise))
+def fit_element(log: RigLog, *, linear: bool) -> Element | None:
+    """Fit a transmission to its displacement (`linear`: in m) and torque; None if it never turns back, or hardly moves."""
+    rig = _prepare_rig(_average_samples(log))
     if rig is None:
         return None
     # either way may end at a model that no single step improves
@@ -210,18 +217,17 @@ def fit_element(
     best = models[1] if _compute_gain(rig, *models) is not None else models[0]
     best = _drop_terms(rig, best)
     gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
-    full_rig = _prepare_rig(position, torque, segments, period, noise)
+    full_rig = _prepare_rig(log)
     return _make_element(rig, full_rig or rig, best, gains, linear)
 
 
-def _average_samples(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> tuple[np.ndarray, np.ndarray, list[slice], float, float]:
-    """Average neighbouring samples of a long log. Returns the arguments of :func:`_prepare_rig`."""
+def _average_samples(log: RigLog) -> RigLog:
+    """Average neighbouring samples of a long log."""
+    position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
-        return position, torque, list(segments), period, noise
+        return log
     parts, ends, mean_count = [], [], 0
     for s in segments:
         segment_means = (s.stop - s.start) // count
@@ -232,12 +238,11 @@ def _average_samples(
         ends.append(slice(mean_count, mean_count + segment_means))
         mean_count += segment_means
     means = np.concatenate(parts, axis=1)
-    return means[0], means[1], ends, count * period, noise / math.sqrt(count)
+    return RigLog(*means, ends, count * period, noise / math.sqrt(count))
 
 
-def _prepare_rig(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> _Rig | None:
+def _prepare_rig(log: RigLog) -> _Rig | None:
+    position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
     smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
     stretches: list[slice] = []
@@ -483,16 +488,14 @@ def _unit_of(name: str, linear: bool) -> str:
     return on_a_line(_UNITS[name]) if linear else _UNITS[name]
 
 
-def element_error(
-    element: Element, position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> tuple[float, float] | None:
+def element_error(element: Element, log: RigLog) -> tuple[float, float] | None:
     """Compute the rms torque error of a fitted transmission on another log, N m (N), and the same over the rms torque.
 
-    Other arguments are those of :func:`fit_element`; None if the log cannot be fitted.
+    None if the log cannot be fitted.
     """
-    rig = _prepare_rig(position, torque, segments, period, noise)
+    rig = _prepare_rig(log)
     if rig is None:
         return None
-    residual = torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
+    residual = rig.torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
     residual_rms = rms(residual)
-    return residual_rms, residual_rms / float(np.std(torque[rig.rows]))
+    return residual_rms, residual_rms / float(np.std(rig.torque[rig.rows]))

@@ -1,5 +1,7 @@
 """Least squares with standard errors that hold for correlated residuals."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 BLOCKS = 12
@@ -38,7 +40,17 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
     if np.linalg.cond(gram) > 1e13:
         return np.full(len(scale), np.nan), np.full(len(scale), np.nan)
     best = np.linalg.solve(gram, moment)
-    without = np.array([np.linalg.lstsq(gram - g, moment - m, rcond=1e-12)[0] for g, m in zip(grams, moments, strict=True)])
-    count = len(without)
-    error = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-    return best / scale, error / scale
+    without = [np.linalg.lstsq(gram - g, moment - m, rcond=1e-12)[0] for g, m in zip(grams, moments, strict=True)]
+    return best / scale, np.sqrt(jackknife_variance(without)) / scale
+
+
+def jackknife_variance(without: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the variance of estimates, each of them without one of the blocks of a log."""
+    deviations = np.array(without) - np.mean(without, axis=0)
+    return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
+
+
+def residual_mean_square(target: np.ndarray, regressors: np.ndarray) -> float:
+    """Return the mean square that a fit of regressors, shape (samples, terms), leaves."""
+    scaled = scale_columns(regressors)
+    return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))

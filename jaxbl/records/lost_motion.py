@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from .least_squares import BLOCKS, fit_with_jackknife, rms
+from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms
 from .signal_quality import MIN_SAMPLES
 
 Flank = Literal["motion", "load"]
@@ -258,10 +258,10 @@ def fit_lost_motion_by_load(
     ]
     variance = 0.0
     for without in (without_passes, without_places):
-        finite = np.array([w for w in without if math.isfinite(w)])
+        finite = [value for value in without if math.isfinite(value)]
         if len(finite) < max(3, len(without) - 1):
             return None
-        variance += (len(finite) - 1) / len(finite) * float(np.sum((finite - finite.mean()) ** 2))
+        variance += float(jackknife_variance(finite))
     size, error = abs(value), math.sqrt(variance)
     changes = np.flatnonzero(np.diff(state))
     if size < 8.0 * error or len(changes) > len(passes):

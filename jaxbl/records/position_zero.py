@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
+from .least_squares import BLOCKS, column_rms, fit_with_jackknife, jackknife_variance, rms
 from .rigid_body import MIN_SPEED_SHARE, smooth_sign
-from .signal_quality import long_segments, low_pass, trim_filter_ends
+from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 
 _MAX_HARMONIC = 40
 """Largest number of periods a turn: more than poles, slots and balls of small drives make."""
@@ -128,7 +128,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
         shifts[chosen] + step * (_parabola_minimum(sums[near]) - _SHIFTS_PER_PERIOD // 2)
         for sums in (total, *(total - block_squares for block_squares in squares))
     )
-    error = float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((np.array(without) - np.mean(without)) ** 2)))
+    error = float(np.sqrt(jackknife_variance(without)))
     if not abs(value) > _BETTER_ERRORS * error:
         return None
     return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
@@ -162,9 +162,8 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     """Select the rows of a log in motion; None if there are too few."""
     parts = []
     for s in long_segments(log.segments):
-        place = low_pass(log.motor[s], cutoff, log.period)
-        velocity = np.gradient(place, log.period)
-        columns = [np.gradient(velocity, log.period), velocity, smooth_sign(velocity)]
+        place, velocity, acceleration = low_pass_motion(log.motor[s], cutoff, log.period)
+        columns = [acceleration, velocity, smooth_sign(velocity)]
         if log.load is not None:
             twist = place - low_pass(log.load[s], cutoff, log.period)
             columns += [twist, np.gradient(twist, log.period)]

@@ -252,9 +252,7 @@ def _resample_and_align(
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
-        motor, load = grid.values["theta_e"], grid.values["theta_s"]
-        segments = grid.first(share).segments
-        return grid, fit_gearing(grid.time, motor, load, segments, period, expected=gear_ratio, turn=turn)
+        return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()
     lateness = None
@@ -345,10 +343,7 @@ def _find_torque_keys(
 
 def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
     """Find a drift between the clocks of both encoders; None if friction of the nominal `shaft` may cause it."""
-    motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    if gearing.is_loose:
-        return None
-    drift = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
+    drift = None if gearing.is_loose else fit_drift(grid, gearing.skew or 0.0)
     # as the machine warms up, friction and wind-up change, at most by the whole wind-up
     if drift is None or (
         shaft is not None

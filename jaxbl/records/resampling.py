@@ -8,7 +8,7 @@ import numpy as np
 
 from .channels import RawChannel
 from .files import LogFile
-from .signal_quality import MIN_SAMPLES, interpolate_spline
+from .signal_quality import MIN_SAMPLES, interpolate_spline, segments_before
 from .time_stamps import SegmentedStamps
 
 _MAX_OVERSAMPLING = 100
@@ -32,8 +32,7 @@ class Grid(NamedTuple):
 
     def first(self, share: float) -> "Grid":
         """Return the grid with the segments of a share of its samples, from the first on."""
-        end = round(share * len(self.time))
-        return self._replace(segments=[slice(s.start, min(s.stop, end)) for s in self.segments if s.start < end])
+        return self._replace(segments=segments_before(self.segments, round(share * len(self.time))))
 
 
 class Delay(NamedTuple):
