@@ -81,8 +81,7 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         names = list(file.columns)
         hint = "the file has no header" if all(isinstance(n, int) for n in names) else suggest_word("u", map(str, names))
         raise file.error(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
-    channel_tables = (table.t, table.u, table.theta_e, table.theta_s, table.omega_e, table.omega_s)
-    used_columns = {t.column for t in channel_tables if t is not None}
+    used_columns = {channel.column for channel in table.channels.values() if channel is not None}
     for column in file.columns:
         is_similar = isinstance(column, str) and column.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if is_similar and column not in used_columns:
@@ -120,17 +119,17 @@ def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -
     if isinstance(table, TorqueTable):
         unit_factor, factor = 1.0, 1.0 if table.factor is None else table.factor
     elif isinstance(table, SpeedTable):
-        unit_factor, factor = _SPEED_FACTORS[table.unit], table.factor
+        unit_factor, factor = SPEED_FACTORS[table.unit], table.factor
     else:
-        unit_factor, factor = _POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
+        unit_factor, factor = POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
     return table.sign * factor * unit_factor * values + (table.offset or 0.0)
 
 
-_POSITION_FACTORS = {
+POSITION_FACTORS = {
     "rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "counts": 2.0 * math.pi, "m": 1.0, "mm": 1e-3,
 }  # fmt: skip
 """Unit of a position -> rad (m); for counts, rad a turn."""
-_SPEED_FACTORS = {
+SPEED_FACTORS = {
     "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
 }  # fmt: skip
 """Unit of a speed -> rad/s (m/s)."""

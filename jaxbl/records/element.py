@@ -457,7 +457,8 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
             low = max(low, 0.0)
             if not error < _MAX_RELATIVE_ERROR * abs(value):
                 open_.append(name)
-        numbers[name] = Number(value, error, (low, high), _unit_of(name, linear))
+        unit = on_a_line(_UNITS[name]) if linear else _UNITS[name]
+        numbers[name] = Number(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_columns(model.terms, model.shapes, full_rig.rows) @ model.sizes
     spread = float(np.std(rig.torque[rig.rows]))
@@ -482,10 +483,6 @@ _UNITS = {
     "centre": "rad", "half_gap": "rad", "length": "rad", "friction_coefficient": "",
 }  # fmt: skip
 """Units of numbers on a rotary axis."""
-
-
-def _unit_of(name: str, linear: bool) -> str:
-    return on_a_line(_UNITS[name]) if linear else _UNITS[name]
 
 
 def element_error(element: Element, log: RigLog) -> tuple[float, float] | None:

@@ -13,7 +13,7 @@ from .element import SIZE_NAMES, Element, RigLog, fit_element
 from .gearing import Gearing, twist_noise
 from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
-from .signal_quality import low_pass
+from .signal_quality import low_pass, low_pass_motion
 from .table import POSITION_CHANNELS, LogTable
 
 _Answer = Literal["yes", "weak", "no"]
@@ -206,9 +206,7 @@ def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
-        position = record.positions[side][s]
-        smooth = low_pass(position, 4.0 * width, record.sample_period) if width else position
-        speed[s] = np.gradient(smooth, record.sample_period)
+        _, speed[s], _ = low_pass_motion(record.positions[side][s], 4.0 * width or math.inf, record.sample_period)
     return speed
 
 

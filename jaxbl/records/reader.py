@@ -397,12 +397,13 @@ def _correct_offset(
     offset = find_encoder_offset(grid.first(share), nominal)
     if offset is None:
         return
-    if integrals:
-        # an integral may begin at any position
-        name = integrals[0]
-        change = -offset.value if name == "theta_e" else offset.value / nominal.gear_ratio
+    # an integral may begin at any position
+    name = integrals[0] if integrals else "theta_e"
+    change = -offset.value if name == "theta_e" else offset.value / nominal.gear_ratio
+    if integrals or offset.is_sure:
         grid.values[name] = grid.values[name] + change
         channels[name] = channels[name]._replace(values=channels[name].values + change)
+    if integrals:
         file.notes.append(
             f"{name} is an integral: {change:.4g} {channels[name].unit} were added, so that it fits the other encoder."
         )
@@ -410,12 +411,10 @@ def _correct_offset(
     size = f"{offset.value:.4g} ± {offset.error:.1g} {channels['theta_e'].unit}"
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
     if offset.is_sure:
-        grid.values["theta_e"] = grid.values["theta_e"] - offset.value
-        file.corrections["offset"] = -offset.value
-        channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - offset.value)
+        file.corrections["offset"] = change
         file.warnings.append(
             f"{twist} is {size} without torque. This offset between the encoders was corrected. [log] theta_e.offset = "
-            f"{-offset.value:.4g} corrects the same; 0 corrects nothing."
+            f"{change:.4g} corrects the same; 0 corrects nothing."
         )
         return
     cause = (
@@ -425,7 +424,7 @@ def _correct_offset(
     )
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
-        f"[log] theta_e.offset = {-offset.value:.4g} corrects it as an offset; 0 corrects nothing."
+        f"[log] theta_e.offset = {change:.4g} corrects it as an offset; 0 corrects nothing."
     )
 
 

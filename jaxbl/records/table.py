@@ -267,11 +267,16 @@ class LogTable(StrictTable):
             raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
+    @property
+    def channels(self) -> dict[str, TimeTable | PositionTable | SpeedTable | TorqueTable | None]:
+        """Tables of time and channels; None if they are left out."""
+        names = ("t", "u", *POSITION_CHANNELS.values(), *SPEED_CHANNELS.values(), "transmitted")
+        return {name: getattr(self, name) for name in names}
+
     def list_columns(self) -> set[ColumnName]:
         """Return names and numbers of all columns that may be read."""
         columns: set[ColumnName] = {*(self.where or {})}
-        for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
-            channel = getattr(self, name)
+        for name, channel in self.channels.items():
             columns.add(name if channel is None else channel.column_or(name))
             if isinstance(channel, PositionTable) and channel.minus is not None:
                 columns.add(channel.minus)
