@@ -15,7 +15,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
-from .free_parameters import FreeParameter
+from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors, regress
@@ -64,7 +64,7 @@ def _derived(experiment: Experiment, found: Found) -> JsonObject:
         return {}
 
     def others(theta: jax.Array) -> JsonObject:
-        at = set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(found.free)})
+        at = set_free_parameters(experiment, found.free, theta)
         assert at.transmission is not None
         known = {path.rpartition(".")[2] for path in leaf_paths(at) if path.startswith("transmission.")}
         return {name: value for name, value in at.transmission.truth().items() if name not in known}

@@ -7,6 +7,7 @@ References: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Application
 (white jerk); G. J. Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,11 +94,24 @@ def _predicted(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     left = [[p[i][j] - gain[i] * p[0][j] for j in range(3)] for i in range(3)]
     u = [[left[i][j] - left[i][0] * gain[j] + gain[i] * gain[j] for j in range(3)] for i in range(3)]
     a, b, c = (x[i] + gain[i] * e for i in range(3))
-    # of a state [a, b, c] what a period makes of it, and so of each row and column
-    rows = [[u[0][j] + u[1][j] + 0.5 * u[2][j] for j in range(3)], [u[1][j] + u[2][j] for j in range(3)], u[2]]
-    moved = [[row[0] + row[1] + 0.5 * row[2], row[1] + row[2], row[2]] for row in rows]
+    moved = _transform(_advance, u)
     new = [moved[i][j] + smoothness * JERK_COVARIANCE[i][j] for i, j in _UPPER]
-    return [a + b + 0.5 * c, b + c, c, *new], [*carry, e, s]
+    return [*_advance(a, b, c), *new], [*carry, e, s]
+
+
+def _advance(a: Any, b: Any, c: Any) -> Leaves:
+    """What a period makes of a state."""
+    return [a + b + 0.5 * c, b + c, c]
+
+
+def _advance_transposed(a: Any, b: Any, c: Any) -> Leaves:
+    """The transposed transition."""
+    return [a, a + b, 0.5 * a + b + c]
+
+
+def _transform(function: Callable[[Any, Any, Any], Leaves], matrix: Any) -> list[Leaves]:
+    """Apply a function to each column, and to each row of what that makes."""
+    return [function(*row) for row in zip(*(function(*column) for column in zip(*matrix, strict=True)), strict=True)]
 
 
 def _innovation(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
@@ -127,15 +141,8 @@ def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     products = [[dot(p[i], large[j]) for j in range(3)] for i in range(3)]
     state = [x[i] - dot(p[i], small) for i in range(3)]
     covariance = [p[i][j] - dot(products[i], p[j]) for i, j in _UPPER]
-    # the transposed transition
-    rows = [
-        large[0],
-        [large[0][j] + large[1][j] for j in range(3)],
-        [0.5 * large[0][j] + large[1][j] + large[2][j] for j in range(3)],
-    ]
-    moved = [[row[0], row[0] + row[1], 0.5 * row[0] + row[1] + row[2]] for row in rows]
-    a, b, c = small
-    return [a, a + b, 0.5 * a + b + c, *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
+    moved = _transform(_advance_transposed, large)
+    return [*_advance_transposed(*small), *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
 
 
 def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> Arrays:

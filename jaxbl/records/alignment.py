@@ -54,17 +54,11 @@ class NominalDrive:
     half_gap: float = 0.0
     dead_time: Literal["no", "sought", "modelled"] = "no"
 
-    def inertia_at(self, channel: str) -> float:
-        """Return the torque on the motor that accelerates the drive, per acceleration of the encoder `channel`."""
-        return self._refer_to(channel, self.motor_inertia + self.load_inertia / self.gear_ratio**2)
-
-    def viscous_at(self, channel: str) -> float:
-        """Return the viscous torque of the drive on the motor, per speed of the encoder `channel`."""
-        return self._refer_to(channel, self.motor_viscous + self.load_viscous / self.gear_ratio**2)
-
-    def _refer_to(self, channel: str, at_motor: float) -> float:
-        # the torque acts at the motor
-        return at_motor if channel == "theta_e" else at_motor * self.gear_ratio
+    def refer_to(self, channel: str) -> tuple[float, float]:
+        """Return inertia and viscous friction: torque on the motor per acceleration, and speed, of the encoder `channel`."""
+        ratio = 1.0 if channel == "theta_e" else self.gear_ratio
+        inertia = self.motor_inertia + self.load_inertia / self.gear_ratio**2
+        return ratio * inertia, ratio * (self.motor_viscous + self.load_viscous / self.gear_ratio**2)
 
 
 @dataclass(frozen=True)

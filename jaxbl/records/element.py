@@ -173,19 +173,17 @@ class _Rig:
         x = self.position - shapes_by_name.get("centre", 0.0)
         b = shapes_by_name.get("half_gap", 0.0)
         deflection = x - np.clip(x, -b, b)
-        columns = [deflection[rows], np.ones(len(rows))]
-        for term in terms:
-            if term == "damping":
-                # no damping inside the gap; a part of it in a sample that crosses an end of the gap
-                contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
-                columns.append((self.rate * contact)[rows])
-            elif term == "dry friction":
-                columns.append(self.direction[rows])
-            elif term == "hysteresis":
-                columns.append(self._compute_hysteresis(deflection, shapes_by_name["length"])[rows])
-            elif term == "friction under load":
-                columns.append((np.abs(deflection) * self.direction)[rows])
-        return np.stack(columns, axis=1)
+        # no damping inside the gap; a part of it in a sample that crosses an end of the gap
+        contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
+        signals = {
+            "damping": self.rate * contact,
+            "dry friction": self.direction,
+            "friction under load": np.abs(deflection) * self.direction,
+        }
+        if "hysteresis" in terms:
+            signals["hysteresis"] = self._compute_hysteresis(deflection, shapes_by_name["length"])
+        columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
+        return np.stack([column[rows] for column in columns], axis=1)
 
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""

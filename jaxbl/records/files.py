@@ -127,11 +127,8 @@ class LogFile:
     def load_values(self, name: ColumnName) -> np.ndarray:
         """Load a column as it is in the file, shape (rows,); InputError if it is too long or cannot be read."""
         self.count_values(name)
-        try:
-            with _report_errors(f"column {name!r}"):
-                return np.asarray(self.columns[name])
-        except InputError as error:
-            raise self.error(str(error)) from None
+        with name_file_in_errors(self.path), _report_errors(f"column {name!r}"):
+            return np.asarray(self.columns[name])
 
     def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> np.ndarray:
         """Load a column of time stamps, s, shape (rows,); dates are counted from the first one.
@@ -203,9 +200,12 @@ def read_log_file(path: Path, selection: Collection[ColumnName] = ()) -> LogFile
     Raises:
         InputError: the file is missing, empty, or of no known kind.
     """
-    try:
+    with name_file_in_errors(path):
         check_file(path)
-        columns = _read_columns(path, selection)
+        try:
+            columns = _read_columns(path, selection)
+        except IsADirectoryError:
+            raise InputError("is a folder; a log file is needed") from None
         if not all(str(name).isprintable() for name in columns):
             printable_columns = {
                 escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
@@ -213,12 +213,18 @@ def read_log_file(path: Path, selection: Collection[ColumnName] = ()) -> LogFile
             columns.clear()
             columns.update(printable_columns)
         return LogFile(path, columns)
+
+
+@contextmanager
+def name_file_in_errors(path: Path | str, remedy: str = "check its permissions") -> Iterator[None]:
+    """Begin an InputError with the name of a file; make one of it that the file is missing or cannot be read."""
+    try:
+        yield
+        return
     except FileNotFoundError:
-        fault = explain_missing_file(path, log_suffixes())
-    except IsADirectoryError:
-        fault = "is a folder; a log file is needed"
+        fault = explain_missing_file(Path(path), log_suffixes())
     except OSError as error:
-        fault = f"cannot be read: {error.strerror or error}; check its permissions"
+        fault = f"cannot be read: {error.strerror or error}; {remedy}"
     except InputError as error:
         fault = str(error)
     raise InputError(f"{path}: {fault}")

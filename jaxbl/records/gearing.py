@@ -4,7 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .least_squares import fit_with_jackknife, residual_mean_square, rms, scale_columns
+from .least_squares import (
+    fit_with_jackknife,
+    fit_without_blocks,
+    residual_mean_square,
+    rms,
+    scale_columns,
+    sum_over_blocks,
+)
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .resampling import Grid
 from .rigid_body import smooth_sign
@@ -224,13 +231,10 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
 
 def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the mean square error on each block of a regression on all other blocks, shape (blocks,)."""
-    scaled, errors = scale_columns(rows), []
-    blocks = np.array_split(np.arange(len(target)), _FOLDS)
-    grams, moments = [scaled[b].T @ scaled[b] for b in blocks], [scaled[b].T @ target[b] for b in blocks]
-    for block, gram, moment in zip(blocks, grams, moments, strict=True):
-        values = np.linalg.lstsq(sum(grams) - gram, sum(moments) - moment, rcond=1e-12)[0]
-        errors.append(float(np.mean((target[block] - scaled[block] @ values) ** 2)))
-    return np.array(errors)
+    scaled = scale_columns(rows)
+    blocks, grams, moments = sum_over_blocks(target, scaled, _FOLDS)
+    fits = zip(blocks, fit_without_blocks(grams, moments), strict=True)
+    return np.array([np.mean((target[block] - scaled[block] @ values) ** 2) for block, values in fits])
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:

@@ -18,10 +18,10 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxbl.errors import InputError, shorten
-from jaxbl.validation import check_file, explain_missing_file
+from jaxbl.validation import check_file
 
 from .channels import to_si, to_signed
-from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, log_suffixes
+from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
@@ -333,15 +333,9 @@ class FollowedFile(_TextSource):
         super().__init__(str(path))
         self._path = path
         self._incomplete_line, self._lines = b"", list[str]()
-        try:
+        with name_file_in_errors(path, "name a text file"):
             check_file(path)
             self._file = path.open("rb")
-        except FileNotFoundError:
-            raise InputError(f"{path}: {explain_missing_file(path, log_suffixes())}") from None
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}; name a text file") from None
 
     def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
         end = time.monotonic() + seconds
@@ -360,10 +354,8 @@ class FollowedFile(_TextSource):
             # the header and a row: the decimal sign shows only in a row
             if len(rows) < 2:
                 return None
-            try:
+            with name_file_in_errors(self.name):
                 self._format = detect_text_format(rows)
-            except InputError as error:
-                raise InputError(f"{self.name}: {error}") from None
             self._header = rows[0] if self._format.names is not None else ""
         self._lines = []
         return self._format.names or range(self._format.count), self._parse_rows(self._format, rows)

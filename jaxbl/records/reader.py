@@ -178,7 +178,7 @@ def read_record(
     # these become evenly spaced samples
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
     grid, gearing, regular, lateness = _resample_and_align(
-        file, table, segmented, channels, gear_ratio, nominal, shaft, share
+        file, table, segmented, channels, encoders, gear_ratio, nominal, shaft, share
     )
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft, share)
@@ -233,6 +233,7 @@ def _resample_and_align(
     table: LogTable,
     segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
+    encoders: Sequence[str],
     gear_ratio: float | None,
     nominal: NominalDrive | None,
     shaft: NominalDrive | None,
@@ -249,7 +250,7 @@ def _resample_and_align(
 
     def resample() -> tuple[Grid, Gearing | None]:
         grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
-        if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
+        if table.kind == "element" or len(encoders) < 2:
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
         return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
@@ -257,7 +258,6 @@ def _resample_and_align(
     grid, gearing = resample()
     lateness = None
     if "u" in channels and table.kind == "drive":
-        encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
         keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
         if lateness is not None and keys is not None:

@@ -62,25 +62,22 @@ def find_resolution(values: np.ndarray) -> float:
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
-def power_spectrum(values: np.ndarray, period: float, *, differentiate: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def power_spectrum(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the one-sided power spectral density of evenly spaced values, by Welch's method.
 
     Args:
         values: shape (samples,).
         period: s.
-        differentiate: whether the density is that of the slope of the values.
 
     Returns:
-        Frequencies, Hz, without 0, and densities, unit²/Hz ((unit/s)²/Hz of the slope).
+        Frequencies, Hz, without 0, and densities, unit²/Hz.
     """
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
     length = min(max(len(differences) // 4, 16), 4096, len(differences))
     frequency, density = welch_spectrum(differences, length)
     frequency, density = frequency[1:], density[1:]
-    density = density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
-    frequency = frequency / period
-    return frequency, density * (2.0 * np.pi * frequency) ** 2 if differentiate else density
+    return frequency / period, density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
 
 
 def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
