@@ -85,13 +85,11 @@ def read_element_task(
     Raises:
         InputError: an unfit log.
     """
-    records = [None if path is None else read_record(path, table) for path in (log, holdout)]
-    assert records[0] is not None
-    if records[1] is not None:
-        check_positions(records[0], records[1])
-        check_positions(records[1], records[0])
-    ratio = None if len(records[0].positions) < 2 else gear_ratio or 1.0
-    return ElementTask(table, ratio, records[0], records[1])
+    record, other = read_record(log, table), None if holdout is None else read_record(holdout, table)
+    if other is not None:
+        check_positions(record, other)
+        check_positions(other, record)
+    return ElementTask(table, None if len(record.positions) < 2 else gear_ratio or 1.0, record, other)
 
 
 def identify_element(

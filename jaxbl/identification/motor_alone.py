@@ -24,7 +24,7 @@ from .log_columns import join_columns, motion_columns
 from .search import Found
 from .segments import Segment, reading_noise, segments_of
 from .trajectory import Windows
-from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, inverse, is_known, widths
+from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, half_gap_of, inverse, is_known, widths
 
 
 class Alone(NamedTuple):
@@ -55,10 +55,6 @@ class Alone(NamedTuple):
     def gap_path(self) -> str | None:
         """Path of the number that makes the gap, if it is sought."""
         return None if self.model.gap is None else self.model.free[self.model.gap].path
-
-    def half(self, value: float) -> float:
-        """Half gap in rad at a value of the number that makes it."""
-        return value * (4.0 if (self.gap_path or "").endswith("dead_zone") else 1.0)
 
 
 def search_alone(
@@ -226,13 +222,14 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
 
 def gap_summary(alone: Alone) -> JsonObject | None:
     """What the motor says of the gap, as `backlash` of `identification.json`; None where the model has none."""
-    if alone.gap is None:
-        return None
     gap, model = alone.gap, alone.model
+    if gap is None or model.gap is None:
+        return None
+    number = model.free[model.gap]
     return {
         "shown": not alone.why,
-        "path": alone.gap_path,
-        "nominal": alone.half(model.free[model.gap or 0].nominal),
+        "path": number.path,
+        "nominal": number.nominal * half_gap_of(number),
         "half_gap": None if alone.why else gap.half,
         "at_most": gap.at_most,
         "unmet": gap.unmet,

@@ -297,11 +297,9 @@ def _reduced(
 
 class _Solved(NamedTuple):
     theta: Array
-    start: PlantState
-    squares: Array
+    point: _Point
     steps: Array
     converged: Array
-    whole: tuple[Array, PlantState, Array]
 
 
 def _zeros_of(function: Callable[..., _Point], *arguments: Any) -> _Point:
@@ -355,7 +353,7 @@ def _solve(
     theta, best, _, _, steps, _, ended = jax.lax.while_loop(going, step, start)
     # where no step was asked for
     states = jax.tree.map(partial(jnp.where, steps == 0), guess, best.start)
-    return _Solved(theta, states, best.squares, steps, ended & jnp.isfinite(best.cost), best.whole)
+    return _Solved(theta, best._replace(start=states), steps, ended & jnp.isfinite(best.cost))
 
 
 def fit(
@@ -406,8 +404,8 @@ def fit(
         on = ~last & gained & (round < rounds)
         found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 1), count)
         theta = jnp.where((moving > 0.0) & on, found.theta, theta)
-        left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
-        return theta, found.start, left, round + 1, converged, found.whole, on & (rounds <= 1), on
+        left, converged = jnp.where(on, found.point.squares, left), jnp.where(on, found.converged, converged)
+        return theta, found.point.start, left, round + 1, converged, found.point.whole, on & (rounds <= 1), on
 
     none = _zeros_of(reduced, theta, windows.start).whole
     no, yes = jnp.asarray(False), jnp.asarray(True)

@@ -14,7 +14,7 @@ backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -79,6 +79,8 @@ _APART = 0.2
 """Prior standard deviation of the load's first speed about the motor's, over the motor's rms speed."""
 _STATES = 4
 """Numbers that a part of a log begins with: positions and velocities of both sides."""
+_ignore_divergence = partial(np.errstate, invalid="ignore", over="ignore")
+"""A model that diverges is given up by its errors."""
 GAPS = "half_gap", "dead_zone"
 """Ends of the paths of numbers that make a gap."""
 
@@ -105,7 +107,7 @@ class Point(NamedTuple):
     @property
     def variance(self) -> float:
         """Mean square of the prediction errors, rad^2."""
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
 
 
@@ -220,14 +222,14 @@ class UnseenLoad:
 
     def _errors(self, which: int, states: PlantState) -> np.ndarray:
         """What the readings of a segment differ from predictions, last axis (counted samples,)."""
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             errors = self.segments[which].readings["motor"] - np.asarray(states.position["motor"])
         return errors[..., self.skipped[which] :]
 
     def _point(self, theta: np.ndarray, start: np.ndarray, smoothness: float, errors: np.ndarray) -> Point:
         prior = np.sum((theta / self.width) ** 2) + np.sum((start - self._expected(start)) ** 2)
         # a model that diverges
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             deviance = self.count * np.log(np.mean(errors**2)) + prior
         return Point(theta, start, smoothness, errors, float(deviance) if np.isfinite(deviance) else np.inf)
 
@@ -283,7 +285,7 @@ class UnseenLoad:
         start, errors = [], []
         for i in range(len(self.segments)):
             each = self._errors(i, self._runs(theta, i, tries, smoothness))
-            with np.errstate(invalid="ignore", over="ignore"):
+            with _ignore_divergence():
                 squares = np.sum(each**2, axis=1)
             best = int(np.argmin(np.where(np.isfinite(squares), squares, np.inf)))
             start.append(tries[best])

@@ -111,7 +111,10 @@ def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Ske
     # friction makes the load lag, never lead
     friction_delay = _NOMINAL_FACTOR * max_delay if gearing.skew > 0.0 else 0.0
     is_sure = size > friction_delay + _SURE_ERRORS * gearing.skew_error and size > 0.05 * grid.period
-    value = _estimate_skew_without_windup(grid, nominal, gearing.skew) if is_sure else gearing.skew
+    value, regression = gearing.skew, _regress_twist(grid, nominal, gearing.skew) if is_sure else None
+    if regression is not None:
+        # without the wind-up by the shaft torque, from the motor's equation of motion
+        value += float(regression.values[2]) / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
     return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay, is_sure)
@@ -125,12 +128,6 @@ def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:
         work += float(grid.values["u"][s] @ velocity)
         square += float(velocity @ velocity)
     return abs(work) / square / nominal.stiffness if square else math.inf
-
-
-def _estimate_skew_without_windup(grid: Grid, nominal: NominalDrive, skew: float) -> float:
-    """Estimate the skew from the twist without the wind-up by the shaft torque (from the motor's equation of motion), s."""
-    regression = _regress_twist(grid, nominal, skew)
-    return skew if regression is None else skew + float(regression.values[2]) / nominal.gear_ratio
 
 
 def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:

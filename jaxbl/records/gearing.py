@@ -71,13 +71,11 @@ class Gearing(LostMotion):
         """Describe value, error and interval; for rad also in degrees."""
         low, high = self.lost_motion_interval
         digits = _count_decimals(self.lost_motion_error)
-        text = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
-        text += f" (95 %: {low:.{digits}f} to {high:.{digits}f}"
-        if unit == "rad":
-            value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
-            digits = _count_decimals(error)
-            text += f"; {value:.{digits}f} ± {error:.{digits}f}°"
-        return f"{text})"
+        size = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
+        value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
+        degrees = _count_decimals(error)
+        in_degrees = f"; {value:.{degrees}f} ± {error:.{degrees}f}°" if unit == "rad" else ""
+        return f"{size} (95 %: {low:.{digits}f} to {high:.{digits}f}{in_degrees})"
 
     def exceeds_noise(self, noise: float) -> bool:
         """Return True if the lost motion exceeds its error and the noise (:func:`twist_noise`)."""

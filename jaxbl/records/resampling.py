@@ -126,9 +126,9 @@ def _hold_over_periods(
     The last value holds for one more period. Means keep the impulse, and so the velocity that a torque makes.
 
     A drive's current loop is much faster than its log, so that a sampled torque is neither held between stamps nor a
-    straight line, but smooth: a cubic spline. Its means keep the velocity at the samples. Positions there, which is what encoders
-    read, need a twelfth of the second difference less: held values w_k move an inertia by (w_k + w_{k-1}) / 2, and a torque
-    of frequency f by sinc²(f T) times its value at t_k, which is the same up to the fourth order of f T.
+    straight line, but smooth: a cubic spline. Its means keep the velocity at the samples. Positions there, which is what
+    encoders read, need a twelfth of the second difference less: held values w_k move an inertia by (w_k + w_{k-1}) / 2, and
+    a torque of frequency f by sinc²(f T) times its value at t_k, which is the same up to the fourth order of f T.
     """
     edges, bounds = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period), np.append(grid, grid[-1] + period)
     if hold == "zoh":
