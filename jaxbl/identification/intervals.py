@@ -18,6 +18,8 @@ from jaxbl.simulate import Experiment
 from .free_parameters import FreeParameter
 from .trajectory import Fit, Windows, fits
 
+_Points = list[tuple[float, float]]
+"""Steps of theta from the best value, and the deviance there."""
 NORMAL = float(ndtri(0.975))
 """Standard errors on either side of a value that a 95 % interval reaches to."""
 UNSEEN = 0.5
@@ -68,14 +70,15 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: in
     normal = flat.T @ flat
     size = np.sqrt(np.diag(normal))
     size = np.where(size > 0.0, size, 1.0)
+    scale = np.outer(size, size)
     scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters)
     # of what diverges nothing is finite
     with np.errstate(all="ignore"):
         variance = np.sum(residual**2) / freedom
         middle = long_run(scores, least) * residual.size / freedom
-        inverse = _pseudo_inverse(normal / np.outer(size, size))
-        plain = variance * inverse / np.outer(size, size)
-        sandwich = inverse @ middle @ inverse / np.outer(size, size)
+        inverse = _pseudo_inverse(normal / scale)
+        plain = variance * inverse / scale
+        sandwich = inverse @ middle @ inverse / scale
         inflation = np.sqrt(np.diag(sandwich) / np.diag(plain))
         # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
         more = np.maximum(1.0 / inflation, 1.0)
@@ -191,9 +194,7 @@ def profile(
     return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1], limit) for i, one in enumerate(free)}
 
 
-def _gathered(
-    one: FreeParameter, centre: float, below: list[tuple[float, float]], above: list[tuple[float, float]], limit: float
-) -> Profile:
+def _gathered(one: FreeParameter, centre: float, below: _Points, above: _Points, limit: float) -> Profile:
     lower, upper = (_end(points, limit) for points in (below, above))
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
     low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
@@ -201,7 +202,7 @@ def _gathered(
     return Profile((low if one.minimum is None else max(low, one.minimum), high), values, np.array([d for _, d in points]))
 
 
-def _end(points: list[tuple[float, float]], limit: float) -> float:
+def _end(points: _Points, limit: float) -> float:
     """Step at which the root of the deviance, which is nearly straight, reaches that of its limit."""
     steps, roots = (np.array(x) for x in zip(*sorted((s, np.sqrt(max(d, 0.0))) for s, d in points), strict=True))
     goal = np.sqrt(limit)

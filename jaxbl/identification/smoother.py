@@ -16,6 +16,10 @@ from jaxtyping import Bool, Float
 from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
+Signal = Float[np.ndarray, " samples"]
+"""A number a sample."""
+Signals = Float[np.ndarray, "samples columns"]
+"""Several numbers a sample."""
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
 _GRID = 19
@@ -45,21 +49,21 @@ class Smoothed(NamedTuple):
     covariance: Float[np.ndarray, "samples 3 3"]
     noise: float | np.floating
     jerk: float | np.floating
-    innovations: Float[np.ndarray, " samples"]
+    innovations: Signal
 
     @property
-    def position(self) -> Float[np.ndarray, " samples"]:
+    def position(self) -> Signal:
         return self.state[:, 0]
 
     @property
-    def velocity(self) -> Float[np.ndarray, " samples"]:
+    def velocity(self) -> Signal:
         return self.state[:, 1]
 
     @property
-    def acceleration(self) -> Float[np.ndarray, " samples"]:
+    def acceleration(self) -> Signal:
         return self.state[:, 2]
 
-    def deviation(self, order: int) -> Float[np.ndarray, " samples"]:
+    def deviation(self, order: int) -> Signal:
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return self.covariance[:, order, order] ** 0.5
 
@@ -133,11 +137,8 @@ def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     # with C = 1 - K C: C' small, less the error; C' large C, and the precision of the reading
     small = [carry[0] - dot(gain, carry[:3]) - e / s, carry[1], carry[2]]
     w = [dot(row, gain) for row in large]
-    large = [
-        [large[0][0] - 2.0 * w[0] + dot(gain, w) + 1.0 / s, large[0][1] - w[1], large[0][2] - w[2]],
-        [large[0][1] - w[1], large[1][1], large[1][2]],
-        [large[0][2] - w[2], large[1][2], large[2][2]],
-    ]
+    first = [large[0][0] - 2.0 * w[0] + dot(gain, w) + 1.0 / s, large[0][1] - w[1], large[0][2] - w[2]]
+    large = [first, [first[1], *large[1][1:]], [first[2], *large[2][1:]]]
     products = [[dot(p[i], large[j]) for j in range(3)] for i in range(3)]
     state = [x[i] - dot(p[i], small) for i in range(3)]
     covariance = [p[i][j] - dot(products[i], p[j]) for i, j in _UPPER]
@@ -235,7 +236,7 @@ def _fit(position: np.ndarray) -> tuple[Any, Any]:
     return np.exp(0.5 * (low + high)), noise * unit
 
 
-def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
+def smooth(position: Signal, period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:
@@ -255,9 +256,7 @@ def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tup
         return _smoothed(values, smoothness, sigma, h)
 
 
-def smoothed_accelerations(
-    positions: Float[np.ndarray, "samples columns"], period: float, known: tuple[Any, Any]
-) -> Float[np.ndarray, "samples columns"]:
+def smoothed_accelerations(positions: Signals, period: float, known: tuple[Any, Any]) -> Signals:
     """Accelerations of several channels, each smoothed as :func:`smooth` does with the same `known` numbers."""
     sigma, jerk = known
     smoothness, found = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)

@@ -25,6 +25,12 @@ from jaxbl.simulate import Experiment, PlantState, plant_trajectory
 from .compilation import jit
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 
+Residuals = Float[Array, "windows samples sides"]
+"""Of positions over the noise."""
+Theta = Float[Array, " parameters"]
+"""Coordinates of the free parameters."""
+_Slopes = tuple[Array, PlantState, Array]
+"""Residuals, initial states, derivatives of the residuals by theta."""
 _INNER = 2
 """Initial states tried at each step of the fit."""
 RIDGE = 1e-10
@@ -65,7 +71,7 @@ class Windows(eqx.Module):
     start: PlantState
     noise: dict[str, Float[Array, ""]]
     rest: Bool[Array, " windows"]
-    finer: Float[Array, "windows samples sides"]
+    finer: Residuals
     gain: dict[str, Float[Array, " 2"]] | None = None
 
     def only(self, which: np.ndarray) -> "Windows":
@@ -99,9 +105,9 @@ class Fit(eqx.Module):
         converged: whether the solver met its tolerance.
     """
 
-    theta: Float[Array, " parameters"]
+    theta: Theta
     start: PlantState
-    residual: Float[Array, "windows samples sides"]
+    residual: Residuals
     jacobian: Float[Array, "windows samples sides parameters"]
     cost: Float[Array, ""]
     converged: Array
@@ -209,7 +215,7 @@ def _without(basis: Array, values: Array) -> Array:
 
 def projected_residual(
     experiment: Experiment, windows: Windows, passes: int = 12, rest: bool = True
-) -> tuple[Float[Array, "windows samples sides"], PlantState]:
+) -> tuple[Residuals, PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
     Of each window's initial state `passes` values are tried, with `rest` standstill among them.
@@ -222,12 +228,10 @@ def projected_residual(
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
 
-def _sloped(
-    experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Float[Array, " parameters"]
-) -> tuple[Array, PlantState, Array]:
+def _sloped(experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Theta) -> _Slopes:
     """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
 
-    def one(window: Windows) -> tuple[Array, PlantState, Array]:
+    def one(window: Windows) -> _Slopes:
         found = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
 
         def residual(theta: Array) -> Array:
@@ -254,7 +258,7 @@ class _Point(NamedTuple):
     jacobian: Array
     start: PlantState
     squares: Array
-    whole: tuple[Array, PlantState, Array]
+    whole: _Slopes
 
     @property
     def cost(self) -> Array:
@@ -274,7 +278,7 @@ def _reduced(
     experiment: Experiment,
     free: Sequence[FreeParameter],
     windows: Windows,
-    theta: Float[Array, " parameters"],
+    theta: Theta,
     moving: Array,
 ) -> _Point:
     """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
@@ -360,7 +364,7 @@ def fit(
     experiment: Experiment,
     free: Sequence[FreeParameter],
     windows: Windows,
-    theta: Float[Array, " parameters"],
+    theta: Theta,
     most_steps: int | Int[Array, ""] = 100,
     held: Bool[Array, " parameters"] | None = None,
     rounds: int | Int[Array, ""] = 3,

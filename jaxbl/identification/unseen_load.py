@@ -421,8 +421,9 @@ class UnseenLoad:
             size = (np.sum(slope**2, axis=0) + precision) ** -0.5
         assert size is not None
         scores = slope * size * (point.errors / np.sqrt(point.variance))[:, None]
-        middle = long_run(scores) + np.diag(precision * size**2)
-        white = inverse((slope * size).T @ (slope * size) + np.diag(precision * size**2))
+        prior = np.diag(precision * size**2)
+        middle = long_run(scores) + prior
+        white = inverse((slope * size).T @ (slope * size) + prior)
         scale = np.outer(size, size)[:count, :count]
         inner = white[:count, :count] * scale
         # by a root of the middle: never negative, whatever rounding does
@@ -641,9 +642,8 @@ class _Search:
             point = self.model.resume(point._replace(theta=theta), _FEW, self.held, without.smoothness)
             gone = (point.deviance - without.deviance) / worth
             if gone > _LIMIT:
-                share = np.sqrt(_LIMIT) - np.sqrt(max(before, 0.0))
-                share /= np.sqrt(gone) - np.sqrt(max(before, 0.0))
-                return float(last + share * (half - last))
+                root = np.sqrt(max(before, 0.0))
+                return float(last + (np.sqrt(_LIMIT) - root) / (np.sqrt(gone) - root) * (half - last))
             last, before, half = half, gone, 1.6 * half
         return self.travel
 

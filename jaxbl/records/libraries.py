@@ -17,6 +17,8 @@ from jaxbl.errors import InputError
 
 ColumnName = str | int
 """Name of a column, or its number, counted from 0."""
+Selection = Collection[ColumnName]
+"""Columns that will be used."""
 
 
 class Columns(dict[ColumnName, Any]):
@@ -112,7 +114,7 @@ _Messages = Iterator[tuple[str, int, Any]]
 """Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
 
 
-def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
     library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
@@ -157,7 +159,7 @@ def _message_types(schema: Any) -> Any:
     return store
 
 
-def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+def read_bag(path: Path, selection: Selection = ()) -> Columns:
     """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
 
     A time is the stamp in the message's header, or the time of recording if there is none. Among the topics of the
@@ -179,7 +181,7 @@ def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
 
 
 def _recording_columns(
-    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Collection[ColumnName]
+    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Selection
 ) -> Columns:
     """Return the columns of a recording; the first one that is used of a topic loads all its selected ones.
 

@@ -26,6 +26,8 @@ from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
+Block = tuple[Sequence[ColumnName], np.ndarray]
+"""Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 LOST, GAPS, RESTARTS = "lost samples interpolated", "gaps in time", "restarts of the clock"
 """Faults that are counted."""
@@ -74,7 +76,7 @@ class Source(Protocol):
     counts: Counter[str]
     fault: str
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         """Wait at most `seconds` for rows.
 
         Returns:
@@ -337,7 +339,7 @@ class FollowedFile(_TextSource):
             check_file(path)
             self._file = path.open("rb")
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         end = time.monotonic() + seconds
         while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
             time.sleep(min(_FILE_POLL_SECONDS, remaining))
@@ -423,7 +425,7 @@ class Datagrams(_TextSource):
             with suppress(OSError):
                 self._received.append(self._socket.recv(1 << 16))
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         time.sleep(seconds)
         datagrams = [self._received.popleft() for _ in range(len(self._received))]
         parts, lines = list[np.ndarray](), list[str]()

@@ -22,6 +22,8 @@ from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filte
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
 
+_Table = dict[str, Any]
+"""A table of a study, by key."""
 _ROUGH_UNCERTAINTY = 0.5
 """Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
 _NAME_PATTERNS = {
@@ -92,7 +94,7 @@ def _guess_channel(name: str, unit: str) -> str:
     return f"theta_{side}" if (is_position and is_possible["position"]) or is_bare_side or has_position_unit else ""
 
 
-def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     """Guess a `[log]` table from names and units of columns; it comes with a sentence on each uncertain guess.
 
     Raises:
@@ -115,7 +117,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
         if numbers.dtype.kind in "iuf" and (channel == "u" or not is_setpoint):
             is_second_choice = is_setpoint or _matches("load", name) if channel == "u" else not _matches("position", name)
             candidates.setdefault(channel, []).append((is_second_choice, column, unit, numbers))
-    table: dict[str, Any] = {}
+    table: _Table = {}
     guesses: list[str] = []
     for channel, columns in candidates.items():
         _, column, unit, numbers = min(columns, key=lambda candidate: candidate[0])
@@ -141,7 +143,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     return table, guesses
 
 
-def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
     if unit not in SECONDS_PER_UNIT:
         median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
         # drives are sampled every 10 us to 0.1 s
@@ -151,7 +153,7 @@ def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses
     return {"column": column, "unit": unit}
 
 
-def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> dict[str, Any]:
+def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> _Table:
     if unit not in _TORQUE_UNITS:
         guesses.append(_describe_unit_guess("u", unit, "N m"))
         return {"column": column}
@@ -166,7 +168,7 @@ def _describe_unit_guess(quantity: str, unit: str, default: str) -> str:
     return f"The unit of {quantity} is {fault}{default} is assumed."
 
 
-def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
     is_whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
     if unit == "counts" or (not unit and is_whole):
         guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
@@ -174,7 +176,7 @@ def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, gue
     return _assume_unit(column, unit, _POSITION_UNITS, guesses)
 
 
-def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> dict[str, Any]:
+def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> _Table:
     """Return the table of a column, with the first one of `units` if its unit is not one of them."""
     if unit not in units:
         guesses.append(_describe_unit_guess(f"'{column}'", unit, units[0]))
@@ -184,11 +186,11 @@ def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: l
 
 def propose_study(
     path: str | Path,
-    log: dict[str, Any] | None = None,
+    log: _Table | None = None,
     *,
     gear_ratio: float | None = None,
     nominal: NominalDrive | None = None,
-) -> tuple[dict[str, Any], list[str], Inspection]:
+) -> tuple[_Table, list[str], Inspection]:
     """Propose a study of a log for `identify` and `diagnose`.
 
     Args:
@@ -296,11 +298,11 @@ def _load_motion(motor: np.ndarray, load: np.ndarray, bandwidth: float, period: 
     return low_pass(motor, cutoff, period)[inner], rows[inner]
 
 
-def _make_study(inspection: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> dict[str, Any]:
+def _make_study(inspection: Inspection, nominal: NominalDrive, table: _Table) -> _Table:
     record = inspection.record
     has_shaft = math.isfinite(nominal.stiffness)
     names = ("motor_inertia", "motor_viscous", *(("load_inertia", "load_viscous", "gear_ratio") if has_shaft else ()))
-    study: dict[str, Any] = {
+    study: _Table = {
         "title": record.path.stem,
         "drive": {"kind": "two_inertia" if has_shaft else "rigid"} | {name: getattr(nominal, name) for name in names},
     }
