@@ -188,17 +188,19 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     values = _replace_dropouts(file, name, values, stamps)
     saturated = 0.0
     if table.saturation is not None:
+        size = np.abs(values)
         # the margins are for the rounding of decimal numbers
-        if np.abs(values).max() > table.saturation * (1.0 + 1e-9):
-            row = int(np.argmax(np.abs(values)))
+        if size.max() > table.saturation * (1.0 + 1e-9):
+            row = int(np.argmax(size))
             raise file.error(
                 f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
                 f"{table.saturation:g}; saturation should be the largest possible value"
             )
-        saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
+        saturated = float(np.mean(size >= table.saturation * (1.0 - 1e-9)))
     values = to_si(table, values)
-    if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
-        raise file.error(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
+    largest = np.abs(values).max()
+    if 0.0 < largest < _LEAST_TORQUE:
+        raise file.error(f"{name} is at most {largest:.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew or 0.0)
 
 

@@ -372,10 +372,10 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     names = _shape_names(terms)
     half, middle = rig.half_range, 0.5 * (float(rig.position.min()) + float(rig.position.max()))
     near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
-    grids = {
-        "centre": [middle + half * start for start in _CENTRE_STARTS],
-        "half_gap": [half * start for start in _HALF_GAP_STARTS],
-        "length": [half * start for start in _LENGTH_STARTS],
+    choices = {
+        "centre": ([middle + half * start for start in _CENTRE_STARTS], middle - half, middle + half),
+        "half_gap": ([half * start for start in _HALF_GAP_STARTS], 0.0, half),
+        "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
     }
 
     def compute_residual(shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -384,11 +384,10 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
 
     shapes = np.empty(0)
     if names:
-        bounds = {"centre": (middle - half, middle + half), "half_gap": (0.0, half), "length": (1e-4 * half, 10.0 * half)}
-        low, high = np.array([bounds[name] for name in names]).T
+        low, high = np.array([choices[name][1:] for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few_rows = rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)]
-        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else grids[name] for name in names))
+        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else choices[name][0] for name in names))
         starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few_rows) ** 2)))[:3]
         inside = low + 1e-9 * half, high - 1e-9 * half
         solutions = [search(np.clip(np.array(start), *inside), args=(few_rows,)) for start in starts]

@@ -265,10 +265,10 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
             judgements += _judge_alike(["Coulomb friction"], "weak", f"{one_way_text} a constant torque")
         else:
             judgements.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
+    answer, reason = "yes", f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
     if minor_share < 0.05:
-        return [*judgements, Identifiability("constant torque", "weak", f"{one_way_text} Coulomb friction")]
-    reason = f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
-    return [*judgements, Identifiability("constant torque", "yes", reason)]
+        answer, reason = "weak", f"{one_way_text} Coulomb friction"
+    return [*judgements, Identifiability("constant torque", answer, reason)]
 
 
 def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:

@@ -123,14 +123,12 @@ def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> 
         return log
     try:
         check_sizes(log)
-    except InputError as error:
-        raise InputError(f"{name}: log.{error}" if name else f"log.{error}") from None
-    try:
         return LogTable.model_validate({} if log is None else dict(log))
+    except InputError as error:
+        fault = f"log.{error}"
     except ValidationError as error:
-        location = ["log", *error.errors()[0]["loc"]]
-        text = explain_first_error(error, location)[1]
-        raise InputError(f"{name}: {text}" if name else text) from None
+        fault = explain_first_error(error, ["log", *error.errors()[0]["loc"]])[1]
+    raise InputError(f"{name}: {fault}" if name else fault)
 
 
 def read_record(
