@@ -309,9 +309,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
     if (
         # friction that falls with the speed takes work none the less
-        friction_power < 0.0
-        and shows_viscous
-        and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
+        friction_power < 0.0 and shows_viscous and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
     ):
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "

@@ -142,9 +142,9 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
     Returns:
         Columns of the waves, and coefficients of the motion and of each wave's cosine and sine.
     """
-    found: list[int] = []
+    waves: list[int] = []
     columns, values = motion, np.zeros(0)
-    while len(found) < _MOST_WAVES:
+    while len(waves) < _MOST_WAVES:
         basis = np.linalg.qr(columns)[0]
         parts = (rows.torque[:, None], rows.cosine[:, lowest:], rows.sine[:, lowest:])
         torque, cosine, sine = (part - basis @ (basis.T @ part) for part in parts)
@@ -154,8 +154,8 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_WAVE_ERRORS:
             break
-        found, values = [*found, wave], coefficients
-    return found, values
+        waves, values = [*waves, wave], coefficients
+    return waves, values
 
 
 def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
