@@ -9,18 +9,18 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
-# The honest proof and logs read for what they are stand at 407 299 for now: they are done at 400 548.
+# The honest proof and logs read for what they are stand at 402 408 for now: they are done at 400 548.
 CEILINGS = {
-    "all": (407299, 2.6, 3.23, 4.19),
+    "all": (402408, 2.44, 3.12, 3.99),
     "report": (61018, 0.33, 1.19, 0.67),
-    "diagnosis": (65692, 10.1, 12.54, 15.47),
-    "records": (49106, 0.0, 0.0, 0.0),
+    "diagnosis": (65590, 10.08, 12.04, 15.69),
+    "records": (48257, 0.0, 0.0, 0.0),
     "gains": (39326, 0.0, 0.0, 0.0),
-    "identification": (36229, 8.6, 14.92, 17.2),
+    "identification": (35241, 7.9, 14.35, 16.23),
     "sweeps": (28678, 0.07, 0.0, 0.0),
     "exports": (24420, 0.02, 0.0, 0.0),
     "fused": (23791, 0.0, 0.0, 0.0),
-    ".": (18236, 0.03, 0.0, 0.0),
+    ".": (18352, 0.03, 0.0, 0.0),
     "drive": (12686, 0.0, 2.2, 0.0),
     "throughput": (11727, 0.0, 0.0, 0.0),
     "cli": (9499, 0.09, 0.0, 0.0),

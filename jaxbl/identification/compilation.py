@@ -142,19 +142,17 @@ def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], 
         return [one for one in jax.tree.leaves(out) if eqx.is_array(one)]
 
     flat.__name__ = getattr(function, "__name__", "program")
-    if key is None:
-        compiled = jax.jit(flat, compiler_options=_options()).lower(*arrays).compile()
-        return _Program(compiled, results[-1])
-    # code that JAX took from its own cache cannot be written once more: a name of its own, and not put there
-    flat.__name__ += f"_{os.getpid()}_{time.time_ns()}"
     least = jax.config.values[_LEAST]
-    jax.config.update(_LEAST, math.inf)
+    if key is not None:
+        # code that JAX took from its own cache cannot be written once more: a name of its own, and not put there
+        flat.__name__ += f"_{os.getpid()}_{time.time_ns()}"
+        jax.config.update(_LEAST, math.inf)
     try:
         compiled = jax.jit(flat, compiler_options=_options()).lower(*arrays).compile()
     finally:
         jax.config.update(_LEAST, least)
     shardings = jax.tree.leaves(compiled.output_shardings)
-    if shardings:
+    if key is not None and shardings:
         with suppress(Exception):  # JAX cannot write it: it is compiled anew next time
             program_cache.save(key, (serialize(compiled)[0], len(shardings), len(shardings[0].device_set), results[-1]))
     return _Program(compiled, results[-1])

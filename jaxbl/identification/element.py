@@ -17,8 +17,8 @@ from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
-from jaxbl.records.element import Element, Number, element_error
-from jaxbl.records.inspection import element_displacement, element_noise, fit_record_element
+from jaxbl.records.element import Element, element_error
+from jaxbl.records.inspection import element_displacement, fit_record_element, make_rig_log
 
 # number -> where a study has it: an effect and its key
 _EFFECTS = {
@@ -85,13 +85,11 @@ def read_element_task(
     Raises:
         InputError: an unfit log.
     """
-    records = [None if path is None else read_record(path, table) for path in (log, holdout)]
-    assert records[0] is not None
-    if records[1] is not None:
-        check_positions(records[0], records[1])
-        check_positions(records[1], records[0])
-    ratio = None if len(records[0].positions) < 2 else gear_ratio or 1.0
-    return ElementTask(table, ratio, records[0], records[1])
+    record, other = read_record(log, table), None if holdout is None else read_record(holdout, table)
+    if other is not None:
+        check_positions(record, other)
+        check_positions(other, record)
+    return ElementTask(table, None if len(record.positions) < 2 else gear_ratio or 1.0, record, other)
 
 
 def identify_element(
@@ -148,19 +146,9 @@ def _path(name: str) -> str:
     return f"effects.{effect}.{key}" if effect else name
 
 
-def _entry(number: Number) -> JsonObject:
-    return {
-        "value": number.value,
-        "standard_error": number.error,
-        "interval": list(number.interval),
-        "unit": number.unit,
-        "nominal": None,
-    }
-
-
 def _summary(task: ElementTask, found: Element) -> JsonObject:
     record = task.record
-    kept = {name: one for name, one in found.numbers.items() if name not in found.open}
+    kept = {name: number for name, number in found.numbers.items() if name not in found.open}
     summary = {
         "title": f"Transmission of {record.path.name}",
         "kind": "element",
@@ -168,7 +156,7 @@ def _summary(task: ElementTask, found: Element) -> JsonObject:
         "file": str(record.path.resolve()),
         "samples": len(record.time),
         "sample_period": record.sample_period,
-        "parameters": {_path(name): _entry(one) for name, one in kept.items()},
+        "parameters": {_path(name): number.to_dict() | {"nominal": None} for name, number in kept.items()},
         "refused": [
             {"direction": {_path(name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in found.open
@@ -179,12 +167,9 @@ def _summary(task: ElementTask, found: Element) -> JsonObject:
         "notes": list(record.notes),
     }
     if task.holdout is not None:
-        other = task.holdout
-        assert other.torque is not None
-        moved, noise = element_displacement(other, task.gear_ratio), element_noise(other, task.gear_ratio)
-        error = element_error(found, moved, other.torque, other.segments, other.sample_period, noise)
-        rms, relative = (None, None) if error is None else error
-        summary["holdout"] = {"file": str(other.path.resolve()), "torque": {"rms": rms, "relative": relative}}
+        error = element_error(found, make_rig_log(task.holdout, task.gear_ratio))
+        rms, relative = error or (None, None)
+        summary["holdout"] = {"file": str(task.holdout.path.resolve()), "torque": {"rms": rms, "relative": relative}}
     return summary
 
 

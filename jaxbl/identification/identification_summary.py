@@ -11,11 +11,11 @@ import numpy as np
 from jaxbl.config import Config
 from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.json_types import JsonObject
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
-from .free_parameters import FreeParameter
+from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors, regress
@@ -43,7 +43,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.statistics.channels[POSITION_CHANNELS[side]].unit
+        unit = record.unit_of(f"{side}.position", "rad")
         position[side] = {"rms": after, "nominal_rms": before, "noise": noise[side], "unit": unit}
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
@@ -64,7 +64,7 @@ def _derived(experiment: Experiment, found: Found) -> JsonObject:
         return {}
 
     def others(theta: jax.Array) -> JsonObject:
-        at = set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(found.free)})
+        at = set_free_parameters(experiment, found.free, theta)
         assert at.transmission is not None
         known = {path.rpartition(".")[2] for path in leaf_paths(at) if path.startswith("transmission.")}
         return {name: value for name, value in at.transmission.truth().items() if name not in known}
@@ -80,7 +80,7 @@ def _derived(experiment: Experiment, found: Found) -> JsonObject:
 
 def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, JsonObject]:
     """Values with standard errors and 95 % intervals, by path."""
-    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
+    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(width.covariance))
     return {
         parameter.path: {
             "value": float(parameter.value(theta[i])),
@@ -136,7 +136,7 @@ def by_trajectories(found: Found, record: Record) -> JsonObject:
 def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> JsonObject:
     """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
     noise = {side: float(one) for side, one in found.windows.noise.items()}
-    record, width = task.record, np.asarray(found.spread.covariance)
+    record, width = task.record, found.spread.covariance
     deviation = np.sqrt(np.diag(width))
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
@@ -150,7 +150,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         side: {
             "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
             "noise": noise[side],
-            "unit": record.statistics.channels[POSITION_CHANNELS[side]].unit,
+            "unit": record.unit_of(f"{side}.position", "rad"),
         }
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }

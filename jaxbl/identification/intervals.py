@@ -18,6 +18,8 @@ from jaxbl.simulate import Experiment
 from .free_parameters import FreeParameter
 from .trajectory import Fit, Windows, fits
 
+_Points = list[tuple[float, float]]
+"""Steps of theta from the best value, and the deviance there."""
 NORMAL = float(ndtri(0.975))
 """Standard errors on either side of a value that a 95 % interval reaches to."""
 UNSEEN = 0.5
@@ -47,9 +49,8 @@ class Spread(NamedTuple):
 
     def with_error(self, *changes: np.ndarray) -> "Spread":
         """Count changes of theta, each of shape (parameters,), as further errors."""
-        covariance = np.asarray(self.covariance)
-        wide = covariance + sum(np.outer(change, change) for change in changes)
-        more = np.sqrt(np.diag(wide) / np.diag(covariance))
+        wide = self.covariance + sum(np.outer(change, change) for change in changes)
+        more = np.sqrt(np.diag(wide) / np.diag(self.covariance))
         return self._replace(covariance=wide, inflation=self.inflation * more)
 
 
@@ -69,14 +70,15 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: in
     normal = flat.T @ flat
     size = np.sqrt(np.diag(normal))
     size = np.where(size > 0.0, size, 1.0)
+    scale = np.outer(size, size)
     scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters)
     # of what diverges nothing is finite
     with np.errstate(all="ignore"):
         variance = np.sum(residual**2) / freedom
         middle = long_run(scores, least) * residual.size / freedom
-        inverse = _pseudo_inverse(normal / np.outer(size, size))
-        plain = variance * inverse / np.outer(size, size)
-        sandwich = inverse @ middle @ inverse / np.outer(size, size)
+        inverse = _pseudo_inverse(normal / scale)
+        plain = variance * inverse / scale
+        sandwich = inverse @ middle @ inverse / scale
         inflation = np.sqrt(np.diag(sandwich) / np.diag(plain))
         # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
         more = np.maximum(1.0 / inflation, 1.0)
@@ -129,10 +131,9 @@ def refusals(free: Sequence[FreeParameter], found: Spread) -> tuple[list[Refusal
 
     Directions are eigenvectors of the covariance, components below a tenth of the largest left out.
     """
-    information = np.asarray(found.information)
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = np.linalg.eigh(found.information)
     condition = float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
-    inflation = float(np.max(np.nan_to_num(np.asarray(found.inflation), nan=1.0)))
+    inflation = float(np.max(np.nan_to_num(found.inflation, nan=1.0)))
     refused = []
     for value, vector in zip(values, vectors.T, strict=True):
         deviation = max(inflation, 1.0) / np.sqrt(value) if value > 0.0 else float("inf")
@@ -167,10 +168,10 @@ def profile(
     :func:`spread`.
     """
     count, limit = len(free), float(chdtri(1.0, 0.05))
-    centre, covariance = np.asarray(best.theta), np.asarray(width.covariance)
+    centre, covariance = np.asarray(best.theta), width.covariance
     deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
-    worth = float(width.variance) * np.asarray(width.inflation) ** 2
+    worth = float(width.variance) * width.inflation**2
 
     which = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)
@@ -193,9 +194,7 @@ def profile(
     return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1], limit) for i, one in enumerate(free)}
 
 
-def _gathered(
-    one: FreeParameter, centre: float, below: list[tuple[float, float]], above: list[tuple[float, float]], limit: float
-) -> Profile:
+def _gathered(one: FreeParameter, centre: float, below: _Points, above: _Points, limit: float) -> Profile:
     lower, upper = (_end(points, limit) for points in (below, above))
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
     low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
@@ -203,7 +202,7 @@ def _gathered(
     return Profile((low if one.minimum is None else max(low, one.minimum), high), values, np.array([d for _, d in points]))
 
 
-def _end(points: list[tuple[float, float]], limit: float) -> float:
+def _end(points: _Points, limit: float) -> float:
     """Step at which the root of the deviance, which is nearly straight, reaches that of its limit."""
     steps, roots = (np.array(x) for x in zip(*sorted((s, np.sqrt(max(d, 0.0))) for s, d in points), strict=True))
     goal = np.sqrt(limit)

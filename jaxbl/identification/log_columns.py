@@ -1,6 +1,6 @@
 """Columns over a log: its smoothed motion, the fit's residuals, the fitted model's torques, and what the observers see."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -17,6 +17,24 @@ from .search import Found
 from .segments import Segment
 
 
+def join_columns(count: int, segments: Sequence[Segment], pieces: Sequence[Mapping[str, Any]]) -> NamedArrays:
+    """Join the columns of segments to columns of a log of `count` samples; NaN between the segments."""
+    columns: NamedArrays = {}
+    for segment, piece in zip(segments, pieces, strict=True):
+        for name, values in piece.items():
+            columns.setdefault(name, np.full(count, np.nan))[segment.rows] = values
+    return columns
+
+
+def motion_columns(segment: Segment, side: str) -> NamedArrays:
+    """Columns of a side's smoothed motion along a segment, with deviations."""
+    smoothed, columns = segment.smoothed[side], {}
+    for order, name in ((1, "velocity"), (2, "acceleration")):
+        columns[f"{side}.{name}"] = smoothed.state[:, order]
+        columns[f"{side}.{name}_deviation"] = smoothed.deviation(order)
+    return columns
+
+
 def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> NamedArrays:
     """Columns of a log and its fit, each of shape (samples,); NaN where the log gives none.
 
@@ -28,31 +46,23 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
     if record.transmitted is not None:
         columns["transmitted"] = record.transmitted
-
-    def whole(pieces: Sequence[Any]) -> np.ndarray:
-        column = np.full(len(record.time), np.nan)
-        for segment, one in zip(segments, pieces, strict=True):
-            column[segment.rows] = one
-        return column
-
+    count = len(record.time)
     for side in fitted.sides:
-        smoothed = [one.smoothed[side] for one in segments]
-        for order, name in ((1, "velocity"), (2, "acceleration")):
-            columns[f"{side}.{name}"] = whole([one.state[:, order] for one in smoothed])
-            columns[f"{side}.{name}_deviation"] = whole([one.deviation(order) for one in smoothed])
+        columns |= join_columns(count, segments, [motion_columns(segment, side) for segment in segments])
     rows = (found.firsts[:, None] + np.arange(found.samples)[None, :]).ravel()
     for i, side in enumerate(fitted.sides):
-        column = np.full(len(record.time), np.nan)
+        column = np.full(count, np.nan)
         column[rows] = float(found.windows.noise[side]) * np.asarray(found.fit.residual[:, :, i]).ravel()
         columns[f"{side}.residual"] = column
     torques = [
         model_torques(fitted, one.kinematics, {side: smoothed.deviation(1) for side, smoothed in one.smoothed.items()})
         for one in segments
     ]
-    for name in torques[0]:
-        column = "torque" if name == "transmission" else f"{name}.effects"
-        columns[column] = whole([one[name] for one in torques])
-    return columns
+    pieces = [
+        {"torque" if name == "transmission" else f"{name}.effects": values for name, values in piece.items()}
+        for piece in torques
+    ]
+    return columns | join_columns(count, segments, pieces)
 
 
 @jit
@@ -84,9 +94,7 @@ def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples:
     # compiled programs sort their results by name
     estimates = [f"{side}.{name}" for side in experiment.sides for name in ("velocity_estimate", "torque_estimate")]
     names = [*(["twist"] if "twist" in kept else []), *estimates]
-    columns = {name: np.full(samples, np.nan) for name in dict.fromkeys([*names, *kept])}
-    for name, column in columns.items():
-        column[longest.rows] = np.asarray(kept[name])
+    columns = join_columns(samples, [longest], [{name: kept[name] for name in dict.fromkeys([*names, *kept])}])
     found: JsonObject = {}
     if experiment.transmission is not None:
         for name in experiment.transmission.truth():

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from jaxbl.drive.excitation import Sine
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
+from jaxbl.records.signal_quality import segments_before
 from jaxbl.records.table import TorqueTable
 from jaxbl.simulate import Experiment
 
@@ -122,29 +124,25 @@ def read_logs(
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    records = [
-        _checked(config, one) if isinstance(one, Record) else _read_one(config, one, seeks_delay, share) for one in several
-    ]
+    read = partial(_read_one, seeks_delay=seeks_delay, share=share)
+    records = [read(config, log) for log in several]
     config = _at_one_period(config, records, like)
-    for i, (log, record) in enumerate(zip(several, records, strict=True)):
-        if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
-            records[i] = _read_one(config, log, seeks_delay, share)
+    records = [
+        record if _alike(record.sample_period, config.log.resample or record.sample_period) else read(config, log)
+        for log, record in zip(several, records, strict=True)
+    ]
     known: dict[str, float] = {}
-    for one in [*reversed(records)] if like is None else [like]:
-        known |= one.corrections
+    for record in [*reversed(records)] if like is None else [like]:
+        known |= record.corrections
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
+        corrections = record.corrections
+        keys = {*known, *corrections}
         # an offset changes when a counter is switched off and on, the skew of a clock that drifts with each log
-        given = {key: known.get(key, 0.0) for key in {*known, *record.corrections}}
-        own = ("offset", *(("skew", "drift") if "drift" in known or "drift" in record.corrections else ()))
-        given |= {
-            key: record.corrections.get(key, 0.0)
-            for key in own
-            if key in given and (key in record.corrections or key != "offset")
-        }
-        if not isinstance(log, Record) and given != record.corrections:
-            again = _read_one(_corrected(config, given), log, seeks_delay, share)
+        own = {"offset"} & {*corrections} | ({"skew", "drift"} if "drift" in keys else set())
+        corrections = {key: (corrections if key in own else known).get(key, 0.0) for key in keys}
+        if not isinstance(log, Record) and corrections != record.corrections:
             # the reader counts what [log] gives as no correction of its own
-            records[i] = replace(again, corrections=given)
+            records[i] = replace(read(_corrected(config, corrections), log), corrections=corrections)
     first, *others = records if like is None else (like, *records)
     others = [_from_zero_of(first, one, config, share) for one in others]
     return join_records([first, *others] if like is None else others)
@@ -213,7 +211,7 @@ def _from_zero_of(first: Record, record: Record, config: Config, share: float) -
         assert one.torque is not None
         load = ratio * one.positions["load"] if two else None
         end = round(share * len(one.time)) if one is record else len(one.time)
-        segments = [slice(part.start, min(part.stop, end)) for part in one.segments if part.start < end]
+        segments = segments_before(one.segments, end)
         motions.append(TurningLog(one.torque, one.positions["motor"], load, segments, one.sample_period))
     found = find_zero_shift(*motions)
     if found is None:
@@ -246,7 +244,9 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     return config.model_copy(update={"log": table})
 
 
-def _read_one(config: Config, log: str | Path, seeks_delay: bool, share: float) -> Record:
+def _read_one(config: Config, log: str | Path | Record, seeks_delay: bool, share: float) -> Record:
+    if isinstance(log, Record):
+        return _checked(config, log)
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
     if seeks_delay and nominal.dead_time == "no":

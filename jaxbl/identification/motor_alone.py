@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,14 +16,15 @@ from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, NamedArrays
 
 from .free_parameters import FreeParameter
 from .intervals import UNSEEN, Refusal, Spread, refusals
+from .log_columns import join_columns, motion_columns
 from .search import Found
 from .segments import Segment, reading_noise, segments_of
 from .trajectory import Windows
-from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, inverse, is_known, widths
+from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, half_gap_of, inverse, is_known, widths
 
 
 class Alone(NamedTuple):
@@ -54,10 +55,6 @@ class Alone(NamedTuple):
     def gap_path(self) -> str | None:
         """Path of the number that makes the gap, if it is sought."""
         return None if self.model.gap is None else self.model.free[self.model.gap].path
-
-    def half(self, value: float) -> float:
-        """Half gap in rad at a value of the number that makes it."""
-        return value * (4.0 if (self.gap_path or "").endswith("dead_zone") else 1.0)
 
 
 def search_alone(
@@ -165,7 +162,7 @@ def _found(model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, he
     sought = np.flatnonzero(~held)
     every = _only(width, sought)
     refused, condition = refusals([model.free[i] for i in sought], every)
-    seen = sought[np.sqrt(np.diag(np.asarray(every.covariance))) < UNSEEN]
+    seen = sought[np.sqrt(np.diag(every.covariance)) < UNSEEN]
     if held.any():
         refused = [Refusal({model.free[i].path: 1.0}, float("inf")) for i in np.flatnonzero(held)] + refused
     noise = reading_noise(model.segments)["motor"]
@@ -189,8 +186,8 @@ def _found(model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, he
 
 def _only(width: Spread, which: np.ndarray) -> Spread:
     """Of some of the numbers; what is left open of the others is no information."""
-    covariance = np.asarray(width.covariance)[np.ix_(which, which)]
-    return Spread(covariance, inverse(covariance), width.variance, np.asarray(width.inflation)[which])
+    covariance = width.covariance[np.ix_(which, which)]
+    return Spread(covariance, inverse(covariance), width.variance, width.inflation[which])
 
 
 def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
@@ -202,19 +199,12 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     fitted, model, point = alone.experiment, alone.model, alone.point
     plant = fitted.plant
     states = model.states(point.theta, point.start, point.smoothness)
-    columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
-
-    def put(name: str, segment: Segment, values: Any) -> None:
-        columns.setdefault(name, np.full(len(record.time), np.nan))[segment.rows] = values
-
+    pieces: list[NamedArrays] = []
     for segment, one in zip(model.segments, states, strict=True):
-        smoothed = segment.smoothed["motor"]
-        for order, name in ((1, "velocity"), (2, "acceleration")):
-            put(f"motor.{name}", segment, smoothed.state[:, order])
-            put(f"motor.{name}_deviation", segment, smoothed.deviation(order))
-        put("motor.residual", segment, segment.readings["motor"] - np.asarray(one.position["motor"]))
+        piece = motion_columns(segment, "motor")
+        piece["motor.residual"] = segment.readings["motor"] - np.asarray(one.position["motor"])
         for name in ("position", "velocity"):
-            put(f"load.modelled_{name}", segment, getattr(one, name)["load"])
+            piece[f"load.modelled_{name}"] = getattr(one, name)["load"]
         k = segment.kinematics
         one = jax.tree.map(jnp.asarray, one)
         through = jax.vmap(plant.transmitted_torque)(one.position, one.velocity, one.effects)[0]
@@ -222,20 +212,24 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
         none = jnp.zeros_like(through)
         total, level = jax.vmap(plant.side_torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
         resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
-        put("torque", segment, through)
-        put("torque_by_motor", segment, total - resisting - plant.inertia("motor") * k.acceleration["motor"])
-    return columns
+        pieces.append(
+            piece
+            | {"torque": through, "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"]}
+        )
+    columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
+    return columns | join_columns(len(record.time), model.segments, pieces)
 
 
 def gap_summary(alone: Alone) -> JsonObject | None:
     """What the motor says of the gap, as `backlash` of `identification.json`; None where the model has none."""
-    if alone.gap is None:
-        return None
     gap, model = alone.gap, alone.model
+    if gap is None or model.gap is None:
+        return None
+    number = model.free[model.gap]
     return {
         "shown": not alone.why,
-        "path": alone.gap_path,
-        "nominal": alone.half(model.free[model.gap or 0].nominal),
+        "path": number.path,
+        "nominal": number.nominal * half_gap_of(number),
         "half_gap": None if alone.why else gap.half,
         "at_most": gap.at_most,
         "unmet": gap.unmet,
@@ -261,7 +255,7 @@ def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.n
     given = np.zeros(len(model.free)) if nominal is None else nominal
     sizes = [float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (given, alone.point.theta)]
     noise = reading_noise(segments)["motor"]
-    unit = record.statistics.channels[POSITION_CHANNELS["motor"]].unit
+    unit = record.unit_of("motor.position", "rad")
     position = {"rms": sizes[1], "nominal_rms": sizes[0], "noise": noise, "unit": unit}
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

@@ -20,12 +20,10 @@ from .regression import Kinematics
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)
 """Tried, over the largest disturbance: alpha must exceed it."""
-_LEAST_LAMBDA = np.array(
-    [
-        *(0.99121979323499, 0.846816465249442, 0.747579903703347, 0.668441411663471, 0.601665665672052),
-        *(0.543670341246327, 0.492453446343278, 0.446755440769939, 0.405712627502788, 0.368691656240434),
-    ]
-)
+_LEAST_LAMBDA = np.array([
+    0.99121979323499, 0.846816465249442, 0.747579903703347, 0.668441411663471, 0.601665665672052,
+    0.543670341246327, 0.492453446343278, 0.446755440769939, 0.405712627502788, 0.368691656240434,
+])  # fmt: skip
 """Least lambda that converges with each of them, over the root of the largest disturbance: of
 :func:`jaxbl.observer.conditions.least_lambda_exact`, which takes longer to compile than all that follows (a test)."""
 _LAMBDA = np.geomspace(1.1, 12.0, 12)

@@ -328,7 +328,7 @@ def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequen
 
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
-    def left(theta: Array, _: None = None) -> Array:
+    def left(theta: Array) -> Array:
         at = set_free_parameters(experiment, free, theta)
         each = [balance(at, part) for part in parts]
         columns = [jnp.concatenate([decimate(one[name].residual, factor) for one in each]) for name in names]

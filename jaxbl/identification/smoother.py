@@ -7,6 +7,7 @@ References: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Application
 (white jerk); G. J. Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,10 @@ from jaxtyping import Bool, Float
 from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
+Signal = Float[np.ndarray, " samples"]
+"""A number a sample."""
+Signals = Float[np.ndarray, "samples columns"]
+"""Several numbers a sample."""
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
 _GRID = 19
@@ -44,21 +49,21 @@ class Smoothed(NamedTuple):
     covariance: Float[np.ndarray, "samples 3 3"]
     noise: float | np.floating
     jerk: float | np.floating
-    innovations: Float[np.ndarray, " samples"]
+    innovations: Signal
 
     @property
-    def position(self) -> Float[np.ndarray, " samples"]:
+    def position(self) -> Signal:
         return self.state[:, 0]
 
     @property
-    def velocity(self) -> Float[np.ndarray, " samples"]:
+    def velocity(self) -> Signal:
         return self.state[:, 1]
 
     @property
-    def acceleration(self) -> Float[np.ndarray, " samples"]:
+    def acceleration(self) -> Signal:
         return self.state[:, 2]
 
-    def deviation(self, order: int) -> Float[np.ndarray, " samples"]:
+    def deviation(self, order: int) -> Signal:
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return self.covariance[:, order, order] ** 0.5
 
@@ -93,11 +98,24 @@ def _predicted(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     left = [[p[i][j] - gain[i] * p[0][j] for j in range(3)] for i in range(3)]
     u = [[left[i][j] - left[i][0] * gain[j] + gain[i] * gain[j] for j in range(3)] for i in range(3)]
     a, b, c = (x[i] + gain[i] * e for i in range(3))
-    # of a state [a, b, c] what a period makes of it, and so of each row and column
-    rows = [[u[0][j] + u[1][j] + 0.5 * u[2][j] for j in range(3)], [u[1][j] + u[2][j] for j in range(3)], u[2]]
-    moved = [[row[0] + row[1] + 0.5 * row[2], row[1] + row[2], row[2]] for row in rows]
+    moved = _transform(_advance, u)
     new = [moved[i][j] + smoothness * JERK_COVARIANCE[i][j] for i, j in _UPPER]
-    return [a + b + 0.5 * c, b + c, c, *new], [*carry, e, s]
+    return [*_advance(a, b, c), *new], [*carry, e, s]
+
+
+def _advance(a: Any, b: Any, c: Any) -> Leaves:
+    """What a period makes of a state."""
+    return [a + b + 0.5 * c, b + c, c]
+
+
+def _advance_transposed(a: Any, b: Any, c: Any) -> Leaves:
+    """The transposed transition."""
+    return [a, a + b, 0.5 * a + b + c]
+
+
+def _transform(function: Callable[[Any, Any, Any], Leaves], matrix: Any) -> list[Leaves]:
+    """Apply a function to each column, and to each row of what that makes."""
+    return [function(*row) for row in zip(*(function(*column) for column in zip(*matrix, strict=True)), strict=True)]
 
 
 def _innovation(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
@@ -119,23 +137,13 @@ def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
     # with C = 1 - K C: C' small, less the error; C' large C, and the precision of the reading
     small = [carry[0] - dot(gain, carry[:3]) - e / s, carry[1], carry[2]]
     w = [dot(row, gain) for row in large]
-    large = [
-        [large[0][0] - 2.0 * w[0] + dot(gain, w) + 1.0 / s, large[0][1] - w[1], large[0][2] - w[2]],
-        [large[0][1] - w[1], large[1][1], large[1][2]],
-        [large[0][2] - w[2], large[1][2], large[2][2]],
-    ]
+    first = [large[0][0] - 2.0 * w[0] + dot(gain, w) + 1.0 / s, large[0][1] - w[1], large[0][2] - w[2]]
+    large = [first, [first[1], *large[1][1:]], [first[2], *large[2][1:]]]
     products = [[dot(p[i], large[j]) for j in range(3)] for i in range(3)]
     state = [x[i] - dot(p[i], small) for i in range(3)]
     covariance = [p[i][j] - dot(products[i], p[j]) for i, j in _UPPER]
-    # the transposed transition
-    rows = [
-        large[0],
-        [large[0][j] + large[1][j] for j in range(3)],
-        [0.5 * large[0][j] + large[1][j] + large[2][j] for j in range(3)],
-    ]
-    moved = [[row[0], row[0] + row[1], 0.5 * row[0] + row[1] + row[2]] for row in rows]
-    a, b, c = small
-    return [a, a + b, 0.5 * a + b + c, *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
+    moved = _transform(_advance_transposed, large)
+    return [*_advance_transposed(*small), *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
 
 
 def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> Arrays:
@@ -228,7 +236,7 @@ def _fit(position: np.ndarray) -> tuple[Any, Any]:
     return np.exp(0.5 * (low + high)), noise * unit
 
 
-def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
+def smooth(position: Signal, period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:
@@ -248,9 +256,7 @@ def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tup
         return _smoothed(values, smoothness, sigma, h)
 
 
-def smoothed_accelerations(
-    positions: Float[np.ndarray, "samples columns"], period: float, known: tuple[Any, Any]
-) -> Float[np.ndarray, "samples columns"]:
+def smoothed_accelerations(positions: Signals, period: float, known: tuple[Any, Any]) -> Signals:
     """Accelerations of several channels, each smoothed as :func:`smooth` does with the same `known` numbers."""
     sigma, jerk = known
     smoothness, found = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)

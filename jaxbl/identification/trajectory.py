@@ -25,6 +25,12 @@ from jaxbl.simulate import Experiment, PlantState, plant_trajectory
 from .compilation import jit
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 
+Residuals = Float[Array, "windows samples sides"]
+"""Of positions over the noise."""
+Theta = Float[Array, " parameters"]
+"""Coordinates of the free parameters."""
+_Slopes = tuple[Array, PlantState, Array]
+"""Residuals, initial states, derivatives of the residuals by theta."""
 _INNER = 2
 """Initial states tried at each step of the fit."""
 RIDGE = 1e-10
@@ -65,30 +71,25 @@ class Windows(eqx.Module):
     start: PlantState
     noise: dict[str, Float[Array, ""]]
     rest: Bool[Array, " windows"]
-    finer: Float[Array, "windows samples sides"]
+    finer: Residuals
     gain: dict[str, Float[Array, " 2"]] | None = None
 
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
-        return self._of(jax.tree.map(lambda x: np.asarray(x)[which], self._columns))
+        columns, common = eqx.partition(self, _IN_COLUMNS)
+        return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[which], columns), common)
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
         """Windows of several parts of a record, with the noise and gain of the first."""
-        return parts[0]._of(jax.tree.map(lambda *x: np.concatenate(x), *(part._columns for part in parts)))
-
-    @property
-    def _columns(self) -> tuple[Any, ...]:
-        """What has a row a window."""
-        return self.torque, self.measured, self.time, self.start, self.rest, self.finer
-
-    def _of(self, columns: tuple[Any, ...]) -> "Windows":
-        torque, measured, time, start, rest, finer = columns
-        return Windows(torque, measured, time, start, self.noise, rest, finer, self.gain)
+        columns, common = zip(*(eqx.partition(part, _IN_COLUMNS) for part in parts), strict=True)
+        return eqx.combine(jax.tree.map(lambda *pieces: np.concatenate(pieces), *columns), common[0])
 
 
-_MAPPED = Windows(0, 0, 0, 0, None, 0, 0, None)  # type: ignore[arg-type]
+_IN_COLUMNS = Windows(True, True, True, True, False, True, True, False)  # type: ignore[arg-type]
+"""What has a row a window."""
+_MAPPED = jax.tree.map(lambda has_rows: 0 if has_rows else None, _IN_COLUMNS)
 
 
 class Fit(eqx.Module):
@@ -104,9 +105,9 @@ class Fit(eqx.Module):
         converged: whether the solver met its tolerance.
     """
 
-    theta: Float[Array, " parameters"]
+    theta: Theta
     start: PlantState
-    residual: Float[Array, "windows samples sides"]
+    residual: Residuals
     jacobian: Float[Array, "windows samples sides parameters"]
     cost: Float[Array, ""]
     converged: Array
@@ -122,6 +123,16 @@ def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Flo
     simulated = plant_trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
     return jnp.stack(sides, axis=-1) - window.finer
+
+
+def _differentiate(function: Callable[[Array], Array], point: Array) -> tuple[Array, Array]:
+    """Derivative and value of a function, by one run of it."""
+
+    def twice(point: Array) -> tuple[Array, Array]:
+        value = function(point)
+        return value, value
+
+    return jax.jacfwd(twice, has_aux=True)(point)
 
 
 class _Eliminated(NamedTuple):
@@ -161,12 +172,11 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     )
     known, _ = ravel_pytree(PlantState(free.position, moving, effects))
 
-    def residual(start: Array) -> tuple[Array, Array]:
-        value = _residual(experiment, unravel(start), window).ravel()
-        return value, value
+    def residual(start: Array) -> Array:
+        return _residual(experiment, unravel(start), window).ravel()
 
     def attempt(i: Array, best: _Inner) -> _Inner:
-        slope, value = jax.jacfwd(residual, has_aux=True)(best.tried)
+        slope, value = _differentiate(residual, best.tried)
         slope = slope * known[None, :]
         cost = jnp.sum(value**2)
         better = (cost < best.cost) | ~jnp.isfinite(best.cost)
@@ -205,7 +215,7 @@ def _without(basis: Array, values: Array) -> Array:
 
 def projected_residual(
     experiment: Experiment, windows: Windows, passes: int = 12, rest: bool = True
-) -> tuple[Float[Array, "windows samples sides"], PlantState]:
+) -> tuple[Residuals, PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
     Of each window's initial state `passes` values are tried, with `rest` standstill among them.
@@ -218,19 +228,16 @@ def projected_residual(
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
 
-def _sloped(
-    experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Float[Array, " parameters"]
-) -> tuple[Array, PlantState, Array]:
+def _sloped(experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Theta) -> _Slopes:
     """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
 
-    def one(window: Windows) -> tuple[Array, PlantState, Array]:
+    def one(window: Windows) -> _Slopes:
         found = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
 
-        def residual(theta: Array) -> tuple[Array, Array]:
-            value = _residual(set_free_parameters(experiment, free, theta), found.start, window)
-            return value, value
+        def residual(theta: Array) -> Array:
+            return _residual(set_free_parameters(experiment, free, theta), found.start, window)
 
-        slope, value = jax.jacfwd(residual, has_aux=True)(theta)
+        slope, value = _differentiate(residual, theta)
         return _without(found.basis, value), found.start, _without(found.basis, slope)
 
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
@@ -251,7 +258,7 @@ class _Point(NamedTuple):
     jacobian: Array
     start: PlantState
     squares: Array
-    whole: tuple[Array, PlantState, Array]
+    whole: _Slopes
 
     @property
     def cost(self) -> Array:
@@ -271,7 +278,7 @@ def _reduced(
     experiment: Experiment,
     free: Sequence[FreeParameter],
     windows: Windows,
-    theta: Float[Array, " parameters"],
+    theta: Theta,
     moving: Array,
 ) -> _Point:
     """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
@@ -294,11 +301,14 @@ def _reduced(
 
 class _Solved(NamedTuple):
     theta: Array
-    start: PlantState
-    squares: Array
+    point: _Point
     steps: Array
     converged: Array
-    whole: tuple[Array, PlantState, Array]
+
+
+def _zeros_of(function: Callable[..., _Point], *arguments: Any) -> _Point:
+    """Zeros in the shapes of a result."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
 
 
 def _converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
@@ -321,8 +331,7 @@ def _solve(
     import optimistix as optx
 
     descent, region = optx.DampedNewtonDescent(linear_solver=lineax.QR()), optx.ClassicalTrustRegion()
-    shapes = jax.eval_shape(point, theta, guess)
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    none = _zeros_of(point, theta, guess)
 
     def going(carry: Any) -> Array:
         *_, steps, _, ended = carry
@@ -348,14 +357,14 @@ def _solve(
     theta, best, _, _, steps, _, ended = jax.lax.while_loop(going, step, start)
     # where no step was asked for
     states = jax.tree.map(partial(jnp.where, steps == 0), guess, best.start)
-    return _Solved(theta, states, best.squares, steps, ended & jnp.isfinite(best.cost), best.whole)
+    return _Solved(theta, best._replace(start=states), steps, ended & jnp.isfinite(best.cost))
 
 
 def fit(
     experiment: Experiment,
     free: Sequence[FreeParameter],
     windows: Windows,
-    theta: Float[Array, " parameters"],
+    theta: Theta,
     most_steps: int | Int[Array, ""] = 100,
     held: Bool[Array, " parameters"] | None = None,
     rounds: int | Int[Array, ""] = 3,
@@ -399,10 +408,10 @@ def fit(
         on = ~last & gained & (round < rounds)
         found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 1), count)
         theta = jnp.where((moving > 0.0) & on, found.theta, theta)
-        left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
-        return theta, found.start, left, round + 1, converged, found.whole, on & (rounds <= 1), on
+        left, converged = jnp.where(on, found.point.squares, left), jnp.where(on, found.converged, converged)
+        return theta, found.point.start, left, round + 1, converged, found.point.whole, on & (rounds <= 1), on
 
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(reduced, theta, windows.start).whole)
+    none = _zeros_of(reduced, theta, windows.start).whole
     no, yes = jnp.asarray(False), jnp.asarray(True)
     first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), no, none, no, yes
     # all that simulates stands in the program once: it takes long to compile

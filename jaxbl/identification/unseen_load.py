@@ -13,11 +13,10 @@ backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap)
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +24,7 @@ from scipy.special import chdtri
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.drive.plant import AbstractDrive, EffectStates, PlantState
+from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
@@ -36,7 +35,7 @@ from .free_parameters import PRIOR_DEVIATION, FreeParameter
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
 from .regression import begun
-from .segments import Segment
+from .segments import Segment, reading_noise
 from .trajectory import Fit
 
 _STEP, _SHORTEST = 1e-2, 1e-6
@@ -80,6 +79,8 @@ _APART = 0.2
 """Prior standard deviation of the load's first speed about the motor's, over the motor's rms speed."""
 _STATES = 4
 """Numbers that a part of a log begins with: positions and velocities of both sides."""
+_ignore_divergence = partial(np.errstate, invalid="ignore", over="ignore")
+"""A model that diverges is given up by its errors."""
 GAPS = "half_gap", "dead_zone"
 """Ends of the paths of numbers that make a gap."""
 
@@ -106,14 +107,15 @@ class Point(NamedTuple):
     @property
     def variance(self) -> float:
         """Mean square of the prediction errors, rad^2."""
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
 
 
+@dataclass(eq=False)
 class UnseenLoad:
     """Fits of a model with two inertias to the motor's readings.
 
-    Args:
+    Attributes:
         experiment: the model, with array leaves, at the log's period.
         free: numbers to be fitted.
         width: prior standard deviation of each one's theta, shape (free,).
@@ -121,27 +123,23 @@ class UnseenLoad:
         rest: whether each begins at rest.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        free: Sequence[FreeParameter],
-        width: np.ndarray,
-        segments: Sequence[Segment],
-        rest: bool,
-    ):
+    experiment: Experiment
+    free: Sequence[FreeParameter]
+    width: np.ndarray
+    segments: Sequence[Segment]
+    rest: bool
+
+    def __post_init__(self):
         # half gaps are sought over decades
-        self.free = tuple(one._replace(positive=True) if is_gap(one) else one for one in free)
-        self.experiment, self.width, self.rest = experiment, np.asarray(width), rest
-        self.segments = segments
-        self.period = float(experiment.run.sample_period)
-        self.skipped = [int(_SKIPPED * len(one)) for one in segments]
-        self.count = sum(map(len, segments)) - sum(self.skipped)
-        motions = [one.smoothed["motor"] for one in segments]
-        self._first = np.array([np.asarray(one.state[0, :2]) for one in motions])
-        self._open = np.array([[float(one.deviation(i)[0]) for i in (0, 1)] for one in motions])
-        speed = np.concatenate([np.asarray(one.velocity) for one in motions])
-        self._speed = rms(speed)
-        self.torque = rms(np.concatenate([one.torque for one in segments]))
+        self.free = tuple(parameter._replace(positive=True) if is_gap(parameter) else parameter for parameter in self.free)
+        self.period = float(self.experiment.run.sample_period)
+        self.skipped = [int(_SKIPPED * len(segment)) for segment in self.segments]
+        self.count = sum(map(len, self.segments)) - sum(self.skipped)
+        motions = [segment.smoothed["motor"] for segment in self.segments]
+        self._first = np.array([motion.state[0, :2] for motion in motions])
+        self._open = np.array([[motion.deviation(i)[0] for i in (0, 1)] for motion in motions])
+        self._speed = rms(np.concatenate([motion.velocity for motion in motions]))
+        self.torque = rms(np.concatenate([segment.torque for segment in self.segments]))
 
     @property
     def gap(self) -> int | None:
@@ -170,9 +168,9 @@ class UnseenLoad:
         rows, torque = [], []
         for one in self.segments:
             k = one.kinematics
-            speed = np.asarray(k.velocity["motor"])
-            rows.append(np.stack([np.asarray(k.acceleration["motor"]), speed, np.sign(speed), np.ones(len(speed))], axis=1))
-            torque.append(np.asarray(k.torque))
+            speed = k.velocity["motor"]
+            rows.append(np.stack([k.acceleration["motor"], speed, np.sign(speed), np.ones(len(speed))], axis=1))
+            torque.append(k.torque)
         matrix, torque = np.concatenate(rows), np.concatenate(torque)
         moving = np.abs(matrix[:, 1]) > 0.1 * self._speed
         found = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
@@ -195,15 +193,23 @@ class UnseenLoad:
         inverse = 1.0 / float(plant.inertia("motor")) + ratio**2 / float(plant.inertia("load"))
         # numbers may grow on the way
         fastest = np.sqrt(2.0 * float(plant.transmission.stiffness) * inverse)
-        steps = int(np.clip(np.ceil(self.period * fastest / _RESOLVED), 1, self.experiment.run.substeps))
-        run = replace(self.experiment.run, substeps=steps)
-        experiment = eqx.tree_at(lambda e: e.run, self.experiment, run)
-        return UnseenLoad(experiment, self.free, self.width, self.segments, self.rest)
+        return self._with_steps(int(np.clip(np.ceil(self.period * fastest / _RESOLVED), 1, self.experiment.run.substeps)))
+
+    def _with_steps(self, steps: int) -> "UnseenLoad":
+        """The same with so many plant steps a sample."""
+        return replace(self, experiment=replace(self.experiment, run=replace(self.experiment.run, substeps=steps)))
 
     def numbers(self, theta: np.ndarray) -> dict[str, float]:
         """Values by path."""
         with np.errstate(over="ignore"):
             return {one.path: float(one.value(float(x))) for one, x in zip(self.free, theta, strict=True)}
+
+    def half_gap(self, theta: np.ndarray) -> float:
+        """Half gap, rad."""
+        if self.gap is None:
+            return self._own["half"]
+        number = self.free[self.gap]
+        return half_gap_of(number) * self.numbers(theta)[number.path]
 
     def states(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> list[PlantState]:
         """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
@@ -216,14 +222,14 @@ class UnseenLoad:
 
     def _errors(self, which: int, states: PlantState) -> np.ndarray:
         """What the readings of a segment differ from predictions, last axis (counted samples,)."""
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             errors = self.segments[which].readings["motor"] - np.asarray(states.position["motor"])
         return errors[..., self.skipped[which] :]
 
     def _point(self, theta: np.ndarray, start: np.ndarray, smoothness: float, errors: np.ndarray) -> Point:
         prior = np.sum((theta / self.width) ** 2) + np.sum((start - self._expected(start)) ** 2)
         # a model that diverges
-        with np.errstate(invalid="ignore", over="ignore"):
+        with _ignore_divergence():
             deviance = self.count * np.log(np.mean(errors**2)) + prior
         return Point(theta, start, smoothness, errors, float(deviance) if np.isfinite(deviance) else np.inf)
 
@@ -250,19 +256,16 @@ class UnseenLoad:
         plant = self.experiment.plant
         assert plant.transmission is not None
         known = {"transmission.stiffness": float(plant.transmission.stiffness), "ratio": float(plant.drive.ratio("load"))}
-        return known | {"half": 0.0 if self.gap is not None else plant.half_gap}
+        return known | {"half": plant.half_gap}
 
     def _runs(self, theta: np.ndarray, which: int, starts: np.ndarray, smoothness: float) -> PlantState:
         """Of a segment from several starts, shape (runs, 4)."""
         segment, numbers = self.segments[which], self.numbers(theta)
         known = self._own | numbers
-        ratio, half = known.get("drive.gear_ratio", known["ratio"]), known["half"]
-        if self.gap is not None:
-            one = self.free[self.gap]
-            half += known[one.path] * half_gap_of(one)
+        ratio = known.get("drive.gear_ratio", known["ratio"])
         position = self._first[which, 0] + self._open[which, 0] * starts[:, 0]
         velocity = self._first[which, 1] + self._open[which, 1] * starts[:, 1]
-        twist = starts[:, 2] * (half + self.torque / known["transmission.stiffness"])
+        twist = starts[:, 2] * (self.half_gap(theta) + self.torque / known["transmission.stiffness"])
         load = velocity + _APART * self._speed * starts[:, 3]
         if self.rest:
             velocity, load = np.zeros_like(velocity), np.zeros_like(load)
@@ -282,7 +285,7 @@ class UnseenLoad:
         start, errors = [], []
         for i in range(len(self.segments)):
             each = self._errors(i, self._runs(theta, i, tries, smoothness))
-            with np.errstate(invalid="ignore", over="ignore"):
+            with _ignore_divergence():
                 squares = np.sum(each**2, axis=1)
             best = int(np.argmin(np.where(np.isfinite(squares), squares, np.inf)))
             start.append(tries[best])
@@ -294,7 +297,7 @@ class UnseenLoad:
         held = np.ones(len(self.free), bool)
         point = self.begun(theta, _FOLLOWING[0])
         for one in (*_FOLLOWING, smoothness):
-            point = self.solve(self.at(theta, point.start, one), _FEW, held)
+            point = self.resume(point, _FEW, held, one)
         return point
 
     def slopes(self, point: Point, held: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
@@ -352,10 +355,13 @@ class UnseenLoad:
                 break
         return best
 
+    def resume(self, point: Point, steps: int, held: np.ndarray | None = None, smoothness: float | None = None) -> Point:
+        """Go on from the numbers of a point, of another model or with another predictor; as :meth:`solve`."""
+        return self.solve(self.at(point.theta, point.start, smoothness or point.smoothness), steps, held)
+
     def predictor(self, point: Point) -> Point:
         """The same numbers with the predictor whose errors are least."""
-        tried = [self.at(point.theta, point.start, float(one)) for one in _SMOOTHNESS]
-        return min([point, *tried], key=lambda one: one.deviance)
+        return _likeliest([point, *(self.at(point.theta, point.start, float(one)) for one in _SMOOTHNESS)])
 
     def finished(self, point: Point, held: np.ndarray | None = None) -> Point:
         """Fit with the predictor that suits it best: chosen, fitted, and so on."""
@@ -368,12 +374,11 @@ class UnseenLoad:
 
     def followed(self, point: Point, held: np.ndarray | None = None) -> Point:
         """From a predictor that follows the readings closely to the one that suits the model."""
-        point = self.at(point.theta, point.start, _FOLLOWING[-1])
-        return self.finished(self.solve(point, _MORE, held), held)
+        return self.finished(self.resume(point, _MORE, held, _FOLLOWING[-1]), held)
 
     def unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
-        noise = float(np.mean([float(one.smoothed["motor"].noise) for one in self.segments]))
+        noise = reading_noise(self.segments)["motor"]
         inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
         return inertia * float(np.sqrt(point.smoothness)) * noise / self.period**2
 
@@ -385,12 +390,9 @@ class UnseenLoad:
         what noise in the recorded torque, once more as much, changes.
         """
         announce("standard errors")
-        fine = UnseenLoad(_stepped(self.experiment, 2), self.free, self.width, self.segments, self.rest)
-        others = [fine.solve(fine.at(point.theta, point.start, point.smoothness), _FEW, held)]
-        for factor in _OTHERS:
-            others.append(self.solve(self.at(point.theta, point.start, factor * point.smoothness), _FEW, held))
-        again = [self.solve(self.at(one.theta, one.start, point.smoothness), _BACK, held) for one in others]
-        best = min([point, *again], key=lambda one: one.deviance)
+        others = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW, held)]
+        others += [self.resume(point, _FEW, held, factor * point.smoothness) for factor in _OTHERS]
+        best = _likeliest([point, *(self.resume(other, _BACK, held, point.smoothness) for other in others)])
         width, slope = self.spread(best, held)
         others += self._noisier(best, held)
         # not their mean: some end in the valley that they came from, and say nothing
@@ -405,8 +407,7 @@ class UnseenLoad:
         for seed in range(_DRAWS):
             random = np.random.default_rng(seed)
             segments = [replace(one, torque=one.torque + noise * random.standard_normal(len(one))) for one in self.segments]
-            model = UnseenLoad(self.experiment, self.free, self.width, segments, self.rest)
-            found.append(model.solve(model.at(point.theta, point.start, point.smoothness), _FEW, held))
+            found.append(replace(self, segments=segments).resume(point, _FEW, held))
         return found
 
     def spread(self, point: Point, held: np.ndarray | None = None) -> tuple[Spread, np.ndarray]:
@@ -420,8 +421,9 @@ class UnseenLoad:
             size = (np.sum(slope**2, axis=0) + precision) ** -0.5
         assert size is not None
         scores = slope * size * (point.errors / np.sqrt(point.variance))[:, None]
-        middle = long_run(scores) + np.diag(precision * size**2)
-        white = inverse((slope * size).T @ (slope * size) + np.diag(precision * size**2))
+        prior = np.diag(precision * size**2)
+        middle = long_run(scores) + prior
+        white = inverse((slope * size).T @ (slope * size) + prior)
         scale = np.outer(size, size)[:count, :count]
         inner = white[:count, :count] * scale
         # by a root of the middle: never negative, whatever rounding does
@@ -500,14 +502,12 @@ class Gap(NamedTuple):
         """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settled`."""
         if not self.needed or model.gap is None:
             return self._replace(without=point)
-        one = model.free[model.gap]
-        half = half_gap_of(one) * model.numbers(point.theta)[one.path]
-        return self._replace(best=point, spread=spread, slope=slope, half=half)
+        return self._replace(best=point, spread=spread, slope=slope, half=model.half_gap(point.theta))
 
 
-def _stepped(experiment: Experiment, factor: int) -> Experiment:
-    """With so many times the plant steps."""
-    return eqx.tree_at(lambda e: e.run, experiment, replace(experiment.run, substeps=factor * experiment.run.substeps))
+def _likeliest(points: Sequence[Point]) -> Point:
+    """The point with the least deviance."""
+    return min(points, key=lambda point: point.deviance)
 
 
 def is_gap(one: FreeParameter) -> bool:
@@ -551,24 +551,18 @@ class _Search:
         self.model, self.coarse = model, model.coarse()
         width = np.where([is_known(one) for one in model.free], np.minimum(_NEAR, model.width), model.width)
         width = np.where([is_gap(one) for one in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
-        self.near = UnseenLoad(self.coarse.experiment, model.free, width, model.segments, model.rest)
-        part = max(model.segments, key=len).first(_PART)
-        self.part = UnseenLoad(self.coarse.experiment, model.free, width, [part], model.rest)
+        self.near = replace(self.coarse, width=width)
+        self.part = replace(self.near, segments=[max(model.segments, key=len).first(_PART)])
         assert model.gap is not None
         self.place: int = model.gap
-        one = model.free[self.place]
-        self.one, self.factor = one, half_gap_of(one)
         self.held = np.arange(len(model.free)) == self.place
-        readings = [segment.readings["motor"] for segment in model.segments]
-        self.travel = float(max(np.ptp(each) for each in readings))
-        self.noise = float(np.mean([float(one.smoothed["motor"].noise) for one in model.segments]))
+        self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
+        self.noise = reading_noise(model.segments)["motor"]
 
     def theta(self, half: float) -> float:
         """Of the gap's number, at a half gap in rad."""
-        return self.one.theta(half / self.factor)
-
-    def half(self, theta: float) -> float:
-        return self.factor * float(self.one.value(theta))
+        number = self.model.free[self.place]
+        return number.theta(half / half_gap_of(number))
 
     def run(self) -> Gap:
         announce("trying half gaps")
@@ -581,14 +575,13 @@ class _Search:
         gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)
         least = min(one.variance for _, one in starts)
         tried = [(half, self.model.count * float(np.log(one.variance / least))) for half, one in starts]
-        found = Gap(
-            best, without, spread, slope, gain, 0, self.travel, tried, self.half(best.theta[self.place]), self.travel
-        )
+        half = self.model.half_gap(best.theta)
+        found = Gap(best, without, spread, slope, gain, 0, self.travel, tried, half, self.travel)
         if gain < SHOWN and self._unmet(without, starts[-1][1], worth):
             return found._replace(unmet=True)
         if gain < SHOWN:
             return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
-        return found._replace(crossings=self._crossings(best))
+        return found._replace(crossings=self._turns(best, self.model.experiment, half))
 
     def _starts(self) -> list[tuple[float, Point]]:
         """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
@@ -613,7 +606,7 @@ class _Search:
             points = [one for one in points if one.variance < _HOPELESS * least]
             found = [one.theta for one in sorted(points, key=lambda one: one.variance)[:kept]]
         ends = [self.coarse.followed(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
-        return self.model.finished(min(ends, key=lambda one: one.deviance))
+        return self.model.finished(_likeliest(ends))
 
     def _without(self, best: Point) -> Point:
         """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
@@ -621,17 +614,15 @@ class _Search:
         found = []
         for theta in (self._begun(none).theta, np.where(self.held, none, best.theta)):
             point = self.near.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW, self.held)
-            found.append(self.coarse.solve(self.coarse.at(point.theta, point.start, _FOLLOWING[1]), _MORE, self.held))
-        found = [self.coarse.followed(min(found, key=lambda one: one.deviance), self.held)]
-        return self.model.finished(min(found, key=lambda one: one.deviance), self.held)
+            found.append(self.coarse.resume(point, _MORE, self.held, _FOLLOWING[1]))
+        return self.model.finished(self.coarse.followed(_likeliest(found), self.held), self.held)
 
     def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
         """Whether the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
         # the load in the middle of the gap
-        point = self.near.at(begun.theta, np.zeros_like(without.start), _FOLLOWING[0])
-        point = self.near.solve(point, _FEW, self.held)
-        point = self.coarse.followed(self.coarse.at(point.theta, point.start, _FOLLOWING[1]), self.held)
-        point = self.model.finished(point, self.held)
+        middle = begun._replace(start=np.zeros_like(without.start))
+        point = self.near.resume(middle, _FEW, self.held, _FOLLOWING[0])
+        point = self.model.finished(self.coarse.followed(point, self.held), self.held)
         if not (point.deviance - without.deviance) / worth <= _LIMIT:
             return False
         plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
@@ -648,29 +639,23 @@ class _Search:
         point, last, before = without, half, 0.0
         while half < self.travel:
             theta = np.where(self.held, self.theta(half), point.theta)
-            point = self.model.solve(self.model.at(theta, point.start, without.smoothness), _FEW, self.held)
+            point = self.model.resume(point._replace(theta=theta), _FEW, self.held, without.smoothness)
             gone = (point.deviance - without.deviance) / worth
             if gone > _LIMIT:
-                share = np.sqrt(_LIMIT) - np.sqrt(max(before, 0.0))
-                share /= np.sqrt(gone) - np.sqrt(max(before, 0.0))
-                return float(last + share * (half - last))
+                root = np.sqrt(max(before, 0.0))
+                return float(last + (np.sqrt(_LIMIT) - root) / (np.sqrt(gone) - root) * (half - last))
             last, before, half = half, gone, 1.6 * half
         return self.travel
-
-    def _crossings(self, point: Point) -> int:
-        """How often the load changes flanks."""
-        return self._turns(point, self.model.experiment.plant.drive, self.half(point.theta[self.place]))
 
     def _reversals(self, point: Point) -> int:
         """How often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
         experiment = set_leaves(self.model.experiment, self.model.numbers(point.theta))
-        plant = experiment.plant
-        assert plant.transmission is not None
-        return self._turns(point, plant.drive, 0.05 * self.model.torque / float(plant.transmission.stiffness))
+        assert experiment.transmission is not None
+        return self._turns(point, experiment, 0.05 * self.model.torque / float(experiment.transmission.stiffness))
 
-    def _turns(self, point: Point, drive: AbstractDrive, size: float) -> int:
-        """Changes of sign of the twist between values of at least some size, rad."""
-        ratio = float(drive.ratio("load"))
+    def _turns(self, point: Point, experiment: Experiment, size: float) -> int:
+        """Changes of sign of the twist between values of at least some size, rad: of flanks, where it is the half gap."""
+        ratio = float(experiment.drive.ratio("load"))
         states = self.model.states(point.theta, point.start, point.smoothness)
         return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), size) for one in states)
 
@@ -684,7 +669,7 @@ def fitted(model: UnseenLoad) -> Point:
     """Fit of a model without a gap to be found, from its nominal numbers."""
     coarse = model.coarse()
     found = [coarse.followed(coarse.begun(theta, _FOLLOWING[0])) for theta in model.beginnings()]
-    return model.finished(min(found, key=lambda one: one.deviance))
+    return model.finished(_likeliest(found))
 
 
 def find_gap(model: UnseenLoad) -> Gap:

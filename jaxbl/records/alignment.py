@@ -10,9 +10,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .gearing import Gearing
-from .least_squares import fit_with_jackknife, rms, scale_columns
+from .least_squares import fit_with_jackknife, residual_mean_square, rms
 from .resampling import Grid
-from .signal_quality import find_bandwidth, interpolate_spline, long_segments, longest_segment, low_pass, trim_filter_ends
+from .signal_quality import (
+    find_bandwidth,
+    interpolate_spline,
+    long_segments,
+    longest_segment,
+    low_pass,
+    low_pass_motion,
+    trim_filter_ends,
+)
 
 _SURE_ERRORS = 6.0
 """Standard errors from which on an estimate is sure: errors from 12 blocks are themselves known to 20 %."""
@@ -46,17 +54,11 @@ class NominalDrive:
     half_gap: float = 0.0
     dead_time: Literal["no", "sought", "modelled"] = "no"
 
-    def inertia_at(self, channel: str) -> float:
-        """Return the torque on the motor that accelerates the drive, per acceleration of the encoder `channel`."""
-        return self._refer_to(channel, self.motor_inertia + self.load_inertia / self.gear_ratio**2)
-
-    def viscous_at(self, channel: str) -> float:
-        """Return the viscous torque of the drive on the motor, per speed of the encoder `channel`."""
-        return self._refer_to(channel, self.motor_viscous + self.load_viscous / self.gear_ratio**2)
-
-    def _refer_to(self, channel: str, at_motor: float) -> float:
-        # the torque acts at the motor
-        return at_motor if channel == "theta_e" else at_motor * self.gear_ratio
+    def refer_to(self, channel: str) -> tuple[float, float]:
+        """Return inertia and viscous friction: torque on the motor per acceleration, and speed, of the encoder `channel`."""
+        ratio = 1.0 if channel == "theta_e" else self.gear_ratio
+        inertia = self.motor_inertia + self.load_inertia / self.gear_ratio**2
+        return ratio * inertia, ratio * (self.motor_viscous + self.load_viscous / self.gear_ratio**2)
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,10 @@ def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Ske
     # friction makes the load lag, never lead
     friction_delay = _NOMINAL_FACTOR * max_delay if gearing.skew > 0.0 else 0.0
     is_sure = size > friction_delay + _SURE_ERRORS * gearing.skew_error and size > 0.05 * grid.period
-    value = _estimate_skew_without_windup(grid, nominal, gearing.skew) if is_sure else gearing.skew
+    value, regression = gearing.skew, _regress_twist(grid, nominal, gearing.skew) if is_sure else None
+    if regression is not None:
+        # without the wind-up by the shaft torque, from the motor's equation of motion
+        value += float(regression.values[2]) / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
     return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay, is_sure)
@@ -123,12 +128,6 @@ def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:
         work += float(grid.values["u"][s] @ velocity)
         square += float(velocity @ velocity)
     return abs(work) / square / nominal.stiffness if square else math.inf
-
-
-def _estimate_skew_without_windup(grid: Grid, nominal: NominalDrive, skew: float) -> float:
-    """Estimate the skew from the twist without the wind-up by the shaft torque (from the motor's equation of motion), s."""
-    regression = _regress_twist(grid, nominal, skew)
-    return skew if regression is None else skew + float(regression.values[2]) / nominal.gear_ratio
 
 
 def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
@@ -195,14 +194,18 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     """Regress the twist, with theta_s shifted by a skew (s); None if the motion is too small."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
     width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, differentiate=True)
-    segments = long_segments(grid.segments)
+    segments, cutoff = long_segments(grid.segments), 4.0 * width
     if not width or not segments or "u" not in grid.values:
         return None
     parts = []
     for s in segments:
         moved = interpolate_spline(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
-        parts.append(_low_pass_motion(motor[s], moved, grid.values["u"][s], nominal, 4.0 * width, grid.period))
-    twist, torque, place, velocity, acceleration, motor_velocity, motor_acceleration = np.concatenate(parts).T
+        motor_motion, load_motion = (low_pass_motion(x, cutoff, grid.period) for x in (motor[s], moved))
+        torque = low_pass(grid.values["u"][s], cutoff, grid.period)
+        inner = trim_filter_ends(len(torque), cutoff, grid.period)
+        parts.append(np.stack([torque, *motor_motion, *load_motion], axis=1)[inner])
+    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts).T
+    twist = motor_place - nominal.gear_ratio * place
     shaft_torque = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
     target = twist - shaft_torque / nominal.stiffness
     constant = np.ones(len(target))
@@ -213,18 +216,18 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
         if is_clear.sum() < 0.25 * len(is_clear) or not 0.05 < share < 0.95:
             continue
         rows = np.column_stack([constant, np.sign(flank), velocity, acceleration])[is_clear]
-        mean_square = _residual_mean_square(target[is_clear], rows)
+        mean_square = residual_mean_square(target[is_clear], rows)
         if best is None or mean_square < best[0]:
             best = (mean_square, is_clear, rows)
     flanks = best is not None
     if best is None:
         rows = np.column_stack([constant, velocity, acceleration])
-        best = (_residual_mean_square(target, rows), constant > 0.0, rows)
+        best = (residual_mean_square(target, rows), constant > 0.0, rows)
     mean_square, is_clear, rows = best
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
     harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
     with_harmonics = np.column_stack([rows, *harmonics])
-    if _residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
+    if residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
         rows = with_harmonics
     values, errors = fit_with_jackknife(target[is_clear], rows)
     if not np.isfinite(values).all():
@@ -234,21 +237,3 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
     motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
     return _Regression(values, errors, *motion, flanks, twist_range)
-
-
-def _low_pass_motion(
-    motor: np.ndarray, load: np.ndarray, torque: np.ndarray, nominal: NominalDrive, cutoff: float, period: float
-) -> np.ndarray:
-    """Return low-passed twist, torque, load position, and velocity and acceleration of load and motor, (samples, 7)."""
-    smooth = low_pass(np.column_stack([motor, load, torque]), cutoff, period)
-    rates = np.gradient(smooth[:, :2], period, axis=0)
-    accelerations = np.gradient(rates, period, axis=0)
-    twist = smooth[:, 0] - nominal.gear_ratio * smooth[:, 1]
-    columns = [twist, smooth[:, 2], smooth[:, 1], rates[:, 1], accelerations[:, 1], rates[:, 0], accelerations[:, 0]]
-    return np.column_stack(columns)[trim_filter_ends(len(motor), cutoff, period)]
-
-
-def _residual_mean_square(target: np.ndarray, rows: np.ndarray) -> float:
-    """Return the mean square of the residuals of a least-squares fit."""
-    scaled = scale_columns(rows)
-    return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))

@@ -9,7 +9,7 @@ from jaxbl.validation import suggest_word
 
 from .files import LogFile
 from .libraries import ColumnName
-from .signal_quality import find_resolution
+from .signal_quality import find_resolution, find_runs
 from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
@@ -81,8 +81,7 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         names = list(file.columns)
         hint = "the file has no header" if all(isinstance(n, int) for n in names) else suggest_word("u", map(str, names))
         raise file.error(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
-    channel_tables = (table.t, table.u, table.theta_e, table.theta_s, table.omega_e, table.omega_s)
-    used_columns = {t.column for t in channel_tables if t is not None}
+    used_columns = {channel.column for channel in table.channels.values() if channel is not None}
     for column in file.columns:
         is_similar = isinstance(column, str) and column.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if is_similar and column not in used_columns:
@@ -120,17 +119,17 @@ def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -
     if isinstance(table, TorqueTable):
         unit_factor, factor = 1.0, 1.0 if table.factor is None else table.factor
     elif isinstance(table, SpeedTable):
-        unit_factor, factor = _SPEED_FACTORS[table.unit], table.factor
+        unit_factor, factor = SPEED_FACTORS[table.unit], table.factor
     else:
-        unit_factor, factor = _POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
+        unit_factor, factor = POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
     return table.sign * factor * unit_factor * values + (table.offset or 0.0)
 
 
-_POSITION_FACTORS = {
+POSITION_FACTORS = {
     "rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "counts": 2.0 * math.pi, "m": 1.0, "mm": 1e-3,
 }  # fmt: skip
 """Unit of a position -> rad (m); for counts, rad a turn."""
-_SPEED_FACTORS = {
+SPEED_FACTORS = {
     "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
 }  # fmt: skip
 """Unit of a speed -> rad/s (m/s)."""
@@ -189,17 +188,19 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     values = _replace_dropouts(file, name, values, stamps)
     saturated = 0.0
     if table.saturation is not None:
+        size = np.abs(values)
         # the margins are for the rounding of decimal numbers
-        if np.abs(values).max() > table.saturation * (1.0 + 1e-9):
-            row = int(np.argmax(np.abs(values)))
+        if size.max() > table.saturation * (1.0 + 1e-9):
+            row = int(np.argmax(size))
             raise file.error(
                 f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
                 f"{table.saturation:g}; saturation should be the largest possible value"
             )
-        saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
+        saturated = float(np.mean(size >= table.saturation * (1.0 - 1e-9)))
     values = to_si(table, values)
-    if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
-        raise file.error(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
+    largest = np.abs(values).max()
+    if 0.0 < largest < _LEAST_TORQUE:
+        raise file.error(f"{name} is at most {largest:.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew or 0.0)
 
 
@@ -217,8 +218,7 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
     The value is 0, or the least or largest. Two samples on each side of a dropout lie on a line that is far from it.
     """
     for filler in (0.0, values.min(), values.max()):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], values == filler, [False]]).astype(int)))
-        starts, stops = edges[::2], edges[1::2]
+        starts, stops = find_runs(values == filler)
         is_inside = (stops - starts <= _MAX_DROPOUT) & (starts >= 2) & (stops <= len(values) - 2)
         starts, stops = starts[is_inside], stops[is_inside]
         beside = values[np.stack([starts - 2, starts - 1, stops, stops + 1])]

@@ -71,6 +71,15 @@ class Number(NamedTuple):
     interval: tuple[float, float]
     unit: str
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the number as result files hold it."""
+        return {
+            "value": self.value,
+            "standard_error": self.error,
+            "interval": list(self.interval),
+            "unit": self.unit,
+        }
+
 
 @dataclass(frozen=True)
 class Element:
@@ -103,22 +112,31 @@ class Element:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `inspection.json`."""
-        numbers = {
-            name: {
-                "value": number.value,
-                "standard_error": number.error,
-                "interval": list(number.interval),
-                "unit": number.unit,
-            }
-            for name, number in self.numbers.items()
-        }
         return {
-            "numbers": numbers,
+            "numbers": {name: number.to_dict() for name, number in self.numbers.items()},
             "open": list(self.open),
             "gains": self.gains,
             "residual": self.residual,
             "share": self.share,
         }
+
+
+class RigLog(NamedTuple):
+    """Log of a transmission.
+
+    Attributes:
+        position: displacement of one side against the other, rad (m), shape (samples,).
+        torque: through the transmission, N m (N), shape (samples,).
+        segments: contiguous parts.
+        period: of sampling, s.
+        noise: of the displacement, rad (m) rms.
+    """
+
+    position: np.ndarray
+    torque: np.ndarray
+    segments: Sequence[slice]
+    period: float
+    noise: float
 
 
 @dataclass(frozen=True)
@@ -155,19 +173,17 @@ class _Rig:
         x = self.position - shapes_by_name.get("centre", 0.0)
         b = shapes_by_name.get("half_gap", 0.0)
         deflection = x - np.clip(x, -b, b)
-        columns = [deflection[rows], np.ones(len(rows))]
-        for term in terms:
-            if term == "damping":
-                # no damping inside the gap; a part of it in a sample that crosses an end of the gap
-                contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
-                columns.append((self.rate * contact)[rows])
-            elif term == "dry friction":
-                columns.append(self.direction[rows])
-            elif term == "hysteresis":
-                columns.append(self._compute_hysteresis(deflection, shapes_by_name["length"])[rows])
-            elif term == "friction under load":
-                columns.append((np.abs(deflection) * self.direction)[rows])
-        return np.stack(columns, axis=1)
+        # no damping inside the gap; a part of it in a sample that crosses an end of the gap
+        contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
+        signals = {
+            "damping": self.rate * contact,
+            "dry friction": self.direction,
+            "friction under load": np.abs(deflection) * self.direction,
+        }
+        if "hysteresis" in terms:
+            signals["hysteresis"] = self._compute_hysteresis(deflection, shapes_by_name["length"])
+        columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
+        return np.stack([column[rows] for column in columns], axis=1)
 
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
@@ -185,20 +201,9 @@ class _Rig:
         return h
 
 
-def fit_element(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, *, noise: float, linear: bool
-) -> Element | None:
-    """Fit a transmission to its displacement and torque; None if the displacement never turns back, or hardly moves.
-
-    Args:
-        position: displacement of one side against the other, rad (m), shape (samples,).
-        torque: through the transmission, N m (N), shape (samples,).
-        segments: contiguous parts.
-        period: of sampling, s.
-        noise: of the displacement, rad (m) rms.
-        linear: True for a displacement in m.
-    """
-    rig = _prepare_rig(*_average_samples(position, torque, segments, period, noise))
+def fit_element(log: RigLog, *, linear: bool) -> Element | None:
+    """Fit a transmission to its displacement (`linear`: in m) and torque; None if it never turns back, or hardly moves."""
+    rig = _prepare_rig(_average_samples(log))
     if rig is None:
         return None
     # either way may end at a model that no single step improves
@@ -210,18 +215,17 @@ def fit_element(
     best = models[1] if _compute_gain(rig, *models) is not None else models[0]
     best = _drop_terms(rig, best)
     gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
-    full_rig = _prepare_rig(position, torque, segments, period, noise)
+    full_rig = _prepare_rig(log)
     return _make_element(rig, full_rig or rig, best, gains, linear)
 
 
-def _average_samples(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> tuple[np.ndarray, np.ndarray, list[slice], float, float]:
-    """Average neighbouring samples of a long log. Returns the arguments of :func:`_prepare_rig`."""
+def _average_samples(log: RigLog) -> RigLog:
+    """Average neighbouring samples of a long log."""
+    position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
-        return position, torque, list(segments), period, noise
+        return log
     parts, ends, mean_count = [], [], 0
     for s in segments:
         segment_means = (s.stop - s.start) // count
@@ -232,12 +236,11 @@ def _average_samples(
         ends.append(slice(mean_count, mean_count + segment_means))
         mean_count += segment_means
     means = np.concatenate(parts, axis=1)
-    return means[0], means[1], ends, count * period, noise / math.sqrt(count)
+    return RigLog(*means, ends, count * period, noise / math.sqrt(count))
 
 
-def _prepare_rig(
-    position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> _Rig | None:
+def _prepare_rig(log: RigLog) -> _Rig | None:
+    position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
     smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
     stretches: list[slice] = []
@@ -369,10 +372,10 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     names = _shape_names(terms)
     half, middle = rig.half_range, 0.5 * (float(rig.position.min()) + float(rig.position.max()))
     near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
-    grids = {
-        "centre": [middle + half * start for start in _CENTRE_STARTS],
-        "half_gap": [half * start for start in _HALF_GAP_STARTS],
-        "length": [half * start for start in _LENGTH_STARTS],
+    choices = {
+        "centre": ([middle + half * start for start in _CENTRE_STARTS], middle - half, middle + half),
+        "half_gap": ([half * start for start in _HALF_GAP_STARTS], 0.0, half),
+        "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
     }
 
     def compute_residual(shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -381,11 +384,10 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
 
     shapes = np.empty(0)
     if names:
-        bounds = {"centre": (middle - half, middle + half), "half_gap": (0.0, half), "length": (1e-4 * half, 10.0 * half)}
-        low, high = np.array([bounds[name] for name in names]).T
+        low, high = np.array([choices[name][1:] for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few_rows = rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)]
-        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else grids[name] for name in names))
+        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else choices[name][0] for name in names))
         starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few_rows) ** 2)))[:3]
         inside = low + 1e-9 * half, high - 1e-9 * half
         solutions = [search(np.clip(np.array(start), *inside), args=(few_rows,)) for start in starts]
@@ -452,7 +454,8 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
             low = max(low, 0.0)
             if not error < _MAX_RELATIVE_ERROR * abs(value):
                 open_.append(name)
-        numbers[name] = Number(value, error, (low, high), _unit_of(name, linear))
+        unit = on_a_line(_UNITS[name]) if linear else _UNITS[name]
+        numbers[name] = Number(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_columns(model.terms, model.shapes, full_rig.rows) @ model.sizes
     spread = float(np.std(rig.torque[rig.rows]))
@@ -479,20 +482,14 @@ _UNITS = {
 """Units of numbers on a rotary axis."""
 
 
-def _unit_of(name: str, linear: bool) -> str:
-    return on_a_line(_UNITS[name]) if linear else _UNITS[name]
-
-
-def element_error(
-    element: Element, position: np.ndarray, torque: np.ndarray, segments: Sequence[slice], period: float, noise: float
-) -> tuple[float, float] | None:
+def element_error(element: Element, log: RigLog) -> tuple[float, float] | None:
     """Compute the rms torque error of a fitted transmission on another log, N m (N), and the same over the rms torque.
 
-    Other arguments are those of :func:`fit_element`; None if the log cannot be fitted.
+    None if the log cannot be fitted.
     """
-    rig = _prepare_rig(position, torque, segments, period, noise)
+    rig = _prepare_rig(log)
     if rig is None:
         return None
-    residual = torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
+    residual = rig.torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
     residual_rms = rms(residual)
-    return residual_rms, residual_rms / float(np.std(torque[rig.rows]))
+    return residual_rms, residual_rms / float(np.std(rig.torque[rig.rows]))

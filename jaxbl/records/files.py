@@ -13,7 +13,7 @@ import math
 import re
 import warnings
 from codecs import BOM_UTF8
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.registry import Registry
 from jaxbl.validation import LARGEST, check_file, explain_missing_file, suggest_word
 
-from .libraries import Column, ColumnName, Columns, read_bag, read_mcap, read_mdf, read_tdms
+from .libraries import Column, ColumnName, Columns, Selection, read_bag, read_mcap, read_mdf, read_tdms
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
@@ -127,11 +127,8 @@ class LogFile:
     def load_values(self, name: ColumnName) -> np.ndarray:
         """Load a column as it is in the file, shape (rows,); InputError if it is too long or cannot be read."""
         self.count_values(name)
-        try:
-            with _report_errors(f"column {name!r}"):
-                return np.asarray(self.columns[name])
-        except InputError as error:
-            raise self.error(str(error)) from None
+        with name_file_in_errors(self.path), _report_errors(f"column {name!r}"):
+            return np.asarray(self.columns[name])
 
     def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> np.ndarray:
         """Load a column of time stamps, s, shape (rows,); dates are counted from the first one.
@@ -193,7 +190,7 @@ def log_suffixes() -> tuple[str, ...]:
     return (*_SUFFIXES, *(f".{name}" for name in READERS))
 
 
-def read_log_file(path: Path, selection: Collection[ColumnName] = ()) -> LogFile:
+def read_log_file(path: Path, selection: Selection = ()) -> LogFile:
     """Read columns of a log file. Suffix and first bytes tell its kind.
 
     Args:
@@ -203,9 +200,12 @@ def read_log_file(path: Path, selection: Collection[ColumnName] = ()) -> LogFile
     Raises:
         InputError: the file is missing, empty, or of no known kind.
     """
-    try:
+    with name_file_in_errors(path):
         check_file(path)
-        columns = _read_columns(path, selection)
+        try:
+            columns = _read_columns(path, selection)
+        except IsADirectoryError:
+            raise InputError("is a folder; a log file is needed") from None
         if not all(str(name).isprintable() for name in columns):
             printable_columns = {
                 escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
@@ -213,18 +213,24 @@ def read_log_file(path: Path, selection: Collection[ColumnName] = ()) -> LogFile
             columns.clear()
             columns.update(printable_columns)
         return LogFile(path, columns)
+
+
+@contextmanager
+def name_file_in_errors(path: Path | str, remedy: str = "check its permissions") -> Iterator[None]:
+    """Begin an InputError with the name of a file; make one of it that the file is missing or cannot be read."""
+    try:
+        yield
+        return
     except FileNotFoundError:
-        fault = explain_missing_file(path, log_suffixes())
-    except IsADirectoryError:
-        fault = "is a folder; a log file is needed"
+        fault = explain_missing_file(Path(path), log_suffixes())
     except OSError as error:
-        fault = f"cannot be read: {error.strerror or error}; check its permissions"
+        fault = f"cannot be read: {error.strerror or error}; {remedy}"
     except InputError as error:
         fault = str(error)
     raise InputError(f"{path}: {fault}")
 
 
-def _read_columns(path: Path, selection: Collection[ColumnName]) -> Columns:
+def _read_columns(path: Path, selection: Selection) -> Columns:
     suffix = path.suffix.lower()
     if (path / _BAG_METADATA).is_file():
         with _report_errors("a ROS bag"):
@@ -276,7 +282,7 @@ def _read_with_installed_reader(path: Path, suffix: str) -> Columns:
     return columns
 
 
-def _read_text(path: Path, head: str, encoding: str, is_complete: bool, selection: Collection[ColumnName]) -> Columns:
+def _read_text(path: Path, head: str, encoding: str, is_complete: bool, selection: Selection) -> Columns:
     """Read JSON or a table. `head` is the beginning of the text, or all of it (`is_complete`)."""
 
     def load_text() -> str:
@@ -337,9 +343,7 @@ _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|i
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _read_table(
-    path: Path, head: str, encoding: str, load_text: Callable[[], str], selection: Collection[ColumnName]
-) -> Columns:
+def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], str], selection: Selection) -> Columns:
     """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks."""
     lines = head.splitlines()
     if max(map(len, lines)) == len(head) and len(head) > _HEAD_BYTES // 2:
@@ -348,7 +352,7 @@ def _read_table(
         return columns
     text_format = detect_text_format(lines)
 
-    def load_rows(selection: Collection[ColumnName]) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
+    def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
@@ -615,7 +619,7 @@ def _to_array(values: list[Any]) -> np.ndarray:
     return np.asarray(pd.Series(values, dtype=object).infer_objects())
 
 
-def _read_matlab(path: Path, selection: Collection[ColumnName]) -> Columns:
+def _read_matlab(path: Path, selection: Selection) -> Columns:
     """Read vectors, columns of matrices (`name[0]`), fields of structures (`name.field`), and cells (`name[0]`)."""
     from scipy.io import loadmat, whosmat
 

@@ -1,12 +1,19 @@
 """Relation of motor and load position: ratio, skew, lost motion."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .least_squares import fit_with_jackknife, rms, scale_columns
+from .least_squares import (
+    fit_with_jackknife,
+    fit_without_blocks,
+    residual_mean_square,
+    rms,
+    scale_columns,
+    sum_over_blocks,
+)
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
+from .resampling import Grid
 from .rigid_body import smooth_sign
 from .signal_quality import (
     MIN_SAMPLES,
@@ -16,6 +23,7 @@ from .signal_quality import (
     long_segments,
     longest_segment,
     low_pass,
+    low_pass_motion,
     trim_filter_ends,
 )
 
@@ -63,13 +71,11 @@ class Gearing(LostMotion):
         """Describe value, error and interval; for rad also in degrees."""
         low, high = self.lost_motion_interval
         digits = _count_decimals(self.lost_motion_error)
-        text = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
-        text += f" (95 %: {low:.{digits}f} to {high:.{digits}f}"
-        if unit == "rad":
-            value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
-            digits = _count_decimals(error)
-            text += f"; {value:.{digits}f} ± {error:.{digits}f}°"
-        return f"{text})"
+        size = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
+        value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
+        degrees = _count_decimals(error)
+        in_degrees = f"; {value:.{degrees}f} ± {error:.{degrees}f}°" if unit == "rad" else ""
+        return f"{size} (95 %: {low:.{digits}f} to {high:.{digits}f}{in_degrees})"
 
     def exceeds_noise(self, noise: float) -> bool:
         """Return True if the lost motion exceeds its error and the noise (:func:`twist_noise`)."""
@@ -81,16 +87,7 @@ def _count_decimals(error: float) -> int:
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
-def fit_gearing(
-    times: np.ndarray,
-    motor: np.ndarray,
-    load: np.ndarray,
-    segments: Sequence[slice],
-    period: float,
-    *,
-    expected: float | None = None,
-    turn: float | None = None,
-) -> Gearing | None:
+def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float | None = None) -> Gearing | None:
     """Regress motor on load position, its velocity, acceleration and flank; None if the motion is too small.
 
     A delay of the load's stamps adds a part to theta_e that is proportional to the velocity; lost motion adds a part with
@@ -102,10 +99,10 @@ def fit_gearing(
     Lost motion is found with the `expected` ratio, if there is one. Gear and encoders repeat after a `turn` of the load;
     None on a linear axis.
     """
-    part = longest_segment(segments)
+    period, motor, load = grid.period, grid.values["theta_e"], grid.values["theta_s"]
+    part, usable = longest_segment(grid.segments), long_segments(grid.segments)
     width = _velocity_bandwidth(load[part], period)
-    usable = long_segments(segments)
-    fit = _fit_with_skew(times, motor, load, usable, period, width) if width and usable else None
+    fit = _fit_with_skew(grid, width) if width and usable else None
     if fit is None:
         return None
     target, rows, coefficients, errors, skew, has_skew = fit
@@ -124,14 +121,16 @@ def fit_gearing(
     # only a significant skew is undone
     undone_skew = skew if has_skew and abs(skew) > 4.0 * errors[1] / abs(coefficients[0]) else 0.0
     ratio = slope if expected is None else expected
-    aligned = [interpolate_spline(times[s], load[s], times[s] + undone_skew) if undone_skew else load[s] for s in usable]
+    aligned = [
+        interpolate_spline(grid.time[s], load[s], grid.time[s] + undone_skew) if undone_skew else load[s] for s in usable
+    ]
     motor_there, load_there = np.concatenate([motor[s] for s in usable]), np.concatenate(aligned)
     twist, least_twist = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, slope))
     motion = float(np.ptp(motor_there))
     is_wide = min(twist, least_twist) > WIDE_TWIST * motion
     # with stick and slip, or a coarse encoder, the load shows its direction no sooner than the motor
     slow = min(width, _velocity_bandwidth(motor[part], period) or width)
-    lost_motion_fit = _fit_lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, is_wide=is_wide)
+    lost_motion_fit = _fit_lost_motion(grid, aligned, 4.0 * slow, ratio, turn, is_wide=is_wide)
     if lost_motion_fit is None:
         # no flank is in contact for long: the rough regression has to do
         lost_motion_fit = LostMotion.from_motion(
@@ -155,9 +154,7 @@ def fit_gearing(
     )
 
 
-def _fit_with_skew(
-    times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, width: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
+def _fit_with_skew(grid: Grid, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
     """Repeat :func:`_regress_motor` until the skew of the load converges.
 
     Returns:
@@ -166,11 +163,11 @@ def _fit_with_skew(
     skew, has_skew, fit = 0.0, True, None
     # converges quadratically: five steps are ample
     for _ in range(5):
-        fit = _regress_motor(times, motor, load, segments, period, 4.0 * width, skew)
+        fit = _regress_motor(grid, 4.0 * width, skew)
         if fit is None:
             return None
         step = float(fit[2][1] / fit[2][0])
-        if not has_skew or abs(step) < 1e-3 * period:
+        if not has_skew or abs(step) < 1e-3 * grid.period:
             break
         skew += step
         # a quarter of the fastest period: a load that moves on its own, no delay of an encoder
@@ -201,23 +198,18 @@ _FOLDS = 10
 """Blocks of the log, each left out in turn, on which a drift has to predict better."""
 
 
-def fit_drift(
-    times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, skew: float
-) -> Drift | None:
-    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`.
-
-    Other arguments are those of :func:`fit_gearing`.
-    """
-    width = _velocity_bandwidth(load[longest_segment(segments)], period)
-    usable = long_segments(segments)
-    if not width or not usable:
+def fit_drift(grid: Grid, skew: float) -> Drift | None:
+    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`."""
+    period = grid.period
+    width = _velocity_bandwidth(grid.values["theta_s"][longest_segment(grid.segments)], period)
+    if not width or not long_segments(grid.segments):
         return None
-    constant = _regress_motor(times, motor, load, usable, period, 4.0 * width, skew)
+    constant = _regress_motor(grid, 4.0 * width, skew)
     drift, fit, error = 0.0, None, np.inf
-    half = 0.5 * float(times[-1] - times[0])
+    half = 0.5 * float(grid.time[-1] - grid.time[0])
     # converges quadratically, as the skew does
     for _ in range(6):
-        fit = _regress_motor(times, motor, load, usable, period, 4.0 * width, skew, drift)
+        fit = _regress_motor(grid, 4.0 * width, skew, drift)
         if fit is None or constant is None:
             return None
         values, errors = fit[2], fit[3]
@@ -237,13 +229,10 @@ def fit_drift(
 
 def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the mean square error on each block of a regression on all other blocks, shape (blocks,)."""
-    scaled, errors = scale_columns(rows), []
-    blocks = np.array_split(np.arange(len(target)), _FOLDS)
-    grams, moments = [scaled[b].T @ scaled[b] for b in blocks], [scaled[b].T @ target[b] for b in blocks]
-    for block, gram, moment in zip(blocks, grams, moments, strict=True):
-        values = np.linalg.lstsq(sum(grams) - gram, sum(moments) - moment, rcond=1e-12)[0]
-        errors.append(float(np.mean((target[block] - scaled[block] @ values) ** 2)))
-    return np.array(errors)
+    scaled = scale_columns(rows)
+    blocks, grams, moments = sum_over_blocks(target, scaled, _FOLDS)
+    fits = zip(blocks, fit_without_blocks(grams, moments), strict=True)
+    return np.array([np.mean((target[block] - scaled[block] @ values) ** 2) for block, values in fits])
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
@@ -266,32 +255,20 @@ def _fit_terms(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _fit_lost_motion(
-    times: np.ndarray,
-    motor: np.ndarray,
-    aligned: list[np.ndarray],
-    segments: Sequence[slice],
-    period: float,
-    cutoff: float,
-    ratio: float,
-    turn: float | None,
-    *,
-    is_wide: bool,
+    grid: Grid, aligned: list[np.ndarray], cutoff: float, ratio: float, turn: float | None, *, is_wide: bool
 ) -> LostMotion | None:
     """Fit the lost motion by the direction of motion, or by changes of the sign of the load torque.
 
-    `aligned` is theta_s without its skew, of each segment; `cutoff` is that of the low-pass before differentiation, Hz.
+    `aligned` is theta_s without its skew, of each long segment; `cutoff` is that of the low-pass before differentiation, Hz.
     If the twist `is_wide`, a large part of the motion, errors that repeat with position cannot be separated.
     """
     from scipy.ndimage import minimum_filter1d
 
-    parts = []
-    for s, load in zip(segments, aligned, strict=True):
-        smooth = low_pass(load, cutoff, period)
-        velocity = np.gradient(smooth, period)
-        cut = trim_filter_ends(len(smooth), cutoff, period)
-        parts.append(
-            np.stack([times[s], motor[s] - ratio * load, smooth, velocity, np.gradient(velocity, period)], axis=1)[cut]
-        )
+    period, parts = grid.period, []
+    for s, load in zip(long_segments(grid.segments), aligned, strict=True):
+        cut = trim_filter_ends(len(load), cutoff, period)
+        motion = low_pass_motion(load, cutoff, period)
+        parts.append(np.stack([grid.time[s], grid.values["theta_e"][s] - ratio * load, *motion], axis=1)[cut])
     time, twist, position, velocity, acceleration = np.concatenate(parts).T
     ends = np.cumsum([len(part) for part in parts])[:-1]
     rows = [np.ones_like(position), velocity, acceleration]
@@ -316,9 +293,7 @@ def _fit_lost_motion(
         sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
         if len(sample) < 3 * terms.shape[1] or is_clear.sum() < 0.1 * len(is_clear):
             continue
-        columns = scale_columns(np.column_stack([np.sign(flank[sample]), terms[sample]]))
-        fitted = columns @ np.linalg.lstsq(columns, twist[sample], rcond=1e-10)[0]
-        mean_square = float(np.mean((twist[sample] - fitted) ** 2))
+        mean_square = residual_mean_square(twist[sample], np.column_stack([np.sign(flank[sample]), terms[sample]]))
         if best is None or mean_square < best[0]:
             best = (mean_square, flank, is_clear)
     if best is None:
@@ -362,14 +337,7 @@ def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics)
 
 
 def _regress_motor(
-    times: np.ndarray,
-    motor: np.ndarray,
-    load: np.ndarray,
-    segments: Sequence[slice],
-    period: float,
-    cutoff: float,
-    skew: float,
-    drift: float | None = None,
+    grid: Grid, cutoff: float, skew: float, drift: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Regress motor on load position for :func:`fit_gearing`, at a skew (s) and a drift (s/s) about the middle of the log.
 
@@ -377,14 +345,17 @@ def _regress_motor(
         Motor positions, shape (rows,). Terms, shape (rows, terms): position, velocity, flank, 1, acceleration, HARMONICS
         terms of the series, and with a `drift` velocity times time. Coefficients and standard errors, shape (terms,).
     """
-    middle = 0.5 * float(times[0] + times[-1])
-    parts, smooth_motor = [], []
-    for s in segments:
-        late = skew + (drift or 0.0) * (times[s] - middle)
-        smooth = low_pass(interpolate_spline(times[s], load[s], times[s] + late), cutoff, period)
-        velocity = np.gradient(smooth, times[s])
-        parts.append(np.stack([smooth, velocity, np.gradient(velocity, times[s])]))
-        smooth_motor.append(low_pass(motor[s], cutoff, period))
+    period, load = grid.period, grid.values["theta_s"]
+    middle = 0.5 * float(grid.time[0] + grid.time[-1])
+    parts, smooth_motor, offsets = [], [], []
+    for s in long_segments(grid.segments):
+        times = grid.time[s]
+        offsets.append(times - middle)
+        late = skew + (drift or 0.0) * offsets[-1]
+        smooth = low_pass(interpolate_spline(times, load[s], times + late), cutoff, period)
+        velocity = np.gradient(smooth, times)
+        parts.append(np.stack([smooth, velocity, np.gradient(velocity, times)]))
+        smooth_motor.append(low_pass(grid.values["theta_e"][s], cutoff, period))
     inner = [trim_filter_ends(len(signal), cutoff, period) for signal in smooth_motor]
 
     def join_segments(signals: list[np.ndarray]) -> np.ndarray:
@@ -417,8 +388,7 @@ def _regress_motor(
         return None
     rows[:, 2] = best[1]
     if drift is not None:
-        time_offset = np.concatenate([times[s][cut] for s, cut in zip(segments, inner, strict=True)]) - middle
-        rows = np.column_stack([rows, velocity * time_offset])
+        rows = np.column_stack([rows, velocity * join_segments(offsets)])
     rows, target = rows[best[2]], target[best[2]]
     coefficients, errors = _fit_terms(target, rows)
     if not np.isfinite(coefficients).all() or coefficients[0] == 0.0:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from .alignment import NominalDrive
-from .element import SIZE_NAMES, Element, fit_element
+from .element import SIZE_NAMES, Element, RigLog, fit_element
 from .gearing import Gearing, twist_noise
 from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
-from .signal_quality import low_pass
+from .signal_quality import low_pass, low_pass_motion
 from .table import POSITION_CHANNELS, LogTable
 
 _Answer = Literal["yes", "weak", "no"]
@@ -155,16 +155,12 @@ def element_displacement(record: Record, gear_ratio: float | None) -> np.ndarray
 
 def fit_record_element(record: Record, gear_ratio: float | None) -> Element | None:
     """Fit a transmission on a test rig to its log; None if the log does not show one."""
+    return fit_element(make_rig_log(record, gear_ratio), linear=record.statistics.channels["theta_e"].unit == "m")
+
+
+def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
+    """Return displacement and torque of an element; the noise is that of its readings with their resolution."""
     assert record.torque is not None
-    channel = record.statistics.channels["theta_e"]
-    displacement, noise = element_displacement(record, gear_ratio), element_noise(record, gear_ratio)
-    return fit_element(
-        displacement, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m"
-    )
-
-
-def element_noise(record: Record, gear_ratio: float | None) -> float:
-    """Return the rms noise of an element's displacement with that of its resolution, rad (m)."""
     statistics = record.statistics.channels
     ratio = {"theta_e": 1.0, "theta_s": gear_ratio or 1.0}
     noise = [
@@ -172,7 +168,8 @@ def element_noise(record: Record, gear_ratio: float | None) -> float:
         for name, factor in ratio.items()
         if name in statistics
     ]
-    return float(np.hypot.reduce(np.ravel(noise)))
+    displacement, reading_noise = element_displacement(record, gear_ratio), float(np.hypot.reduce(np.ravel(noise)))
+    return RigLog(displacement, record.torque, record.segments, record.sample_period, reading_noise)
 
 
 _ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap"} | SIZE_NAMES
@@ -209,9 +206,7 @@ def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
-        position = record.positions[side][s]
-        smooth = low_pass(position, 4.0 * width, record.sample_period) if width else position
-        speed[s] = np.gradient(smooth, record.sample_period)
+        _, speed[s], _ = low_pass_motion(record.positions[side][s], 4.0 * width or math.inf, record.sample_period)
     return speed
 
 
@@ -270,10 +265,10 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
             judgements += _judge_alike(["Coulomb friction"], "weak", f"{one_way_text} a constant torque")
         else:
             judgements.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
+    answer, reason = "yes", f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
     if minor_share < 0.05:
-        return [*judgements, Identifiability("constant torque", "weak", f"{one_way_text} Coulomb friction")]
-    reason = f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
-    return [*judgements, Identifiability("constant torque", "yes", reason)]
+        answer, reason = "weak", f"{one_way_text} Coulomb friction"
+    return [*judgements, Identifiability("constant torque", answer, reason)]
 
 
 def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:

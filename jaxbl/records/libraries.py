@@ -17,6 +17,8 @@ from jaxbl.errors import InputError
 
 ColumnName = str | int
 """Name of a column, or its number, counted from 0."""
+Selection = Collection[ColumnName]
+"""Columns that will be used."""
 
 
 class Columns(dict[ColumnName, Any]):
@@ -112,7 +114,7 @@ _Messages = Iterator[tuple[str, int, Any]]
 """Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
 
 
-def read_mcap(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
     library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
@@ -157,7 +159,7 @@ def _message_types(schema: Any) -> Any:
     return store
 
 
-def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
+def read_bag(path: Path, selection: Selection = ()) -> Columns:
     """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
 
     A time is the stamp in the message's header, or the time of recording if there is none. Among the topics of the
@@ -179,7 +181,7 @@ def read_bag(path: Path, selection: Collection[ColumnName] = ()) -> Columns:
 
 
 def _recording_columns(
-    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Collection[ColumnName]
+    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Selection
 ) -> Columns:
     """Return the columns of a recording; the first one that is used of a topic loads all its selected ones.
 
@@ -198,32 +200,29 @@ def _recording_columns(
     loaded_values: dict[str, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
 
-    def load_values(topic: str, name: str) -> np.ndarray:
-        if name not in loaded_values:
-            names = [
-                column for column, place in places.items() if place[0] == topic and (column in selection or column == name)
-            ]
-            paths = [fields[topic][places[column][1]] for column in names]
-            stamps, recording_times, rows = array("q"), array("q"), array("d")
-            for _, time, message in iterate_messages([topic]):
-                stamps.append(_header_time(message))
-                recording_times.append(time)
-                rows.extend(float(_number_at(message, path)) for path in paths)
-            # a clock may begin at 0; headers that are not filled in are all 0
-            has_stamps = len(stamps) > 1 and all(stamps[1:])
-            times[topic] = np.frombuffer(stamps if has_stamps else recording_times, dtype=np.int64)
-            values = np.frombuffer(rows, dtype=float).reshape(-1, len(names)) if names else np.empty((len(stamps), 0))
-            loaded_values.update(dict(zip(names, values.T, strict=True)))
-        return loaded_values.get(name, np.empty(0))
+    def load_topic(topic: str, name: str = "") -> None:
+        names = [column for column, place in places.items() if place[0] == topic and (column in selection or column == name)]
+        paths = [fields[topic][places[column][1]] for column in names]
+        stamps, recording_times, rows = array("q"), array("q"), array("d")
+        for _, time, message in iterate_messages([topic]):
+            stamps.append(_header_time(message))
+            recording_times.append(time)
+            rows.extend(float(_number_at(message, path)) for path in paths)
+        # a clock may begin at 0; headers that are not filled in are all 0
+        has_stamps = len(stamps) > 1 and all(stamps[1:])
+        times[topic] = np.frombuffer(stamps if has_stamps else recording_times, dtype=np.int64)
+        values = np.frombuffer(rows, dtype=float).reshape(len(stamps), len(names))
+        loaded_values.update(zip(names, values.T, strict=True))
 
     def load_seconds(topic: str) -> np.ndarray:
-        for needed_topic in (main, topic):
-            if needed_topic not in times:
-                load_values(needed_topic, "")
+        for needed_topic in {main, topic} - {*times}:
+            load_topic(needed_topic)
         return 1e-9 * (times[topic] - times[main][0])
 
     def load_column(topic: str, name: str) -> np.ndarray:
-        values = load_values(topic, name)
+        if name not in loaded_values:
+            load_topic(topic, name)
+        values = loaded_values[name]
         return values if topic == main else np.interp(load_seconds(main), load_seconds(topic), values)
 
     count = counts[main]

@@ -3,7 +3,6 @@
 Columns and `[log]` table are those of a whole log. Unfit rows are counted and left out, as nobody can correct them any more.
 """
 
-import itertools
 import math
 import os
 import socket
@@ -19,14 +18,16 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxbl.errors import InputError, shorten
-from jaxbl.validation import check_file, explain_missing_file
+from jaxbl.validation import check_file
 
 from .channels import to_si, to_signed
-from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, log_suffixes
+from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
+Block = tuple[Sequence[ColumnName], np.ndarray]
+"""Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 LOST, GAPS, RESTARTS = "lost samples interpolated", "gaps in time", "restarts of the clock"
 """Faults that are counted."""
@@ -75,7 +76,7 @@ class Source(Protocol):
     counts: Counter[str]
     fault: str
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         """Wait at most `seconds` for rows.
 
         Returns:
@@ -127,22 +128,6 @@ def check_stream_table(table: LogTable, name: str) -> None:
         raise InputError(f"{name}: [log] {keys[0]} is for whole logs; remove it to read rows that arrive one at a time")
 
 
-class _Samples(NamedTuple):
-    """Rows in SI units: stamps (s), torque and position of each side, shape (rows,) each."""
-
-    stamps: np.ndarray
-    torque: np.ndarray
-    positions: dict[str, np.ndarray]
-
-    def select(self, rows: slice | np.ndarray) -> "_Samples":
-        positions = {side: values[rows] for side, values in self.positions.items()}
-        return _Samples(self.stamps[rows], self.torque[rows], positions)
-
-    def append(self, other: "_Samples") -> "_Samples":
-        positions = {side: np.append(values, other.positions[side]) for side, values in self.positions.items()}
-        return _Samples(np.append(self.stamps, other.stamps), np.append(self.torque, other.torque), positions)
-
-
 class _ChannelReader:
     """Converts rows of columns to SI units; it remembers the turns of wrapped positions, and the integrals of speeds."""
 
@@ -156,8 +141,12 @@ class _ChannelReader:
         self._previous: dict[str, float] = {}
         self._row = 0
 
-    def convert(self, values: np.ndarray) -> tuple[_Samples, int]:
-        """Convert values (rows, columns). Returns the samples, and the number of rows that were unreadable."""
+    def convert(self, values: np.ndarray) -> tuple[np.ndarray, int]:
+        """Convert values (rows, columns).
+
+        Returns:
+            Samples: stamps (s), torque, motor and load position, shape (4, samples). Number of rows that were unreadable.
+        """
         # the same as pandas' comparison of a column with a number, true or false
         for column, required in (self._table.where or {}).items():
             values = values[values[:, self._indices[column]] == required]
@@ -169,38 +158,40 @@ class _ChannelReader:
             stamps = values[:, self._indices[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
         torque_table = self._table.u or TorqueTable()
         torque = to_si(torque_table, self._read_numbers(values, torque_table.column_or("u"), torque_table.signed_bits))
-        numbers = {}
-        for side, name in POSITION_CHANNELS.items():
+        signals = [stamps, torque]
+        for name in POSITION_CHANNELS.values():
             channel, position_table = self._table.position_source(name)
             bits = position_table.signed_bits
-            numbers[side] = self._read_numbers(values, position_table.column_or(channel), bits)
+            numbers = self._read_numbers(values, position_table.column_or(channel), bits)
             if isinstance(position_table, PositionTable) and position_table.minus is not None:
-                numbers[side] = numbers[side] - self._read_numbers(values, position_table.minus, bits)
-        is_readable = np.isfinite(np.stack([stamps, torque, *numbers.values()])).all(axis=0)
-        stamps = stamps[is_readable]
-        positions = {side: self._read_position(side, numbers[side][is_readable], stamps) for side in numbers}
-        return _Samples(stamps, torque[is_readable], positions), int(np.count_nonzero(~is_readable))
+                numbers = numbers - self._read_numbers(values, position_table.minus, bits)
+            signals.append(numbers)
+        samples = np.stack(signals)
+        samples = samples[:, np.isfinite(samples).all(axis=0)]
+        for i, name in enumerate(POSITION_CHANNELS.values(), 2):
+            samples[i] = self._read_position(name, samples[i], samples[0])
+        return samples, len(values) - samples.shape[1]
 
     def _read_numbers(self, values: np.ndarray, column: ColumnName, bits: int | None) -> np.ndarray:
         numbers = values[:, self._indices[column]]
         return numbers if bits is None else to_signed(numbers, bits)
 
-    def _read_position(self, side: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    def _read_position(self, name: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):
             return values
-        _, table = self._table.position_source(POSITION_CHANNELS[side])
+        _, table = self._table.position_source(name)
         if isinstance(table, SpeedTable):
             speed = to_si(table, values)
-            speeds = np.append(self._previous.get(f"{side} speed", float(speed[0])), speed)
-            times = np.append(self._previous.get(f"{side} time", float(stamps[0])), stamps)
+            speeds = np.append(self._previous.get(f"{name} speed", float(speed[0])), speed)
+            times = np.append(self._previous.get(f"{name} time", float(stamps[0])), stamps)
             # over a gap, too, as if the speed had changed linearly
             steps = np.diff(times) * 0.5 * (speeds[1:] + speeds[:-1])
-            position = self._previous.get(side, 0.0) + np.cumsum(steps)
-            self._previous |= {side: position[-1], f"{side} speed": speed[-1], f"{side} time": stamps[-1]}
+            position = self._previous.get(name, 0.0) + np.cumsum(steps)
+            self._previous |= {name: position[-1], f"{name} speed": speed[-1], f"{name} time": stamps[-1]}
             return position
         if table.wrap is not None:
-            values = np.unwrap(np.append(self._previous.get(side, float(values[0])), values), period=table.wrap)[1:]
-            self._previous[side] = values[-1]
+            values = np.unwrap(np.append(self._previous.get(name, float(values[0])), values), period=table.wrap)[1:]
+            self._previous[name] = values[-1]
         return to_si(table, values)
 
 
@@ -221,7 +212,7 @@ class Stream:
         self._table, self._period = table, period
         self._reader: _ChannelReader | None = None
         self._columns: list[ColumnName] = []
-        self._last: _Samples | None = None
+        self._last = np.empty((4, 0))
         self._first_stamps: list[float] = []
         self._is_period_checked = False
 
@@ -239,7 +230,7 @@ class Stream:
             self._reader, self._columns = _ChannelReader(self._table, self.source.name, columns), list(columns)
         samples, unreadable = self._reader.convert(values)
         self._count(UNREADABLE, unreadable)
-        self._check_period(samples.stamps)
+        self._check_period(samples[0])
         return self._split_rows(samples)
 
     def _count(self, fault: str, number: int) -> None:
@@ -263,52 +254,48 @@ class Stream:
                 "sampling period, or [log] t = { period = ... } says that there are none"
             )
 
-    def _split_rows(self, samples: _Samples) -> list[Rows]:
+    def _split_rows(self, samples: np.ndarray) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
-        if not len(samples.stamps):
-            return []
-        last = [] if self._last is None else self._last.stamps
-        latest = np.maximum.accumulate(np.concatenate([[-np.inf], last, samples.stamps]))[-len(samples.stamps) - 1 : -1]
-        is_restart = latest - samples.stamps > _RESTART_SECONDS
+        stamps = samples[0]
+        latest = np.maximum.accumulate(np.concatenate([[-np.inf], self._last[0], stamps]))[-len(stamps) - 1 : -1]
+        is_restart = latest - stamps > _RESTART_SECONDS
         if is_restart.any():
             restart = int(np.argmax(is_restart))
-            rows = self._split_rows(samples.select(slice(restart)))
+            rows = self._split_rows(samples[:, :restart])
             self._count(RESTARTS, 1)
-            self._last = None
-            return [*rows, *self._split_rows(samples.select(slice(restart, None)))]
-        is_later = samples.stamps > latest
+            self._last = samples[:, :0]
+            return [*rows, *self._split_rows(samples[:, restart:])]
+        is_later = stamps > latest
         self._count(DISORDERED, int(np.count_nonzero(~is_later)))
-        samples = samples.select(is_later)
-        if not len(samples.stamps):
+        if not is_later.any():
             return []
-        longest_interval = GAP_PERIODS * self._period
-        starts = np.flatnonzero(np.diff(samples.stamps) > longest_interval) + 1
+        # from the last sample, which was returned already, lost ones are interpolated
+        samples, returned = np.concatenate([self._last, samples[:, is_later]], axis=1), self._last.shape[1]
+        self._last = samples[:, -1:]
+        starts = np.flatnonzero(np.diff(samples[0]) > GAP_PERIODS * self._period) + 1
         self._count(GAPS, len(starts))
-        if self._last is not None and samples.stamps[0] - self._last.stamps[0] > longest_interval:
-            self._count(GAPS, 1)
-            self._last = None
         rows = []
-        for start, stop in itertools.pairwise([0, *starts, len(samples.stamps)]):
-            rows.append(self._interpolate_lost(samples.select(slice(start, stop))))
-            self._last = None
-        self._last = samples.select(slice(-1, None))
+        for piece in np.split(samples, starts, axis=1):
+            if piece.shape[1] > returned:
+                rows.append(self._interpolate_lost(piece, returned))
+            returned = 0
         return rows
 
-    def _interpolate_lost(self, samples: _Samples) -> Rows:
-        """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period."""
-        starts_segment = self._last is None
-        stamps, torque, positions = samples if self._last is None else self._last.append(samples)
+    def _interpolate_lost(self, samples: np.ndarray, returned: int) -> Rows:
+        """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period.
+
+        The first of the samples was `returned` already (1), or a segment starts with it (0).
+        """
+        stamps, torque, *positions = samples
         steps = np.maximum(np.round(np.diff(stamps) / self._period), 1.0)
         received = np.concatenate([[0.0], np.cumsum(steps)])
         numbers = np.arange(received[-1] + 1.0)
         self._count(LOST, len(numbers) - len(received))
         if len(numbers) > len(received):
             torque = torque[np.searchsorted(received, numbers, side="right") - 1]
-            positions = {side: np.interp(numbers, received, values) for side, values in positions.items()}
-        # a row before the first one of `samples` was returned already
-        first = 0 if starts_segment else 1
-        time = float(stamps[0]) + first * self._period
-        return Rows(time, torque[first:], {side: values[first:] for side, values in positions.items()}, starts_segment)
+            positions = [np.interp(numbers, received, values) for values in positions]
+        sides = {side: values[returned:] for side, values in zip(POSITION_CHANNELS, positions, strict=True)}
+        return Rows(float(stamps[0]) + returned * self._period, torque[returned:], sides, not returned)
 
 
 def period_error(name: str, measured: float, period: float) -> InputError:
@@ -348,17 +335,11 @@ class FollowedFile(_TextSource):
         super().__init__(str(path))
         self._path = path
         self._incomplete_line, self._lines = b"", list[str]()
-        try:
+        with name_file_in_errors(path, "name a text file"):
             check_file(path)
             self._file = path.open("rb")
-        except FileNotFoundError:
-            raise InputError(f"{path}: {explain_missing_file(path, log_suffixes())}") from None
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}; name a text file") from None
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         end = time.monotonic() + seconds
         while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
             time.sleep(min(_FILE_POLL_SECONDS, remaining))
@@ -375,10 +356,8 @@ class FollowedFile(_TextSource):
             # the header and a row: the decimal sign shows only in a row
             if len(rows) < 2:
                 return None
-            try:
+            with name_file_in_errors(self.name):
                 self._format = detect_text_format(rows)
-            except InputError as error:
-                raise InputError(f"{self.name}: {error}") from None
             self._header = rows[0] if self._format.names is not None else ""
         self._lines = []
         return self._format.names or range(self._format.count), self._parse_rows(self._format, rows)
@@ -446,7 +425,7 @@ class Datagrams(_TextSource):
             with suppress(OSError):
                 self._received.append(self._socket.recv(1 << 16))
 
-    def poll(self, seconds: float) -> tuple[Sequence[ColumnName], np.ndarray] | None:
+    def poll(self, seconds: float) -> Block | None:
         time.sleep(seconds)
         datagrams = [self._received.popleft() for _ in range(len(self._received))]
         parts, lines = list[np.ndarray](), list[str]()

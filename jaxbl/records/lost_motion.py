@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from .least_squares import BLOCKS, fit_with_jackknife, rms
+from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms
 from .signal_quality import MIN_SAMPLES
 
 Flank = Literal["motion", "load"]
@@ -154,16 +154,14 @@ def _shift_between_states(
 
     Where the load hardly pulls, the gap is not crossed in full: the shifts of such places are smaller, and count less.
     """
-    size = 2 * BINS
-    sums, counts = [], []
-    for state in (~is_late & selection, is_late & selection):
-        counts.append(np.bincount(cells.group[state], minlength=size))
-        sums.append(np.bincount(cells.group[state], cells.twist[state], minlength=size))
-    crossed_twice = (counts[0] > 0) & (counts[1] > 0)
+    states = [~is_late & selection, is_late & selection]
+    counts = np.array([np.bincount(cells.group[state], minlength=2 * BINS) for state in states])
+    sums = np.array([np.bincount(cells.group[state], cells.twist[state], minlength=2 * BINS) for state in states])
+    crossed_twice = (counts > 0).all(axis=0)
     if crossed_twice.sum() < 4:
         return math.nan, np.zeros(0)
-    shifts = sums[1][crossed_twice] / counts[1][crossed_twice] - sums[0][crossed_twice] / counts[0][crossed_twice]
-    weights = 1.0 / (1.0 / counts[0][crossed_twice] + 1.0 / counts[1][crossed_twice])
+    counts, means = counts[:, crossed_twice], sums[:, crossed_twice] / counts[:, crossed_twice]
+    shifts, weights = means[1] - means[0], 1.0 / (1.0 / counts[0] + 1.0 / counts[1])
     # start at the shortest half: small shifts lie to one side, and would move a median and widen its scale; 3.44 is the
     # usual constant of an MM-estimate (85 % of the efficiency of a mean)
     ordered, half = np.sort(shifts), len(shifts) // 2
@@ -258,10 +256,10 @@ def fit_lost_motion_by_load(
     ]
     variance = 0.0
     for without in (without_passes, without_places):
-        finite = np.array([w for w in without if math.isfinite(w)])
+        finite = [value for value in without if math.isfinite(value)]
         if len(finite) < max(3, len(without) - 1):
             return None
-        variance += (len(finite) - 1) / len(finite) * float(np.sum((finite - finite.mean()) ** 2))
+        variance += float(jackknife_variance(finite))
     size, error = abs(value), math.sqrt(variance)
     changes = np.flatnonzero(np.diff(state))
     if size < 8.0 * error or len(changes) > len(passes):

@@ -265,9 +265,9 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     `file.contradiction` is set if no fit would be worth its time. Friction takes the power <u ω> + J <fall of ω² a second>
     / 2, the model's f <ω²>; noise, gaps and shafts do not change this. Without nominal friction this part is left out.
     """
-    nominal_inertia = nominal.inertia_at(channel)
+    nominal_inertia, nominal_viscous = nominal.refer_to(channel)
     inertia, inertia_error = float(rigid_fit.values[0]), float(rigid_fit.errors[0])
-    viscous, nominal_viscous = float(rigid_fit.values[1]), nominal.viscous_at(channel)
+    viscous = float(rigid_fit.values[1])
     shows_viscous = abs(viscous) > 8.0 * float(rigid_fit.errors[1]) and rigid_fit.inflation[1] < 10.0
     nominal_power = nominal_viscous * rigid_fit.square
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
@@ -276,7 +276,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         power_ratio = viscous / nominal_viscous if shows_viscous else None
     has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
     sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
-    text, is_doubtful, is_surely_wrong, ratio = "", False, False, 1.0
+    text, ratio, doubtful_ratio, sure_ratio = "", 1.0, math.inf, math.inf
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
     if (
         inertia > 4.0 * inertia_error
@@ -286,18 +286,16 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     ):
         ratio = inertia / nominal_inertia
         text = f"u moves {channel} as an inertia of {inertia:.3g} would, {ratio:.3g} times the nominal {nominal_inertia:.3g}"
-        is_doubtful, is_surely_wrong = (
-            not 1.0 / _DOUBTFUL_INERTIA < ratio < _DOUBTFUL_INERTIA,
-            not (has_usual_friction or 1.0 / sure_factor < ratio < _SURE_FACTOR),
-        )
+        doubtful_ratio, sure_ratio = _DOUBTFUL_INERTIA, _SURE_FACTOR
     elif inertia:
         ratio = rigid_fit.torque / (nominal_inertia * rigid_fit.acceleration)
         text = (
             f"u is {rigid_fit.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {nominal_inertia:.3g} needs for "
             "this motion"
         )
-        is_doubtful = not 1.0 / _DOUBTFUL_INERTIA < ratio < _DOUBTFUL_TORQUE
-        is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < _SURE_FACTOR * _DOUBTFUL_TORQUE)
+        doubtful_ratio, sure_ratio = _DOUBTFUL_TORQUE, _SURE_FACTOR * _DOUBTFUL_TORQUE
+    is_doubtful = not 1.0 / _DOUBTFUL_INERTIA < ratio < doubtful_ratio
+    is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < sure_ratio)
     if power_ratio is not None and not has_usual_friction and not is_doubtful:
         text = (
             f"friction takes {friction_power:.3g} W, but for dry friction {power_ratio:.3g} times what the nominal viscous "
@@ -311,9 +309,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
     if (
         # friction that falls with the speed takes work none the less
-        friction_power < 0.0
-        and shows_viscous
-        and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
+        friction_power < 0.0 and shows_viscous and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
     ):
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "

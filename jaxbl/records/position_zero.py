@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
+from .least_squares import BLOCKS, column_rms, fit_with_jackknife, jackknife_variance, rms
 from .rigid_body import MIN_SPEED_SHARE, smooth_sign
-from .signal_quality import long_segments, low_pass, trim_filter_ends
+from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 
 _MAX_HARMONIC = 40
 """Largest number of periods a turn: more than poles, slots and balls of small drives make."""
@@ -82,7 +82,8 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     if first_rows is None or rows is None or turns * _MAX_HARMONIC < _MIN_PERIODS:
         return None
     lowest = int(np.ceil(_MIN_PERIODS / turns))
-    return _find_shift(first_rows, rows, lowest) or _find_shift(*map(_exchange_acceleration, (first_rows, rows)), lowest)
+    exchanged = _exchange_acceleration(first_rows), _exchange_acceleration(rows)
+    return _find_shift(first_rows, rows, lowest) or _find_shift(*exchanged, lowest)
 
 
 def _exchange_acceleration(rows: "_MovingRows") -> "_MovingRows":
@@ -128,7 +129,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
         shifts[chosen] + step * (_parabola_minimum(sums[near]) - _SHIFTS_PER_PERIOD // 2)
         for sums in (total, *(total - block_squares for block_squares in squares))
     )
-    error = float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((np.array(without) - np.mean(without)) ** 2)))
+    error = float(np.sqrt(jackknife_variance(without)))
     if not abs(value) > _BETTER_ERRORS * error:
         return None
     return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
@@ -142,9 +143,9 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
     Returns:
         Columns of the waves, and coefficients of the motion and of each wave's cosine and sine.
     """
-    found: list[int] = []
+    waves: list[int] = []
     columns, values = motion, np.zeros(0)
-    while len(found) < _MOST_WAVES:
+    while len(waves) < _MOST_WAVES:
         basis = np.linalg.qr(columns)[0]
         parts = (rows.torque[:, None], rows.cosine[:, lowest:], rows.sine[:, lowest:])
         torque, cosine, sine = (part - basis @ (basis.T @ part) for part in parts)
@@ -154,17 +155,16 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_WAVE_ERRORS:
             break
-        found, values = [*found, wave], coefficients
-    return found, values
+        waves, values = [*waves, wave], coefficients
+    return waves, values
 
 
 def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     """Select the rows of a log in motion; None if there are too few."""
     parts = []
     for s in long_segments(log.segments):
-        place = low_pass(log.motor[s], cutoff, log.period)
-        velocity = np.gradient(place, log.period)
-        columns = [np.gradient(velocity, log.period), velocity, smooth_sign(velocity)]
+        place, velocity, acceleration = low_pass_motion(log.motor[s], cutoff, log.period)
+        columns = [acceleration, velocity, smooth_sign(velocity)]
         if log.load is not None:
             twist = place - low_pass(log.load[s], cutoff, log.period)
             columns += [twist, np.gradient(twist, log.period)]

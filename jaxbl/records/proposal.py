@@ -12,14 +12,18 @@ import numpy as np
 from jaxbl.errors import InputError
 
 from .alignment import NominalDrive
+from .channels import POSITION_FACTORS, SPEED_FACTORS
 from .files import LogFile, read_log_file
 from .inspection import Inspection, inspect
 from .least_squares import fit_with_jackknife
 from .libraries import ColumnName
 from .rigid_body import smooth_sign
-from .signal_quality import long_segments, low_pass, trim_filter_ends
+from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 from .table import POSITION_CHANNELS
+from .time_stamps import SECONDS_PER_UNIT
 
+_Table = dict[str, Any]
+"""A table of a study, by key."""
 _ROUGH_UNCERTAINTY = 0.5
 """Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
 _NAME_PATTERNS = {
@@ -40,9 +44,12 @@ _UNIT_NAMES = {
     "%": "%", "ma": "mA",
 }  # fmt: skip
 """Spelling of a unit -> its name in `[log]`."""
-_SPEED_UNITS = ("rad/s", "rpm", "deg/s", "turn/s", "m/s", "mm/s")
-_POSITION_UNITS = ("rad", "deg", "turn", "counts", "m", "mm")
-_TORQUE_UNITS = ("N m", "N", "A", "V", "counts", "mN m", "%", "mA")
+_SPEED_UNITS, _POSITION_UNITS = [*SPEED_FACTORS], [*POSITION_FACTORS]
+_TORQUE_UNITS = {
+    "N m": ("N m", None), "N": ("N", None), "A": ("A", 1.0), "V": ("V", 1.0), "counts": ("counts", 1.0),
+    "mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3),
+}  # fmt: skip
+"""Unit of a torque -> unit and factor in `[log]`."""
 
 
 def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
@@ -87,7 +94,7 @@ def _guess_channel(name: str, unit: str) -> str:
     return f"theta_{side}" if (is_position and is_possible["position"]) or is_bare_side or has_position_unit else ""
 
 
-def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     """Guess a `[log]` table from names and units of columns; it comes with a sentence on each uncertain guess.
 
     Raises:
@@ -110,7 +117,7 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
         if numbers.dtype.kind in "iuf" and (channel == "u" or not is_setpoint):
             is_second_choice = is_setpoint or _matches("load", name) if channel == "u" else not _matches("position", name)
             candidates.setdefault(channel, []).append((is_second_choice, column, unit, numbers))
-    table: dict[str, Any] = {}
+    table: _Table = {}
     guesses: list[str] = []
     for channel, columns in candidates.items():
         _, column, unit, numbers = min(columns, key=lambda candidate: candidate[0])
@@ -136,31 +143,24 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     return table, guesses
 
 
-def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
-    if unit not in ("s", "ms", "us", "ns"):
+def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
+    if unit not in SECONDS_PER_UNIT:
         median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
         # drives are sampled every 10 us to 0.1 s
-        unit = next(
-            (u for u, seconds in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if median * seconds <= 0.1), "s"
-        )
+        unit = next((name for name, seconds in SECONDS_PER_UNIT.items() if median * seconds <= 0.1), "s")
         if unit != "s":
             guesses.append(f"t is taken to be in {unit}, by its period of {median:g}.")
     return {"column": column, "unit": unit}
 
 
-def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> dict[str, Any]:
-    plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
+def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> _Table:
+    if unit not in _TORQUE_UNITS:
+        guesses.append(_describe_unit_guess("u", unit, "N m"))
+        return {"column": column}
     if unit in ("A", "V", "%", "mA", "counts"):
         guesses.append(f"u.factor: put in the torque of one {unit}; 1 N m for each A or V, or for 100 %, is a placeholder.")
-    if unit in plain:
-        unit, factor = plain[unit]
-        return {"column": column, "unit": unit, "factor": factor}
-    if unit in ("A", "V", "counts"):
-        return {"column": column, "unit": unit, "factor": 1.0}
-    if unit in ("N m", "N"):
-        return {"column": column, "unit": unit}
-    guesses.append(_describe_unit_guess("u", unit, "N m"))
-    return {"column": column}
+    unit, factor = _TORQUE_UNITS[unit]
+    return {"column": column, "unit": unit} | ({} if factor is None else {"factor": factor})
 
 
 def _describe_unit_guess(quantity: str, unit: str, default: str) -> str:
@@ -168,7 +168,7 @@ def _describe_unit_guess(quantity: str, unit: str, default: str) -> str:
     return f"The unit of {quantity} is {fault}{default} is assumed."
 
 
-def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
     is_whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
     if unit == "counts" or (not unit and is_whole):
         guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
@@ -176,7 +176,7 @@ def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, gue
     return _assume_unit(column, unit, _POSITION_UNITS, guesses)
 
 
-def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> dict[str, Any]:
+def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> _Table:
     """Return the table of a column, with the first one of `units` if its unit is not one of them."""
     if unit not in units:
         guesses.append(_describe_unit_guess(f"'{column}'", unit, units[0]))
@@ -186,11 +186,11 @@ def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: l
 
 def propose_study(
     path: str | Path,
-    log: dict[str, Any] | None = None,
+    log: _Table | None = None,
     *,
     gear_ratio: float | None = None,
     nominal: NominalDrive | None = None,
-) -> tuple[dict[str, Any], list[str], Inspection]:
+) -> tuple[_Table, list[str], Inspection]:
     """Propose a study of a log for `identify` and `diagnose`.
 
     Args:
@@ -291,22 +291,18 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
 
 def _load_motion(motor: np.ndarray, load: np.ndarray, bandwidth: float, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return motor position, and columns of load position, velocity, acceleration, direction and 1; low-passed."""
-    cutoff = 4.0 * bandwidth
-    smooth = np.column_stack([motor, load])
-    if bandwidth:
-        smooth = low_pass(smooth, cutoff, period)
-    velocity = np.gradient(smooth[:, 1], period)
-    acceleration = np.gradient(velocity, period)
-    rows = np.column_stack([smooth[:, 1], velocity, acceleration, smooth_sign(velocity), np.ones(len(motor))])
+    cutoff = 4.0 * bandwidth or math.inf
+    position, velocity, acceleration = low_pass_motion(load, cutoff, period)
+    rows = np.column_stack([position, velocity, acceleration, smooth_sign(velocity), np.ones(len(motor))])
     inner = trim_filter_ends(len(motor), cutoff, period) if bandwidth else slice(None)
-    return smooth[inner, 0], rows[inner]
+    return low_pass(motor, cutoff, period)[inner], rows[inner]
 
 
-def _make_study(inspection: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> dict[str, Any]:
+def _make_study(inspection: Inspection, nominal: NominalDrive, table: _Table) -> _Table:
     record = inspection.record
     has_shaft = math.isfinite(nominal.stiffness)
     names = ("motor_inertia", "motor_viscous", *(("load_inertia", "load_viscous", "gear_ratio") if has_shaft else ()))
-    study: dict[str, Any] = {
+    study: _Table = {
         "title": record.path.stem,
         "drive": {"kind": "two_inertia" if has_shaft else "rigid"} | {name: getattr(nominal, name) for name in names},
     }

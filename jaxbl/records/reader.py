@@ -123,14 +123,12 @@ def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> 
         return log
     try:
         check_sizes(log)
-    except InputError as error:
-        raise InputError(f"{name}: log.{error}" if name else f"log.{error}") from None
-    try:
         return LogTable.model_validate({} if log is None else dict(log))
+    except InputError as error:
+        fault = f"log.{error}"
     except ValidationError as error:
-        location = ["log", *error.errors()[0]["loc"]]
-        text = explain_first_error(error, location)[1]
-        raise InputError(f"{name}: {text}" if name else text) from None
+        fault = explain_first_error(error, ["log", *error.errors()[0]["loc"]])[1]
+    raise InputError(f"{name}: {fault}" if name else fault)
 
 
 def read_record(
@@ -178,7 +176,7 @@ def read_record(
     # these become evenly spaced samples
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and has_both_encoders else None
     grid, gearing, regular, lateness = _resample_and_align(
-        file, table, segmented, channels, gear_ratio, nominal, shaft, share
+        file, table, segmented, channels, encoders, gear_ratio, nominal, shaft, share
     )
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft, share)
@@ -233,6 +231,7 @@ def _resample_and_align(
     table: LogTable,
     segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
+    encoders: Sequence[str],
     gear_ratio: float | None,
     nominal: NominalDrive | None,
     shaft: NominalDrive | None,
@@ -249,17 +248,14 @@ def _resample_and_align(
 
     def resample() -> tuple[Grid, Gearing | None]:
         grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
-        if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
+        if table.kind == "element" or len(encoders) < 2:
             return grid, None
         turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
-        motor, load = grid.values["theta_e"], grid.values["theta_s"]
-        segments = grid.first(share).segments
-        return grid, fit_gearing(grid.time, motor, load, segments, period, expected=gear_ratio, turn=turn)
+        return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()
     lateness = None
     if "u" in channels and table.kind == "drive":
-        encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
         keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
         if lateness is not None and keys is not None:
@@ -345,10 +341,7 @@ def _find_torque_keys(
 
 def _find_clock_drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
     """Find a drift between the clocks of both encoders; None if friction of the nominal `shaft` may cause it."""
-    motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    if gearing.is_loose:
-        return None
-    drift = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
+    drift = None if gearing.is_loose else fit_drift(grid, gearing.skew or 0.0)
     # as the machine warms up, friction and wind-up change, at most by the whole wind-up
     if drift is None or (
         shaft is not None
@@ -402,12 +395,13 @@ def _correct_offset(
     offset = find_encoder_offset(grid.first(share), nominal)
     if offset is None:
         return
-    if integrals:
-        # an integral may begin at any position
-        name = integrals[0]
-        change = -offset.value if name == "theta_e" else offset.value / nominal.gear_ratio
+    # an integral may begin at any position
+    name = integrals[0] if integrals else "theta_e"
+    change = -offset.value if name == "theta_e" else offset.value / nominal.gear_ratio
+    if integrals or offset.is_sure:
         grid.values[name] = grid.values[name] + change
         channels[name] = channels[name]._replace(values=channels[name].values + change)
+    if integrals:
         file.notes.append(
             f"{name} is an integral: {change:.4g} {channels[name].unit} were added, so that it fits the other encoder."
         )
@@ -415,12 +409,10 @@ def _correct_offset(
     size = f"{offset.value:.4g} ± {offset.error:.1g} {channels['theta_e'].unit}"
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
     if offset.is_sure:
-        grid.values["theta_e"] = grid.values["theta_e"] - offset.value
-        file.corrections["offset"] = -offset.value
-        channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - offset.value)
+        file.corrections["offset"] = change
         file.warnings.append(
             f"{twist} is {size} without torque. This offset between the encoders was corrected. [log] theta_e.offset = "
-            f"{-offset.value:.4g} corrects the same; 0 corrects nothing."
+            f"{change:.4g} corrects the same; 0 corrects nothing."
         )
         return
     cause = (
@@ -430,7 +422,7 @@ def _correct_offset(
     )
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
-        f"[log] theta_e.offset = {-offset.value:.4g} corrects it as an offset; 0 corrects nothing."
+        f"[log] theta_e.offset = {change:.4g} corrects it as an offset; 0 corrects nothing."
     )
 
 

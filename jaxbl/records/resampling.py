@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from .channels import RawChannel
 from .files import LogFile
-from .signal_quality import MIN_SAMPLES, interpolate_spline
+from .signal_quality import MIN_SAMPLES, interpolate_spline, segments_before
 from .time_stamps import SegmentedStamps
 
 _MAX_OVERSAMPLING = 100
@@ -32,8 +32,7 @@ class Grid(NamedTuple):
 
     def first(self, share: float) -> "Grid":
         """Return the grid with the segments of a share of its samples, from the first on."""
-        end = round(share * len(self.time))
-        return self._replace(segments=[slice(s.start, min(s.stop, end)) for s in self.segments if s.start < end])
+        return self._replace(segments=segments_before(self.segments, round(share * len(self.time))))
 
 
 class Delay(NamedTuple):
@@ -76,15 +75,13 @@ def resample_channels(
             short.append((len(grid), first))
             continue
         for name, raw in channels.items():
-            reading_times = stamps - delays[name].at(stamps)
-            if raw.hold == "sampled":
-                values[name].append(_hold_sampled_torque(reading_times, raw.values[segment], grid, period))
-            elif not interpolate and not any(delays[name]) and len(grid) == len(stamps):
-                values[name].append(raw.values[segment])
-            elif raw.hold:
-                values[name].append(_mean_over_periods(reading_times, raw.values[segment], grid, period))
-            else:
-                values[name].append(interpolate_spline(reading_times, raw.values[segment], grid))
+            readings, reading_times = raw.values[segment], stamps - delays[name].at(stamps)
+            is_on_grid = not interpolate and not any(delays[name]) and len(grid) == len(stamps)
+            if raw.hold and not (is_on_grid and raw.hold == "zoh"):
+                readings = _hold_over_periods(reading_times, readings, grid, period, raw.hold)
+            elif not is_on_grid:
+                readings = interpolate_spline(reading_times, readings, grid)
+            values[name].append(readings)
         times.append(grid)
         segments.append(slice(first_row, first_row + len(grid)))
         first_row += len(grid)
@@ -121,29 +118,24 @@ def _common_times(
     return begin + period * np.arange(count, dtype=float)
 
 
-def _hold_sampled_torque(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Return torques to be held over each period of a grid, which move a drive as the torque sampled at `stamps` does.
-
-    A drive's current loop is much faster than its log, so that the torque between stamps is neither held nor a straight
-    line, but smooth: a cubic spline. Its means keep the velocity at the samples. Positions there, which is what encoders
-    read, need a twelfth of the second difference less: held values w_k move an inertia by (w_k + w_{k-1}) / 2, and a torque
-    of frequency f by sinc²(f T) times its value at t_k, which is the same up to the fourth order of f T.
-    """
-    from scipy.interpolate import CubicSpline
-
-    # the last value holds for one more period
-    knots = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period)
-    torque = CubicSpline(knots, np.append(values, values[-1]))
-    means = np.diff(torque.antiderivative()(np.append(grid, grid[-1] + period))) / period
-    return means - np.diff(means, n=2, prepend=means[0], append=means[-1]) / 12.0
-
-
-def _mean_over_periods(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Average values, which hold from each stamp to the next, over each period of a grid.
+def _hold_over_periods(
+    stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float, hold: Literal["zoh", "sampled"]
+) -> np.ndarray:
+    """Return torques to be held over each period of a grid, which move a drive as torques do that `hold` from `stamps` on.
 
     The last value holds for one more period. Means keep the impulse, and so the velocity that a torque makes.
+
+    A drive's current loop is much faster than its log, so that a sampled torque is neither held between stamps nor a
+    straight line, but smooth: a cubic spline. Its means keep the velocity at the samples. Positions there, which is what
+    encoders read, need a twelfth of the second difference less: held values w_k move an inertia by (w_k + w_{k-1}) / 2, and
+    a torque of frequency f by sinc²(f T) times its value at t_k, which is the same up to the fourth order of f T.
     """
-    edges = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period)
-    integral = np.concatenate([[0.0], np.cumsum(values * np.diff(edges))])
-    bounds = np.append(grid, grid[-1] + period)
-    return np.diff(np.interp(bounds, edges, integral)) / period
+    edges, bounds = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period), np.append(grid, grid[-1] + period)
+    if hold == "zoh":
+        integral = np.concatenate([[0.0], np.cumsum(values * np.diff(edges))])
+        return np.diff(np.interp(bounds, edges, integral)) / period
+    from scipy.interpolate import CubicSpline
+
+    torque = CubicSpline(edges, np.append(values, values[-1]))
+    means = np.diff(torque.antiderivative()(bounds)) / period
+    return means - np.diff(means, n=2, prepend=means[0], append=means[-1]) / 12.0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .least_squares import column_rms, fit_with_jackknife, rms
-from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, trim_filter_ends
+from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, low_pass_motion, trim_filter_ends
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
     cutoff = 3.0 * bandwidth
     targets, all_rows, slowing = [], [], 0.0
     for segment in long_segments(segments):
-        smooth = low_pass(position[segment], cutoff, period)
-        velocity = np.gradient(smooth, period)
-        acceleration = np.gradient(velocity, period)
+        smooth, velocity, acceleration = low_pass_motion(position[segment], cutoff, period)
         direction = low_pass(smooth_sign(velocity), cutoff, period)
         smooth_torque = low_pass(torque[segment], cutoff, period)
         inner = trim_filter_ends(len(smooth), cutoff, period)

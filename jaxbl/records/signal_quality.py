@@ -62,25 +62,22 @@ def find_resolution(values: np.ndarray) -> float:
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
-def power_spectrum(values: np.ndarray, period: float, *, differentiate: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def power_spectrum(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the one-sided power spectral density of evenly spaced values, by Welch's method.
 
     Args:
         values: shape (samples,).
         period: s.
-        differentiate: whether the density is that of the slope of the values.
 
     Returns:
-        Frequencies, Hz, without 0, and densities, unit²/Hz ((unit/s)²/Hz of the slope).
+        Frequencies, Hz, without 0, and densities, unit²/Hz.
     """
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
     length = min(max(len(differences) // 4, 16), 4096, len(differences))
     frequency, density = welch_spectrum(differences, length)
     frequency, density = frequency[1:], density[1:]
-    density = density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
-    frequency = frequency / period
-    return frequency, density * (2.0 * np.pi * frequency) ** 2 if differentiate else density
+    return frequency / period, density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
 
 
 def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
@@ -114,14 +111,20 @@ def find_bandwidth(values: np.ndarray, period: float, *, differentiate: bool) ->
     return float(frequency[np.searchsorted(cumulative, 0.95 * cumulative[-1])])
 
 
+def find_runs(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return first row, and row behind the last one, of each run of rows that meet a condition, shape (runs,)."""
+    edges = np.flatnonzero(np.diff(condition, prepend=False, append=False))
+    return edges[::2], edges[1::2]
+
+
 def saturated_share(values: np.ndarray, step: float) -> float:
     """Return the share of samples in runs of five or more at the least or largest value (within half a `step`)."""
     if np.ptp(values) == 0.0:
         return 0.0
     saturated = 0
     for extreme in (values.min(), values.max()):
-        is_extreme = np.concatenate([[False], np.abs(values - extreme) <= 0.5 * step, [False]])
-        lengths = np.diff(np.flatnonzero(np.diff(is_extreme)))[::2]
+        starts, stops = find_runs(np.abs(values - extreme) <= 0.5 * step)
+        lengths = stops - starts
         # a single run may be a rest; a clipped signal comes back to the same value
         if np.count_nonzero(lengths >= 5) >= 2:
             saturated += int(lengths[lengths >= 5].sum())
@@ -170,11 +173,23 @@ def trim_filter_ends(samples: int, cutoff: float, period: float) -> slice:
     return slice(margin, samples - margin)
 
 
+def low_pass_motion(positions: np.ndarray, cutoff: float, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return position, velocity and acceleration of a low-passed position, or of several in columns."""
+    smooth = low_pass(positions, cutoff, period)
+    velocity = np.gradient(smooth, period, axis=0)
+    return smooth, velocity, np.gradient(velocity, period, axis=0)
+
+
 def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndarray) -> np.ndarray:
     """Interpolate values to new times by a cubic spline; beyond an end the end's value is returned."""
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(times, values)(np.clip(new_times, times[0], times[-1]))
+
+
+def segments_before(segments: Sequence[slice], end: int) -> list[slice]:
+    """Return the parts of segments before a sample."""
+    return [slice(segment.start, min(segment.stop, end)) for segment in segments if segment.start < end]
 
 
 def longest_segment(segments: Sequence[slice]) -> slice:

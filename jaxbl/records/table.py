@@ -41,12 +41,15 @@ _Sign = Annotated[int, BeforeValidator(_check_sign)]
 _SECONDS: Any = {"unit": "s"}
 
 
+def _optional(description: str, **keywords: Any) -> Any:
+    """Return the field of a key that may be left out."""
+    return Field(default=None, description=description, **keywords)
+
+
 class _ColumnTable(StrictTable):
     """Keys common to time and channels; a column's name or number alone stands for a table with only that key."""
 
-    column: _Column | None = Field(
-        default=None, description="name of the column, or its number counted from 0; left out: the channel's own name"
-    )
+    column: _Column | None = _optional("name of the column, or its number counted from 0; left out: the channel's own name")
 
     @model_validator(mode="before")
     @classmethod
@@ -68,9 +71,7 @@ class TimeTable(_ColumnTable):
     """The time stamps of a log."""
 
     unit: Literal["s", "ms", "us", "ns"] = Field(default="s", description="unit of the stamps")
-    period: Positive | None = Field(
-        default=None, gt=0.0, description="sampling period of a log without stamps", json_schema_extra=_SECONDS
-    )
+    period: Positive | None = _optional("sampling period of a log without stamps", gt=0.0, json_schema_extra=_SECONDS)
 
     @model_validator(mode="after")
     def _check_source(self) -> "TimeTable":
@@ -83,36 +84,28 @@ class _ChannelTable(_ColumnTable):
     """Keys common to measured channels."""
 
     sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
-    signed_bits: int | None = Field(
-        default=None, ge=2, le=63, description="word length of two's complement numbers that were logged as unsigned"
-    )
+    signed_bits: int | None = _optional("word length of two's complement numbers that were logged as unsigned", ge=2, le=63)
 
 
 class PositionTable(_ChannelTable):
     """An encoder's column."""
 
     unit: Literal["rad", "deg", "turn", "counts", "m", "mm"] = Field(default="rad", description="unit of the column")
-    counts_per_turn: Positive | None = Field(default=None, gt=0.0, description="counts of one turn; for unit counts")
+    counts_per_turn: Positive | None = _optional("counts of one turn; for unit counts", gt=0.0)
     factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
-    minus: _Column | None = Field(default=None, description="column to be subtracted, in the same unit")
-    wrap: Positive | None = Field(
-        default=None, gt=0.0, description="period, in numbers of the column, after which it starts again; undone"
-    )
-    offset: float | None = Field(
-        default=None, description="added last, in SI units; left out: 0, of theta_e less an offset that is sure"
-    )
-    skew: _Skew | None = Field(
-        default=None,
-        description="by how much the stamps are later than the readings, undone; 'estimate' (theta_s only): as found "
+    minus: _Column | None = _optional("column to be subtracted, in the same unit")
+    wrap: Positive | None = _optional("period, in numbers of the column, after which it starts again; undone", gt=0.0)
+    offset: float | None = _optional("added last, in SI units; left out: 0, of theta_e less an offset that is sure")
+    skew: _Skew | None = _optional(
+        "by how much the stamps are later than the readings, undone; 'estimate' (theta_s only): as found "
         "against theta_e; left out: 0, of theta_s a skew that is sure",
         json_schema_extra=_SECONDS,
     )
-    drift: float | None = Field(
-        default=None,
+    drift: float | None = _optional(
+        "by how much the skew grows in each second, undone; `skew` is then that at the first stamp; left out: "
+        "0, of theta_s a drift that is sure",
         ge=-0.1,
         le=0.1,
-        description="by how much the skew grows in each second, undone; `skew` is then that at the first stamp; left out: "
-        "0, of theta_s a drift that is sure",
         json_schema_extra={"unit": "s/s"},
     )
 
@@ -138,9 +131,8 @@ class SpeedTable(_ChannelTable):
     )
     factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
     offset: float = Field(default=0.0, description="added to the speed, in rad/s (m/s)", json_schema_extra={"unit": "rad/s"})
-    skew: float | None = Field(
-        default=None,
-        description="by how much the stamps are later than the readings, undone; left out: 0, of omega_s one that is sure",
+    skew: float | None = _optional(
+        "by how much the stamps are later than the readings, undone; left out: 0, of omega_s one that is sure",
         json_schema_extra=_SECONDS,
     )
 
@@ -153,21 +145,17 @@ class SpeedTable(_ChannelTable):
 class TorqueTable(_ChannelTable):
     """A torque's column (force on a linear axis), or that of a voltage, current or duty that stands for it."""
 
-    unit: Literal["N m", "N", "V", "A", "counts"] | None = Field(
-        default=None, description="unit of the column: N m, N, V, A or counts; left out: N m, or N on a linear axis"
+    unit: Literal["N m", "N", "V", "A", "counts"] | None = _optional(
+        "unit of the column: N m, N, V, A or counts; left out: N m, or N on a linear axis"
     )
-    factor: float | None = Field(
-        default=None,
+    factor: float | None = _optional(
+        "N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
         gt=0.0,
-        description="N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
     )
     offset: float = Field(default=0.0, description="added last, in SI units")
-    saturation: Positive | None = Field(
-        default=None, gt=0.0, description="magnitude, in numbers of the column, at which it saturates"
-    )
-    skew: float | None = Field(
-        default=None,
-        description="by how much the stamps are later than the torque, undone; left out: 0, of u a lateness that is sure",
+    saturation: Positive | None = _optional("magnitude, in numbers of the column, at which it saturates", gt=0.0)
+    skew: float | None = _optional(
+        "by how much the stamps are later than the torque, undone; left out: 0, of u a lateness that is sure",
         json_schema_extra=_SECONDS,
     )
 
@@ -202,40 +190,30 @@ class LogTable(StrictTable):
         description="drive: a machine in motion; element: a transmission alone on a test rig, theta_e the displacement of "
         "one side (against theta_s, the other's, if there is one), u the torque through it",
     )
-    hold: Literal["zoh", "sampled"] | None = Field(
-        default=None,
-        description="u between stamps: zoh: each value holds until the next stamp, as a command does; sampled: a smooth "
+    hold: Literal["zoh", "sampled"] | None = _optional(
+        "u between stamps: zoh: each value holds until the next stamp, as a command does; sampled: a smooth "
         "torque, measured at its stamps, as a drive reports its current; left out: zoh, or sampled where that is sure",
     )
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
-    t: TimeTable | None = Field(default=None, description="time stamps; left out: column t, in s")
-    u: TorqueTable | None = Field(default=None, description="input torque on the motor shaft; left out: column u, in N m")
-    theta_e: PositionTable | None = Field(default=None, description="motor position; left out: column theta_e, in rad")
-    theta_s: PositionTable | None = Field(default=None, description="load position; left out: column theta_s, in rad")
-    omega_e: SpeedTable | None = Field(default=None, description="motor speed, in place of theta_e; left out: none")
-    omega_s: SpeedTable | None = Field(default=None, description="load speed, in place of theta_s; left out: none")
-    transmitted: TorqueTable | None = Field(default=None, description="measured transmitted torque; left out: none")
-    absent: list[_ChannelName] | None = Field(
-        default=None, description="channels that were not recorded, of u, theta_e, theta_s; left out: none"
+    t: TimeTable | None = _optional("time stamps; left out: column t, in s")
+    u: TorqueTable | None = _optional("input torque on the motor shaft; left out: column u, in N m")
+    theta_e: PositionTable | None = _optional("motor position; left out: column theta_e, in rad")
+    theta_s: PositionTable | None = _optional("load position; left out: column theta_s, in rad")
+    omega_e: SpeedTable | None = _optional("motor speed, in place of theta_e; left out: none")
+    omega_s: SpeedTable | None = _optional("load speed, in place of theta_s; left out: none")
+    transmitted: TorqueTable | None = _optional("measured transmitted torque; left out: none")
+    absent: list[_ChannelName] | None = _optional("channels that were not recorded, of u, theta_e, theta_s; left out: none")
+    where: dict[str, _Scalar] | None = _optional(
+        "column -> value: only rows that have it (a switch, a mode); left out: all rows"
     )
-    where: dict[str, _Scalar] | None = Field(
-        default=None, description="column -> value: only rows that have it (a switch, a mode); left out: all rows"
-    )
-    start: float | None = Field(
-        default=None, ge=0.0, description="reads from here on, counted from the first stamp", json_schema_extra=_SECONDS
-    )
-    stop: float | None = Field(
-        default=None, gt=0.0, description="reads up to here, counted from the first stamp", json_schema_extra=_SECONDS
-    )
-    resample: Positive | None = Field(
-        default=None,
+    start: float | None = _optional("reads from here on, counted from the first stamp", ge=0.0, json_schema_extra=_SECONDS)
+    stop: float | None = _optional("reads up to here, counted from the first stamp", gt=0.0, json_schema_extra=_SECONDS)
+    resample: Positive | None = _optional(
+        "period to resample to; left out: the log's own, uneven stamps to their median",
         gt=0.0,
-        description="period to resample to; left out: the log's own, uneven stamps to their median",
         json_schema_extra=_SECONDS,
     )
-    closed_loop: bool | None = Field(
-        default=None, description="whether a controller chose u from the positions; left out: not known"
-    )
+    closed_loop: bool | None = _optional("whether a controller chose u from the positions; left out: not known")
 
     @model_validator(mode="after")
     def _check_channels(self) -> "LogTable":
@@ -267,11 +245,16 @@ class LogTable(StrictTable):
             raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
+    @property
+    def channels(self) -> dict[str, TimeTable | PositionTable | SpeedTable | TorqueTable | None]:
+        """Tables of time and channels; None if they are left out."""
+        names = ("t", "u", *POSITION_CHANNELS.values(), *SPEED_CHANNELS.values(), "transmitted")
+        return {name: getattr(self, name) for name in names}
+
     def list_columns(self) -> set[ColumnName]:
         """Return names and numbers of all columns that may be read."""
         columns: set[ColumnName] = {*(self.where or {})}
-        for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
-            channel = getattr(self, name)
+        for name, channel in self.channels.items():
             columns.add(name if channel is None else channel.column_or(name))
             if isinstance(channel, PositionTable) and channel.minus is not None:
                 columns.add(channel.minus)

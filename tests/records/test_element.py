@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbl.records import element
-from jaxbl.records.element import fit_element
+from jaxbl.records.element import RigLog, fit_element
 
 PERIOD, STIFFNESS, GAP, CENTRE, FRICTION, TORQUE, LENGTH = 0.01, 500.0, 0.02, 0.005, 0.8, 2.0, 0.01
 
@@ -26,7 +26,7 @@ def simulate_rig(count=2400, seed=1, gap=GAP):
 
 def test_a_gap_hysteresis_and_friction_are_told_apart():
     x, u = simulate_rig()
-    fit = fit_element(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, noise=1e-5, linear=False)
+    fit = fit_element(RigLog(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, 1e-5), linear=False)
     assert set(fit.terms) == {"gap", "dry friction", "hysteresis"}
     truth = {
         "stiffness": STIFFNESS, "half_gap": GAP, "centre": CENTRE, "dry_friction": FRICTION, "hysteresis": TORQUE,
@@ -46,11 +46,13 @@ def test_a_gap_hysteresis_and_friction_are_told_apart():
 def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
     random = np.random.default_rng(2)
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(2000))
-    fit = fit_element(x, 3.0e4 * x + random.standard_normal(2000), [slice(0, 2000)], PERIOD, noise=0.0, linear=True)
+    u = 3.0e4 * x + random.standard_normal(2000)
+    fit = fit_element(RigLog(x, u, [slice(0, 2000)], PERIOD, 0.0), linear=True)
     assert fit.terms == () and fit.numbers["stiffness"].unit == "N/m"
     low, high = fit.numbers["stiffness"].interval
     assert low < 3.0e4 < high < 1.01 * 3.0e4
-    assert fit_element(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, noise=0.0, linear=False) is None
+    one_way = RigLog(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, 0.0)
+    assert fit_element(one_way, linear=False) is None
 
 
 def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
@@ -59,5 +61,5 @@ def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(4003))
     u = 3.0e4 * x + np.random.default_rng(2).standard_normal(4003)
     for parts in ([slice(0, 4000), slice(4000, 4003)], [slice(0, 3), slice(3, 4003)]):
-        fit = fit_element(x, u, parts, PERIOD, noise=0.0, linear=True)
+        fit = fit_element(RigLog(x, u, parts, PERIOD, 0.0), linear=True)
         assert fit is not None and fit.numbers["stiffness"].value == pytest.approx(3.0e4, rel=0.01)

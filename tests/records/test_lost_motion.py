@@ -9,11 +9,13 @@ from measured import GEAR_RATIO, SERVO, find_recording, simulate_log
 
 from jaxbl.records import inspect, lost_motion
 from jaxbl.records.gearing import fit_gearing
+from jaxbl.records.resampling import Grid
 
 
 def fit_frame(frame, expected=GEAR_RATIO):
-    times, motor, load = (frame[name].to_numpy() for name in ("t", "theta_e", "theta_s"))
-    return fit_gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
+    times, positions = frame["t"].to_numpy(), {name: frame[name].to_numpy() for name in ("theta_e", "theta_s")}
+    grid = Grid(times, positions, [slice(0, len(times))], times[1] - times[0])
+    return fit_gearing(grid, expected=expected, turn=2.0 * np.pi)
 
 
 def simulate_load(seed, *, gap=0.02, drift=0.0, changes=(61.0,), turns_around=False):

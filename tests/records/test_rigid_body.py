@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxbl.records.gearing import fit_gearing
+from jaxbl.records.resampling import Grid
 from jaxbl.records.rigid_body import fit_rigid_drive
 
 RANDOM = np.random.default_rng(3)
@@ -17,4 +18,4 @@ def test_motion_of_one_frequency_leaves_inertia_and_spring_alike():
         assert fit.inflation[0] > 1e3 and fit.inflation[3] > 1e3
     assert fit_rigid_drive(np.zeros(8000), position, log, 1e-3) is None
     assert fit_rigid_drive(position, RANDOM.standard_normal(8000), log, 1e-3) is None
-    assert fit_gearing(time, position, RANDOM.standard_normal(8000), log, 1e-3) is None
+    assert fit_gearing(Grid(time, {"theta_e": position, "theta_s": RANDOM.standard_normal(8000)}, log, 1e-3)) is None

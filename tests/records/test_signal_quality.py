@@ -37,10 +37,10 @@ def test_spectrum_has_the_power_of_the_signal():
     period = 2e-3
     time = period * np.arange(20000)
     values = 3.0 * np.sin(2.0 * np.pi * 20.0 * time)
-    for slope, power in ((False, 4.5), (True, 4.5 * (2.0 * np.pi * 20.0) ** 2)):
-        frequency, density = signal_quality.power_spectrum(values, period, differentiate=slope)
-        assert density.sum() * frequency[0] == pytest.approx(power, rel=0.03)
-        assert frequency[np.argmax(density)] == pytest.approx(20.0, abs=frequency[0])
+    frequency, density = signal_quality.power_spectrum(values, period)
+    for spectrum, power in ((density, 4.5), (density * (2.0 * np.pi * frequency) ** 2, 4.5 * (2.0 * np.pi * 20.0) ** 2)):
+        assert spectrum.sum() * frequency[0] == pytest.approx(power, rel=0.03)
+        assert frequency[np.argmax(spectrum)] == pytest.approx(20.0, abs=frequency[0])
 
 
 def test_bandwidth_leaves_noise_and_steps_out():
