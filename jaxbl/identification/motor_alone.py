@@ -16,7 +16,7 @@ from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment, NamedArrays
+from jaxbl.simulate import Experiment
 
 from .free_parameters import FreeParameter
 from .intervals import UNSEEN, Refusal, Spread, refusals
@@ -59,7 +59,7 @@ class Alone(NamedTuple):
 
 def search_alone(
     nominal: Experiment,
-    free: Sequence[FreeParameter],
+    free: tuple[FreeParameter, ...],
     segments: Sequence[Segment],
     settings: IdentifyTable,
     record: Record,
@@ -199,7 +199,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     fitted, model, point = alone.experiment, alone.model, alone.point
     plant = fitted.plant
     states = model.states(point.theta, point.start, point.smoothness)
-    pieces: list[NamedArrays] = []
+    pieces = []
     for segment, one in zip(model.segments, states, strict=True):
         piece = motion_columns(segment, "motor")
         piece["motor.residual"] = segment.readings["motor"] - np.asarray(one.position["motor"])

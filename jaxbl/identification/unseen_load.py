@@ -124,7 +124,7 @@ class UnseenLoad:
     """
 
     experiment: Experiment
-    free: Sequence[FreeParameter]
+    free: tuple[FreeParameter, ...]
     width: np.ndarray
     segments: Sequence[Segment]
     rest: bool

@@ -236,7 +236,7 @@ def _average_samples(log: RigLog) -> RigLog:
         ends.append(slice(mean_count, mean_count + segment_means))
         mean_count += segment_means
     means = np.concatenate(parts, axis=1)
-    return RigLog(*means, ends, count * period, noise / math.sqrt(count))
+    return RigLog(means[0], means[1], ends, count * period, noise / math.sqrt(count))
 
 
 def _prepare_rig(log: RigLog) -> _Rig | None:

@@ -56,7 +56,7 @@ def fit_without_blocks(grams: np.ndarray, moments: np.ndarray) -> list[np.ndarra
     return [np.linalg.lstsq(matrix, side, rcond=1e-12)[0] for matrix, side in zip(matrices, sides, strict=True)]
 
 
-def jackknife_variance(without: Sequence[np.ndarray]) -> np.ndarray:
+def jackknife_variance(without: Sequence[np.ndarray] | Sequence[float]) -> np.ndarray:
     """Return the variance of estimates, each of them without one of the blocks of a log."""
     deviations = np.array(without) - np.mean(without, axis=0)
     return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
