@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
-from jaxbl.records.least_squares import BLOCKS, rms
+from jaxbl.records.least_squares import BLOCKS, jackknife_variance, rms
 
 from .blocks import multiply_by_blocks, solve_products
 from .diagnosis_task import DiagnosisTask
@@ -136,8 +136,8 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     blocks = np.sum(products, axis=0)
     total = np.sum(blocks, axis=0)
     own = slice(len(moved))
-    change, without = solve_products(total)[own], np.array([solve_products(total - one)[own] for one in blocks])
-    error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    change, without = solve_products(total)[own], [solve_products(total - one)[own] for one in blocks]
+    error = np.sqrt(jackknife_variance(without))
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it

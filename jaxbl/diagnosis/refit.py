@@ -20,6 +20,7 @@ from jaxbl.identification.free_parameters import FreeParameter, set_free_paramet
 from jaxbl.identification.intervals import spread_of
 from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
+from jaxbl.records.least_squares import sum_over_blocks
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
@@ -155,10 +156,8 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     Returns:
         Changes, shape (quarters, numbers).
     """
-    parts = np.array_split(np.arange(len(errors)), QUARTERS)
-    grams = np.stack([np.einsum("rsp,rsq->pq", slopes[rows], slopes[rows]) for rows in parts])
-    towards = np.stack([np.einsum("rsp,rs->p", slopes[rows], errors[rows]) for rows in parts])
-    whole = np.sum(grams, axis=0) + prior
+    _, grams, towards = sum_over_blocks(errors.ravel(), slopes.reshape(errors.size, -1), QUARTERS)
+    whole = grams.sum(axis=0) + prior
     # no number moves by more than once its size: beyond that a first order says nothing
     return np.stack(
         [

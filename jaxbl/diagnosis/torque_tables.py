@@ -6,7 +6,7 @@ kept if the model with them predicts each quarter of the log better by tables th
 Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.segments import Segment
 from jaxbl.json_types import JsonObject
+from jaxbl.records.least_squares import sum_over_blocks
 from jaxbl.simulate import Experiment, with_effects
 
 from .blocks import QUARTERS, SURE, is_worse, standard_errors_better, take_folds
@@ -136,14 +137,13 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
         )
         for over, points in choices.items()
     }
-    blocks = np.array_split(np.arange(len(target)), _BLOCKS)
-    nothing = np.array([np.mean(target[rows] ** 2) for rows in blocks])
+    nothing = np.array([np.mean(part**2) for part in np.array_split(target, _BLOCKS)])
     found = []
     for overs in _sets(list(choices)):
         if len(target) < _LEAST * sum(widths[over] for over in overs):
             continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
-        fits = [_Fit.of(matrix, target, blocks, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
+        fits = [_Fit.of(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
         fit = min(fits, key=lambda one: float(np.mean(one.squares)))
         gain = nothing - fit.squares
         sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(_BLOCKS)
@@ -198,31 +198,26 @@ class _Fit:
     left_out: np.ndarray
 
     @classmethod
-    def of(
-        cls, matrix: np.ndarray, target: np.ndarray, blocks: Sequence[np.ndarray], widths: Sequence[int], stiffness: float
-    ) -> "_Fit":
+    def of(cls, matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> "_Fit":
         penalty, at = _RIDGE * np.eye(matrix.shape[1]), 0
         for width in widths:
             second = np.diff(np.eye(width), n=2, axis=0)
             penalty[at : at + width, at : at + width] += stiffness * second.T @ second
             at += width
         penalty *= np.mean(matrix**2) * len(target)
-        grams = [matrix[rows].T @ matrix[rows] for rows in blocks]
-        towards = [matrix[rows].T @ target[rows] for rows in blocks]
+        blocks, grams, towards = sum_over_blocks(target, matrix, _BLOCKS)
         inner, right = np.sum(grams, axis=0), np.sum(towards, axis=0)
 
-        def solve_without(out: Iterable[int]) -> np.ndarray:
-            out = list(out)
+        def solve_without(out: Sequence[int] | np.ndarray) -> np.ndarray:
             share = 1.0 - sum(len(blocks[i]) for i in out) / len(target)
-            gram, one = (np.sum([parts[i] for i in out], axis=0) for parts in (grams, towards))
-            return np.linalg.solve(inner - gram + share * penalty, right - one)
+            return np.linalg.solve(inner - grams[out].sum(axis=0) + share * penalty, right - towards[out].sum(axis=0))
 
         squares = [np.mean((target[rows] - matrix[rows] @ solve_without([i])) ** 2) for i, rows in enumerate(blocks)]
         left_out = np.stack([solve_without(part) for part in np.array_split(np.arange(len(blocks)), QUARTERS)])
         inverse = np.linalg.inv(inner + penalty)
         values = inverse @ right
         # scatter of the blocks' gradients: errors within a block are correlated
-        scores = np.stack([one - gram @ values for gram, one in zip(grams, towards, strict=True)])
+        scores = towards - grams @ values
         scores -= scores.mean(axis=0)
         covariance = inverse @ (scores.T @ scores * _BLOCKS / (_BLOCKS - 1)) @ inverse
         return cls(values, np.sqrt(np.diag(covariance)), np.array(squares), left_out)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
+from jaxbl.records.least_squares import fit_without_blocks, sum_over_blocks
 from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
@@ -302,14 +303,15 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
 
 def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " blocks"]:
     """Power of a torque that its means over ranges of a channel predict, in each block of the log from the other blocks."""
-    block = np.arange(len(torque)) * _BLOCKS // len(torque)
-    label = np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)
-    sums, counts = np.zeros((_BLOCKS, _BINS)), np.full((_BLOCKS, _BINS), 1e-9)
-    np.add.at(sums, (block, label), torque)
-    np.add.at(counts, (block, label), 1.0)
-    mean = (np.sum(sums, axis=0) - sums) / (np.sum(counts, axis=0) - counts + 1.0)
-    gain = torque**2 - (torque - mean[block, label]) ** 2
-    return np.bincount(block, gain, _BLOCKS) / np.maximum(np.bincount(block, minlength=_BLOCKS), 1)
+    ranges = np.eye(_BINS)[np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)]
+    blocks, counts, sums = sum_over_blocks(torque, ranges, _BLOCKS)
+    means = fit_without_blocks(counts, sums)
+    return np.array(
+        [
+            np.mean(torque[rows] ** 2 - (torque[rows] - ranges[rows] @ mean) ** 2)
+            for rows, mean in zip(blocks, means, strict=True)
+        ]
+    )
 
 
 def shortest(factor: int) -> int:
