@@ -20,7 +20,7 @@ FLOOR = 0.006
 
 
 def standard_errors_better(log: ReferenceLog, control: Comparison, model: Comparison) -> float:
-    """By how many standard errors a model beats a control, block by block, each channel over its noise.
+    """Count the standard errors by which a model beats a control, block by block, each channel over its noise.
 
     All channels together, by the mean of their logarithms, or the channel that shows the difference best if none says
     otherwise: a ripple is seen in the torque, and hardly in windows of the position. Torques are referred to the input: a
@@ -47,8 +47,8 @@ def mean_squares(errors: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
 
 
 def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
-    """By how many standard errors squared errors of a model over their noise, block by block, are below those of a control;
-    shapes (..., blocks), in front channels.
+    """Count the standard errors by which squared errors of a model over their noise, block by block, are below those of a
+    control; shapes (..., blocks), in front channels.
 
     By logarithms, since a few blocks may have most of the errors, of noise and errors together: what is less than the noise
     counts for nothing, as on a drive that stands still. What structure in the noise may bring is no gain.
@@ -60,7 +60,7 @@ def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
 
 
 def is_better(new: Errors, old: Errors) -> bool:
-    """Whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
+    """Tell whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return bool(np.sum(np.log([new[name] for name in old]) - np.log(list(old.values()))) < 0.0)
 
@@ -73,8 +73,8 @@ _SURELY = 1.1
 
 
 def is_worse(after: Comparison, before: Comparison, noise: Errors) -> bool:
-    """Whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the blocks,
-    or by much."""
+    """Tell whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the
+    blocks, or by much."""
     for name, value in after.errors.items():
         limit = _WORSE_SPEED if name.startswith("velocity") else _WORSE
         most = max(before.errors[name], noise[name])

@@ -81,7 +81,7 @@ def new_search(setup: Setup, bound: float = np.inf, without: Collection[str] = (
 
 
 def explain(setup: Setup, history: list[Step]) -> tuple[EffectSearch, Explanation]:
-    """What the log says that the model lacks.
+    """Find what the log says that the model lacks.
 
     Where two effects are missing at once, the model's own numbers may go wrong, and hide both. If they do, effects are
     sought with these numbers held near to what is known of them; what that finds counts if its numbers stay there without
@@ -164,7 +164,7 @@ class Choice:
         return tables
 
     def _leaves_more(self, chosen: Chosen, or_little: bool = False) -> bool:
-        """Whether a model leaves more on the log than a complete one would; or less than half explained."""
+        """Tell whether a model leaves more on the log than a complete one would; or less than half explained."""
         setup, fitted = self.setup, chosen.fitted
         if self._tested is None or self._tested[0] is not fitted:
             whole = self.log.compare(fitted.experiment)
@@ -320,7 +320,7 @@ class Choice:
         return Chosen(search, found, less, compared, chosen.withdrawn, gains, rival)
 
     def _is_plausible(self, fitted: FittedModel) -> bool:
-        """Whether a model's own numbers are where they may be by what is known of them."""
+        """Tell whether a model's own numbers are where they may be by what is known of them."""
         return bool(np.all(np.abs(fitted.theta[: len(self.setup.prior)]) < FAR * self.setup.prior))
 
 

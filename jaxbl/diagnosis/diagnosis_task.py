@@ -52,7 +52,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
 
 
 def input_rms(record: Record) -> float:
-    """Of the input on all segments of a log, N m."""
+    """Return the rms of the input on all segments of a log, N m."""
     assert record.torque is not None
     return rms(np.concatenate([record.torque[part] for part in record.segments]))
 
@@ -69,7 +69,7 @@ def _long(record: Record) -> Record:
 
 
 def can_hold_out(record: Record) -> bool:
-    """Whether a log is long enough for a quarter of it to be held out."""
+    """Tell whether a log is long enough for a quarter of it to be held out."""
     return HELD_OUT * _count_samples(record) >= _LEAST_SAMPLES
 
 

@@ -400,7 +400,7 @@ class EffectSearch:
         return after
 
     def _standard_errors(self, before: Model, after: Model, smoothness: Sequence[float]) -> float:
-        """By how many standard errors the prediction errors of one model are below another's, by blocks of the log."""
+        """Count the standard errors by which one model's prediction errors are below another's, by blocks of the log."""
         costs = []
         for model in (before, after):
             errors, deviation = np.concatenate(model.linear.left(smoothness)), before.linear.predictor(smoothness).deviation
@@ -408,8 +408,8 @@ class EffectSearch:
         return standard_errors_between(*costs)
 
     def _heat(self, model: Model) -> float:
-        """By how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it were
-        without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12 (2017))."""
+        """Find by how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it
+        were without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12 (2017))."""
         best, own = self.fit(model.numbers, model.theta), len(self.free)
         variance, white = (np.diag(one)[own:] for one in (best.covariance, best.white))
         return max(float(np.max(variance / np.maximum(white, 1e-300), initial=1.0)), 1.0)
@@ -564,7 +564,7 @@ class EffectSearch:
         return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
 
     def _is_felt(self, model: Model) -> bool:
-        """Whether a model can be simulated, and its last effect has a torque that counts."""
+        """Tell whether a model can be simulated, and its last effect has a torque that counts."""
         return bool(np.isfinite(model.log_evidence)) and model.linear.share(model.names[-1]) > LEAST
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:

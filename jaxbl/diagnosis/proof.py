@@ -77,12 +77,12 @@ class Proof(NamedTuple):
 
     @property
     def has_power(self) -> bool:
-        """Whether some channel is a test."""
+        """True if some channel is a test."""
         return len(self.weak) < len(self.expected)
 
 
 def open_held_out(setup: Setup) -> tuple[Record, ReferenceLog]:
-    """What was held out, as models are compared with it; cleaned and smoothed as the log was."""
+    """Open what was held out, as models are compared with it; it is cleaned and smoothed as the log was."""
     record, rest = setup.task.holdout.open(), setup.task.config.log.initial_state == "rest"
     segments = quiet(segments_of(record, setup.nominal.sides, rest), setup.input_noise.unfelt)
     return record, ReferenceLog(segments, setup.fitted.bandwidth, rest and setup.task.separate)
@@ -110,7 +110,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
 
 
 def _reach(log: ReferenceLog) -> Errors:
-    """How far a log reaches: travel and largest speed of each side, and largest torque of the input."""
+    """Measure how far a log reaches: travel and largest speed of each side, and largest torque of the input."""
     found = {name: float(np.ptp(values)) for name, values in log.readings().items()}
     for side in log.noise:
         speeds = np.concatenate([np.asarray(segment.smoothed[side].velocity) for segment in log.segments])

@@ -146,7 +146,7 @@ class _Refiner:
 
 
 def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """How least-squares numbers change where one quarter of the rows after the other is left out, to first order.
+    """Find how least-squares numbers change where one quarter of the rows after the other is left out, to first order.
 
     Args:
         errors: left by the numbers, over their deviation; shape (rows, sides).
