@@ -409,7 +409,8 @@ class EffectSearch:
 
     def _heat(self, model: Model) -> float:
         """Find by how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it
-        were without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12 (2017))."""
+        were without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12, 2017).
+        """
         best, own = self.fit(model.numbers, model.theta), len(self.free)
         variance, white = (np.diag(one)[own:] for one in (best.covariance, best.white))
         return max(float(np.max(variance / np.maximum(white, 1e-300), initial=1.0)), 1.0)
