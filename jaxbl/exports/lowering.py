@@ -9,9 +9,8 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import chain, count
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -19,21 +18,9 @@ import numpy as np
 
 from jaxbl.fused import Unsupported
 from jaxbl.fused.elementary import FUNCTIONS
-from jaxbl.fused.jaxprs import (
-    ClosedJaxpr,
-    JaxprEqn,
-    Literal,
-    Var,
-    callee,
-    cond_branches,
-    equation_parameter,
-    equation_source,
-    scan_parameters,
-    trace_scalar_function,
-)
+from jaxbl.fused.jaxprs import ClosedJaxpr, JaxprEqn, equation_source
+from jaxbl.fused.scalar_writer import COMPARISONS, ScalarWriter
 
-TYPES = ("float32", "float64", "int32", "uint32", "int64", "uint64", "bool")
-"""Types of numbers that the code may have."""
 _LONGEST_FORMULA = 90
 """Letters of a formula in a comment."""
 
@@ -133,7 +120,7 @@ def lower_to_operations(closed: ClosedJaxpr, arguments: Sequence[Any]) -> Routin
         Unsupported: an operation of it is unknown here.
     """
     lowering = _Lowering()
-    results = lowering.lower_jaxpr(closed, arguments)
+    results = lowering.write_jaxpr(closed, arguments)
     return Routine(tuple(lowering.statements), tuple(results))
 
 
@@ -237,121 +224,94 @@ def _select_marked(candidates: Sequence[Any], marks: Sequence[bool]) -> tuple[An
     return tuple(candidate for candidate, marked in zip(candidates, marks, strict=True) if marked)
 
 
-def _dtype_of(v: Any) -> np.dtype:
-    """Return the dtype of a variable or literal of a jaxpr."""
-    return np.dtype(v.aval.dtype)
-
-
-class _Lowering:
+class _Lowering(ScalarWriter):
     """Writes statements as it goes through equations."""
+
+    number_types = ("float32", "float64", "int32", "uint32", "int64", "uint64", "bool")
+    arrays = "arrays: what runs in real time should be made of scalars"
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self._variable_by_operation: dict[Any, Variable] = {}
         """The variable that holds the result of an operation, by the operation's name, type and operands."""
-        self.operation_by_variable: dict[Value, Operation] = {}
+        self._operation_by_variable: dict[Value, Operation] = {}
         self._numbers = count()
         self._source = ""
+        self._is_in_call = False
+        """Within a call the source stays that of the call."""
 
-    def variable(self, dtype: Any, name: str = "") -> Variable:
-        return Variable(np.dtype(dtype), next(self._numbers), name)
+    def variable(self, dtype: Any) -> Variable:
+        return Variable(np.dtype(dtype), next(self._numbers))
 
     # jaxprs
 
-    def lower_jaxpr(self, closed: ClosedJaxpr, arguments: Sequence[Value], outside: bool = True) -> list[Value]:
-        """Lower a jaxpr and return its results. Within a call (`outside` is False) the source stays that of the call."""
-        jaxpr = closed.jaxpr
-        env: dict[Var, Value] = dict(zip(jaxpr.invars, arguments, strict=True))
-        env |= {v: Constant(np.asarray(value)) for v, value in zip(jaxpr.constvars, closed.consts, strict=True)}
+    def write_equation(self, eqn: JaxprEqn, operands: list[Value]) -> list[Value]:
+        if not self._is_in_call:
+            self._source = equation_source(eqn)
+        results = super().write_equation(eqn, operands)
+        return (
+            [_add_formula(result, eqn.primitive.name, operands) for result in results]
+            if _are_constant(operands)
+            else results
+        )
 
-        def read(v: Var | Literal) -> Value:
-            return Constant(np.asarray(v.val, _dtype_of(v))) if isinstance(v, Literal) else env[v]
+    def write_call(self, called, operands):
+        was_in_call, self._is_in_call = self._is_in_call, True
+        results = super().write_call(called, operands)
+        self._is_in_call = was_in_call
+        return results
 
-        for eqn in jaxpr.eqns:
-            if outside:
-                self._source = equation_source(eqn)
-            values = [read(v) for v in eqn.invars]
-            results = self.lower_equation(eqn, values, outside)
-            if all(isinstance(value, Constant) for value in values):
-                results = [_add_formula(result, eqn.primitive.name, values) for result in results]  # type: ignore[arg-type]
-            env |= dict(zip(eqn.outvars, results, strict=True))
-        return [read(v) for v in jaxpr.outvars]
-
-    def lower_equation(self, eqn: JaxprEqn, operands: list[Value], outside: bool = True) -> list[Value]:
-        name, all_constant = eqn.primitive.name, all(isinstance(value, Constant) for value in operands)
-        variables: list[Any] = [*eqn.invars, *eqn.outvars]
-        if any(v.aval.shape for v in variables):
-            if all_constant:
-                return self._evaluate(eqn, operands)
-            raise Unsupported(f"{name} of arrays: what runs in real time should be made of scalars")
-        if name == "scan":
-            return self._lower_scan(*scan_parameters(eqn), operands, outside)
-        if name == "cond":
-            return self._lower_cond(cond_branches(eqn), operands, outside)
-        if (called := callee(eqn)) is not None:
-            return self.lower_jaxpr(called, operands, False)
-        dtype = _dtype_of(eqn.invars[0]) if operands else np.dtype(bool)
-        if str(dtype) not in TYPES:
-            raise Unsupported(f"numbers of type {dtype}")
-        real = jnp.issubdtype(dtype, jnp.floating)
-        if name in FUNCTIONS and real:
-            return self.lower_jaxpr(trace_scalar_function(FUNCTIONS[name], dtype), operands, False)
-        rule = (_OF_FLOATS if real else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
-        if rule is None:
-            if all_constant:
-                return self._evaluate(eqn, operands)
-            raise Unsupported(f"{name} of {dtype}")
-        return [rule(self, eqn, *operands)]
-
-    def _evaluate(self, eqn: JaxprEqn, constants: Sequence[Value]) -> list[Value]:
+    def write_unknown(self, eqn, operands, kind):
         """Compute an equation of constants by JAX."""
-        results = eqn.primitive.bind(*(jnp.asarray(constant.value) for constant in constants), **eqn.params)  # type: ignore[union-attr]
+        if not _are_constant(operands):
+            return super().write_unknown(eqn, operands, kind)
+        results = eqn.primitive.bind(*(jnp.asarray(constant.value) for constant in operands), **eqn.params)  # type: ignore[union-attr]
         return [Constant(np.asarray(constant)) for constant in (results if eqn.primitive.multiple_results else [results])]
 
-    def _lower_scan(self, times: int, body: ClosedJaxpr, fixed: int, operands: list[Value], outside: bool) -> list[Value]:
-        fixed_values, state = operands[:fixed], operands[fixed:]
-        if times == 1 or all(isinstance(value, Constant) for value in operands):
+    def write_scan(self, times, body, constants, state):
+        if times == 1 or _are_constant([*constants, *state]):
             for _ in range(times):
-                state = self.lower_jaxpr(body, [*fixed_values, *state], outside)
+                state = self.write_jaxpr(body, [*constants, *state])
             return state
         source = self._source
         carried = tuple(self.variable(value.dtype) for value in state)
-        statements, results = self._lower_body(lambda: self.lower_jaxpr(body, [*fixed_values, *carried], outside))
+        statements, results = self._lower_body(body, [*constants, *carried])
         self.statements.append(Repeat(times, carried, tuple(state), statements, results, source))
         return list(carried)
 
-    def _lower_cond(self, branches: Sequence[ClosedJaxpr], operands: list[Value], outside: bool) -> list[Value]:
-        condition, *branch_operands = operands
-        if isinstance(condition, Constant):
-            return self.lower_jaxpr(branches[int(np.clip(condition.value, 0, len(branches) - 1))], branch_operands, outside)
+    def write_cond(self, branches, index, operands):
+        if isinstance(index, Constant):
+            return self.write_jaxpr(branches[int(np.clip(index.value, 0, len(branches) - 1))], operands)
         if len(branches) != 2:
             raise Unsupported("cond among more than two")
-        condition, source = self.emit("ne", bool, condition, _make_constant_like(condition, 0)), self._source
-        no, yes = (self._lower_body(lambda body=body: self.lower_jaxpr(body, branch_operands, outside)) for body in branches)
+        condition, source = self._convert_to_bool(index), self._source
+        (no_body, no), (yes_body, yes) = (self._lower_body(branch, operands) for branch in branches)
         # what is the same on both ways is no choice
-        differ = [not are_same(a, b) for a, b in zip(yes[1], no[1], strict=True)]
-        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes[1], differ, strict=True)]
-        outs = tuple(out for out, differs in zip(merged, differ, strict=True) if differs and isinstance(out, Variable))
-        results = _select_marked(yes[1], differ), _select_marked(no[1], differ)
-        self.statements.append(Choice(condition, outs, (yes[0], no[0]), results, source))
+        differ = [not are_same(a, b) for a, b in zip(yes, no, strict=True)]
+        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes, differ, strict=True)]
+        outs, *results = (_select_marked(values, differ) for values in (merged, yes, no))
+        self.statements.append(Choice(condition, outs, (yes_body, no_body), tuple(results), source))
         return merged
 
-    def _lower_body(self, lower_body: Callable[[], list[Value]]) -> tuple[tuple[Statement, ...], tuple[Value, ...]]:
+    def _lower_body(self, body: ClosedJaxpr, arguments: Sequence[Value]) -> tuple[tuple[Statement, ...], tuple[Value, ...]]:
         """Lower a body apart: variables that it defines cannot be used after it."""
         outer_statements, outer_variables = self.statements, self._variable_by_operation
         self.statements, self._variable_by_operation = [], dict(outer_variables)
-        results = lower_body()
+        results = self.write_jaxpr(body, arguments)
         statements, self.statements, self._variable_by_operation = self.statements, outer_statements, outer_variables
         return tuple(statements), tuple(results)
 
     # operations
 
+    def literal(self, number: Any, dtype: Any) -> Constant:
+        return Constant(np.asarray(number, dtype))
+
     def emit(self, name: str, dtype: Any, *operands: Value) -> Value:
         """Write an operation and return its result: a new variable, or a value that is known to be the same."""
-        dtype = np.dtype(dtype)
-        if all(isinstance(value, Constant) for value in operands):
+        dtype = np.dtype(bool if name in COMPARISONS else dtype)
+        if _are_constant(operands):
             with np.errstate(all="ignore"):
-                numbers: list[Any] = [constant.value[()] for constant in operands]  # type: ignore[union-attr]
+                numbers = [constant.value[()] for constant in operands]
                 typed = _TYPED_EVALUATIONS.get(name)
                 value = np.asarray(typed(dtype, *numbers) if typed else _EVALUATIONS[name](*numbers), dtype)
             return Constant(value, paths=_find_paths(operands))
@@ -360,8 +320,8 @@ class _Lowering:
         key = (name, dtype, *operands)
         if key not in self._variable_by_operation:
             out = self._variable_by_operation[key] = self.variable(dtype)
-            self.operation_by_variable[out] = Operation(out, name, operands, self._source)
-            self.statements.append(self.operation_by_variable[out])
+            self._operation_by_variable[out] = Operation(out, name, operands, self._source)
+            self.statements.append(self._operation_by_variable[out])
         return self._variable_by_operation[key]
 
     def _simplify(self, name: str, dtype: np.dtype, operands: Sequence[Value]) -> Value | None:
@@ -377,7 +337,7 @@ class _Lowering:
             mantissa, exponent = np.frexp(b.value)
             if abs(mantissa) == 0.5 and abs(exponent) < 100:
                 # the reciprocal is exact
-                pair = _make_constant_like(b, 1), b
+                pair = self.literal(1, dtype), b
                 return self.emit("mul", dtype, a, _add_formula(self.emit("div", dtype, *pair), "div", pair))
         if name == "sub" and isinstance(b, Constant) and b.value == 0 and not np.signbit(b.value):
             return a
@@ -391,10 +351,32 @@ class _Lowering:
             return a
         if name == "ne" and _is_number(b, 0):
             # a truth value that became a number
-            inner = self.operation_by_variable.get(a)
+            inner = self._operation_by_variable.get(a)
             if inner is not None and inner.name == "convert" and inner.operands[0].dtype == bool:
                 return inner.operands[0]
         return None
+
+    def convert(self, number, old, new):
+        if new.kind == "b" and old.kind != "b":
+            return self._convert_to_bool(number)
+        return self.emit("convert", new, number)
+
+    def _convert_to_bool(self, number: Value) -> Value:
+        return self.emit("ne", number.dtype, number, self.literal(0, number.dtype))
+
+    def bitcast(self, number, new):
+        """The bits of a number as another one; of an exponent that is put together from an integer, a power of two."""
+        bias, bits = (1023, 52) if new == np.float64 else (127, 23)
+        shift = self._operation_by_variable.get(number) if new.kind == "f" else None
+        if shift is not None and shift.name == "shift_left" and _is_number(shift.operands[1], bits):
+            sum_ = self._operation_by_variable.get(shift.operands[0])
+            if sum_ is not None and sum_.name == "add" and _is_number(sum_.operands[1], bias):
+                exponent = sum_.operands[0]
+                before = self._operation_by_variable.get(exponent)
+                if before is not None and before.name == "convert":
+                    exponent = before.operands[0]
+                return self.emit("power_of_two", new, self.emit("convert", np.int32, exponent))
+        return self.emit("bitcast", new, number)
 
 
 # constants
@@ -454,110 +436,12 @@ _TYPED_EVALUATIONS: dict[str, Callable[..., Any]] = {
 """The same for operations that depend on the type of their result, which comes first."""
 
 
-# rules: what a primitive becomes
-
-Rule = Callable[..., Value]
-
-
-def _make_operation_rule(name: str) -> Rule:
-    return lambda w, eqn, *operands: w.emit(name, operands[0].dtype, *operands)
-
-
-def _make_constant_like(like: Value, value: float) -> Constant:
-    return Constant(np.asarray(value, like.dtype))
-
-
-def _make_comparison_rule(name: str) -> Rule:
-    return lambda w, eqn, a, b: w.emit(name, bool, a, b)
-
-
-def _sign(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    zero = _make_constant_like(a, 0)
-    below = w.emit("select", a.dtype, w.emit("lt", bool, a, zero), _make_constant_like(a, -1), a)
-    return w.emit("select", a.dtype, w.emit("gt", bool, a, zero), _make_constant_like(a, 1), below)
-
-
-def _clamp(w: _Lowering, eqn: JaxprEqn, low: Value, a: Value, high: Value) -> Value:
-    return w.emit("min", a.dtype, w.emit("max", a.dtype, a, low), high)
-
-
-def _power(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    power = equation_parameter(eqn, "y")
-    if not 1 <= abs(power) <= 8:
-        raise Unsupported(f"integer_pow by {power}")
-    result = reduce(lambda x, y: w.emit("mul", a.dtype, x, y), [a] * abs(power))
-    return result if power > 0 else w.emit("div", a.dtype, _make_constant_like(a, 1), result)
-
-
-def _select(w: _Lowering, eqn: JaxprEqn, condition: Value, *cases: Value) -> Value:
-    if len(cases) != 2 or condition.dtype != bool:
-        raise Unsupported("select_n among more than two")
-    return w.emit("select", cases[0].dtype, condition, cases[1], cases[0])
-
-
-def _convert(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    new = _dtype_of(eqn.outvars[0])
-    if new.kind == "b" and a.dtype.kind != "b":
-        return w.emit("ne", bool, a, _make_constant_like(a, 0))
-    return w.emit("convert", new, a)
-
-
-def _bitcast(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    """The bits of a number as another one; of an exponent that is put together from an integer, a power of two."""
-    new = _dtype_of(eqn.outvars[0])
-    bias, bits = (1023, 52) if new == np.float64 else (127, 23)
-    shift = w.operation_by_variable.get(a) if new.kind == "f" else None
-    if shift is not None and shift.name == "shift_left" and _is_number(shift.operands[1], bits):
-        sum_ = w.operation_by_variable.get(shift.operands[0])
-        if sum_ is not None and sum_.name == "add" and _is_number(sum_.operands[1], bias):
-            exponent = sum_.operands[0]
-            before = w.operation_by_variable.get(exponent)
-            if before is not None and before.name == "convert":
-                exponent = before.operands[0]
-            return w.emit("power_of_two", new, w.emit("convert", np.int32, exponent))
-    return w.emit("bitcast", new, a)
+def _are_constant(values: Sequence[Value]) -> TypeGuard[Sequence[Constant]]:
+    return all(isinstance(value, Constant) for value in values)
 
 
 def _is_number(value: Value, number: int) -> bool:
     return isinstance(value, Constant) and value.value == number
-
-
-def _finite(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    return w.emit("le", bool, w.emit("abs", a.dtype, a), _make_constant_like(a, float(jnp.finfo(a.dtype).max)))
-
-
-def _one_minus_square(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    unit = _make_constant_like(a, 1)
-    return w.emit("mul", a.dtype, w.emit("add", a.dtype, unit, a), w.emit("sub", a.dtype, unit, a))
-
-
-_OF_FLOATS: dict[str, Rule] = {
-    **{name: _make_operation_rule(name) for name in ("add", "sub", "mul", "div", "neg", "abs", "sqrt", "floor", "ceil")},
-    "add_any": _make_operation_rule("add"),
-    "square": lambda w, eqn, a: w.emit("mul", a.dtype, a, a),
-    "one_minus_square": _one_minus_square,
-    "integer_pow": _power,
-    # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.emit(
-        ("round_away", "round_even")[int(equation_parameter(eqn, "rounding_method"))], a.dtype, a
-    ),
-    "is_finite": _finite,
-}
-_OF_INTEGERS: dict[str, Rule] = {
-    name: _make_operation_rule(name)
-    for name in ("add", "sub", "mul", "div", "rem", "neg", "and", "or", "xor", "not", "shift_left", "shift_right_logical")
-}
-_OF_ALL: dict[str, Rule] = {
-    **{name: _make_comparison_rule(name) for name in ("gt", "lt", "ge", "le", "eq", "ne")},
-    "sign": _sign,
-    "max": _make_operation_rule("max"),
-    "min": _make_operation_rule("min"),
-    "clamp": _clamp,
-    "select_n": _select,
-    "convert_element_type": _convert,
-    "bitcast_convert_type": _bitcast,
-    **dict.fromkeys(("copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze"), lambda w, eqn, a: a),
-}
 
 
 def name_constants(constants: Iterable[Constant], study_numbers: Mapping[str, Any]) -> dict[Constant, str]:

@@ -8,8 +8,7 @@ import ctypes
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,17 +16,8 @@ from llvmlite import binding, ir
 
 from . import Unsupported
 from .dependence import LoopHooks
-from .elementary import FUNCTIONS
-from .jaxprs import (
-    ClosedJaxpr,
-    JaxprEqn,
-    Literal,
-    Var,
-    callee,
-    equation_parameter,
-    scan_parameters,
-    trace_scalar_function,
-)
+from .jaxprs import ClosedJaxpr, JaxprEqn
+from .scalar_writer import COMPARISONS, Rule, ScalarWriter
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _MEMORY_TYPES = {
@@ -46,13 +36,6 @@ Vector = Any
 _FLAGS = ("contract",)
 """A product and a sum may become one instruction; nothing is reordered, as sums are compensated."""
 _BOOL = np.dtype(bool)
-
-
-def _dtype(v: Any) -> np.dtype:
-    """The type of a variable or literal of a jaxpr."""
-    if str(v.aval.dtype) not in _MEMORY_TYPES:
-        raise Unsupported(f"numbers of type {v.aval.dtype}")
-    return np.dtype(v.aval.dtype)
 
 
 def _target_machine() -> Any:
@@ -122,7 +105,11 @@ def loop_signature(
         ("block flag", "blocks and lanes", after_block.jaxpr.outvars[carry:] if after_block else []),
         ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    arrays = [(f"{name} {i}", _dtype(v), extent) for name, extent, variables in groups for i, v in enumerate(variables)]
+    arrays = [
+        (f"{name} {i}", _LoopWriter.check_type(v.aval.dtype), extent)
+        for name, extent, variables in groups
+        for i, v in enumerate(variables)
+    ]
     specs: list[ArraySpec] = []
     for name, dtype, extent in reversed(arrays):
         is_like_next = specs and specs[-1].dtype == dtype and specs[-1].extent == extent
@@ -291,8 +278,14 @@ def _address(array: np.ndarray) -> int:
     return array.__array_interface__["data"][0]
 
 
-class _LoopWriter:
+class _LoopWriter(ScalarWriter):
     """Writes jaxprs as LLVM assembly; every number is a vector of lanes."""
+
+    number_types = _MEMORY_TYPES
+    own_rules: ClassVar[dict[str, Rule]] = {
+        "clamp": lambda w, eqn, dtype, low, a, high: w.emit("min", dtype, w.emit("max", dtype, low, a), high),
+        "is_finite": lambda w, eqn, dtype, a: w.emit("lt", dtype, w.emit("abs", dtype, a), w.literal(np.inf, dtype)),
+    }
 
     def __init__(self, module: ir.Module, lanes: int):
         self.module, self.lanes = module, lanes
@@ -435,60 +428,56 @@ class _LoopWriter:
         build.position_at_end(behind)
         return carried
 
-    def write_jaxpr(self, closed: ClosedJaxpr, arguments: Sequence[Vector]) -> list[Vector]:
-        """Write the equations of a jaxpr of scalars; returns its results."""
-        jaxpr = closed.jaxpr
-        env: dict[Var, Vector] = dict(zip(jaxpr.invars, arguments, strict=True))
-        if any(v.aval.shape for v in jaxpr.constvars):
-            raise Unsupported("steps that read tables")
-        env |= {v: self.literal(number, _dtype(v)) for v, number in zip(jaxpr.constvars, closed.consts, strict=True)}
-
-        def read(v: Var | Literal) -> Vector:
-            return self.literal(v.val, _dtype(v)) if isinstance(v, Literal) else env[v]
-
-        for eqn in jaxpr.eqns:
-            out: list[Any] = eqn.outvars
-            if any(v.aval.shape for v in out):
-                raise Unsupported(f"{eqn.primitive.name} of shape {out[0].aval.shape}")
-            operands = [read(v) for v in eqn.invars]
-            results = self.write_equation(eqn, operands)
-            if all(self.is_invariant(operand) for operand in operands):
-                self.invariants |= set(results)
-            env |= dict(zip(out, results, strict=True))
-        return [read(v) for v in jaxpr.outvars]
-
     def write_equation(self, eqn: JaxprEqn, operands: list[Vector]) -> list[Vector]:
-        name = eqn.primitive.name
-        if name == "scan":
-            # a loop of fixed length that carries a state: the substeps of a plant
-            length, body, constant_count = scan_parameters(eqn)
-            constants, state = operands[:constant_count], operands[constant_count:]
-            return self.write_for(
-                _INT(0), _INT(length), state, lambda _, state: self.write_jaxpr(body, [*constants, *state])
-            )
-        if (called := callee(eqn)) is not None:
-            return self.write_jaxpr(called, operands)
-        dtype = _dtype(eqn.invars[0])
-        is_float = jnp.issubdtype(dtype, jnp.floating)
-        if name in FUNCTIONS and is_float:
-            return self.write_jaxpr(trace_scalar_function(FUNCTIONS[name], dtype), operands)
-        rule = (_FLOAT_RULES if is_float else _INTEGER_RULES).get(name) or _COMMON_RULES.get(name)
-        if rule is None:
+        results = super().write_equation(eqn, operands)
+        if all(self.is_invariant(operand) for operand in operands):
+            self.invariants |= set(results)
+        return results
+
+    def write_scan(self, times, body, constants, state):
+        # the substeps of a plant
+        return self.write_for(_INT(0), _INT(times), state, lambda _, state: self.write_jaxpr(body, [*constants, *state]))
+
+    def write_cond(self, branches, index, operands):
+        raise Unsupported("cond")
+
+    def emit(self, name, dtype, *operands):
+        instruction = (_FLOAT_INSTRUCTIONS if jnp.issubdtype(dtype, jnp.floating) else _INTEGER_INSTRUCTIONS).get(name)
+        if instruction is None:
             raise Unsupported(f"{name} of {dtype}")
-        return [rule(self, eqn, *operands)]
+        return instruction(self, dtype, *operands)
+
+    def convert(self, number, old, new):
+        if old == new:
+            return number
+        if new == _BOOL:
+            raise Unsupported(f"conversion of {old} to bool")
+        build, target = self.build, self.vector_type(_MEMORY_TYPES[str(new)])
+        is_wider, is_signed = old == _BOOL or new.itemsize > old.itemsize, jnp.issubdtype(old, jnp.signedinteger)
+        from_float, to_float = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
+        if from_float and to_float:
+            return (build.fpext if is_wider else build.fptrunc)(number, target)
+        if from_float:
+            return (build.fptosi if jnp.issubdtype(new, jnp.signedinteger) else build.fptoui)(number, target)
+        if to_float:
+            return (build.sitofp if is_signed else build.uitofp)(number, target)
+        if number.type == target:
+            return number
+        return (build.trunc if not is_wider else build.sext if is_signed else build.zext)(number, target)
+
+    def bitcast(self, number, new):
+        return self.build.bitcast(number, self.vector_type(_MEMORY_TYPES[str(new)]))
 
     def vector_type(self, element: ir.Type) -> ir.VectorType:
         return ir.VectorType(element, self.lanes)
 
     def literal(self, number: Any, dtype: np.dtype) -> Vector:
         """A number of a type in all lanes."""
-        element = _BIT if dtype == _BOOL else _MEMORY_TYPES[str(dtype)]
+        if np.ndim(number):
+            raise Unsupported("steps that read tables")
+        element = _BIT if dtype == _BOOL else _MEMORY_TYPES[str(self.check_type(dtype))]
         python_number = np.asarray(number, dtype).item()
         return ir.Constant(self.vector_type(element), [ir.Constant(element, python_number)] * self.lanes)
-
-    def literal_like(self, vector: Vector, number: float) -> Vector:
-        """A number of a vector's type in all lanes."""
-        return ir.Constant(vector.type, [ir.Constant(vector.type.element, number)] * self.lanes)
 
     def is_invariant(self, vector: Vector) -> bool:
         return isinstance(vector, ir.Constant) or vector in self.invariants
@@ -502,124 +491,63 @@ class _LoopWriter:
         return self.build.call(function, operands)
 
 
-def _divide(w: _LoopWriter, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
+Instruction = Callable[..., Vector]
+"""`instruction(writer, dtype, *operands)` writes an operation on numbers of type `dtype`."""
+
+
+def _divide(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
     if w.is_invariant(b) and not w.is_invariant(a):
         # the reciprocal leaves the loop
-        return w.build.fmul(a, w.build.fdiv(w.literal_like(b, 1.0), b), flags=_FLAGS)
+        return w.build.fmul(a, w.build.fdiv(w.literal(1, dtype), b), flags=_FLAGS)
     return w.build.fdiv(a, b)
 
 
-def _sign(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
-    below = w.build.select(w.build.fcmp_ordered("<", a, w.literal_like(a, 0.0)), w.literal_like(a, -1.0), a)
-    return w.build.select(w.build.fcmp_ordered(">", a, w.literal_like(a, 0.0)), w.literal_like(a, 1.0), below)
-
-
-def _extremum_rule(order: str) -> Callable[..., Vector]:
+def _extremum(order: str) -> Instruction:
     """The larger or smaller of two numbers, NaN if either is."""
 
-    def rule(w: _LoopWriter, eqn: JaxprEqn | None, a: Vector, b: Vector) -> Vector:
+    def write(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
         extremum = w.build.select(w.build.fcmp_unordered(order, a, b), a, b)
         return w.build.select(w.build.fcmp_unordered("uno", b, b), b, extremum)
 
-    return rule
+    return write
 
 
-_MAXIMUM, _MINIMUM = _extremum_rule(">"), _extremum_rule("<")
-
-
-def _clamp(w: _LoopWriter, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> Vector:
-    return _MINIMUM(w, eqn, _MAXIMUM(w, eqn, low, a), high)
-
-
-def _integer_power(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
-    exponent = equation_parameter(eqn, "y")
-    if not 1 <= abs(exponent) <= 8:
-        raise Unsupported(f"integer_pow by {exponent}")
-    power = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(exponent))
-    return power if exponent > 0 else w.build.fdiv(w.literal_like(a, 1.0), power)
-
-
-def _comparison_rule(order: str) -> Callable[..., Vector]:
-    def rule(w: _LoopWriter, eqn: JaxprEqn, a: Vector, b: Vector) -> Vector:
-        dtype = _dtype(eqn.invars[0])
+def _comparison(order: str) -> Instruction:
+    def write(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
         if jnp.issubdtype(dtype, jnp.floating):
             return (w.build.fcmp_unordered if order == "!=" else w.build.fcmp_ordered)(order, a, b)
         is_signed = jnp.issubdtype(dtype, jnp.signedinteger)
         return (w.build.icmp_signed if is_signed else w.build.icmp_unsigned)(order, a, b)
 
-    return rule
+    return write
 
 
-def _select(w: _LoopWriter, eqn: JaxprEqn, condition: Vector, *cases: Vector) -> Vector:
-    if len(cases) != 2 or condition.type.element != _BIT:
-        raise Unsupported("select_n among more than two")
-    return w.build.select(condition, cases[1], cases[0])
+def _instruction(name: str, **options: Any) -> Instruction:
+    return lambda w, dtype, *operands: getattr(w.build, name)(*operands, **options)
 
 
-def _convert(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
-    old, new = _dtype(eqn.invars[0]), _dtype(eqn.outvars[0])
-    if old == new:
-        return a
-    if new == _BOOL:
-        raise Unsupported(f"conversion of {old} to bool")
-    target, is_wider = w.vector_type(_MEMORY_TYPES[str(new)]), old == _BOOL or new.itemsize > old.itemsize
-    is_signed = jnp.issubdtype(old, jnp.signedinteger)
-    from_float, to_float = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
-    if from_float and to_float:
-        return (w.build.fpext if is_wider else w.build.fptrunc)(a, target)
-    if from_float:
-        return (w.build.fptosi if jnp.issubdtype(new, jnp.signedinteger) else w.build.fptoui)(a, target)
-    if to_float:
-        return (w.build.sitofp if is_signed else w.build.uitofp)(a, target)
-    if a.type == target:
-        return a
-    return (w.build.trunc if not is_wider else w.build.sext if is_signed else w.build.zext)(a, target)
+def _intrinsic(name: str) -> Instruction:
+    return lambda w, dtype, *operands: w.call_intrinsic(name, *operands)
 
 
-def _instruction(name: str, **options: Any) -> Callable[..., Vector]:
-    return lambda w, eqn, *operands: getattr(w.build, name)(*operands, **options)
-
-
-def _intrinsic(name: str) -> Callable[..., Vector]:
-    return lambda w, eqn, *operands: w.call_intrinsic(name, *operands)
-
-
-def _one_minus_square(w: _LoopWriter, eqn: JaxprEqn, a: Vector) -> Vector:
-    """1 - a², in JAX 0.11's derivatives of tanh."""
-    unit = w.literal_like(a, 1.0)
-    return w.build.fmul(w.build.fadd(unit, a), w.build.fsub(unit, a))
-
-
-_FLOAT_RULES: dict[str, Callable[..., Vector]] = {
+_COMMON_INSTRUCTIONS = {
+    **dict(zip(COMPARISONS, map(_comparison, ("<", "<=", ">", ">=", "==", "!=")), strict=True)),
+    "select": _instruction("select"),
+}
+_FLOAT_INSTRUCTIONS: dict[str, Instruction] = _COMMON_INSTRUCTIONS | {
     **{name: _instruction(f"f{name}", flags=_FLAGS) for name in ("add", "sub", "mul")},
-    "add_any": _instruction("fadd", flags=_FLAGS),
     "div": _divide,
     "neg": _instruction("fneg"),
-    "square": lambda w, eqn, a: w.build.fmul(a, a, flags=_FLAGS),
-    "one_minus_square": _one_minus_square,
-    "integer_pow": _integer_power,
     "abs": _intrinsic("fabs"),
     **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
-    # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.call_intrinsic(("round", "rint")[int(equation_parameter(eqn, "rounding_method"))], a),
-    "sign": _sign,
-    "max": _MAXIMUM,
-    "min": _MINIMUM,
-    "clamp": _clamp,
-    "is_finite": lambda w, eqn, a: w.build.fcmp_ordered("<", w.call_intrinsic("fabs", a), w.literal_like(a, float("inf"))),
+    "round_away": _intrinsic("round"),
+    "round_even": _intrinsic("rint"),
+    "max": _extremum(">"),
+    "min": _extremum("<"),
 }
-_INTEGER_RULES: dict[str, Callable[..., Vector]] = {
+_INTEGER_INSTRUCTIONS: dict[str, Instruction] = _COMMON_INSTRUCTIONS | {
     **{name: _instruction(name) for name in ("add", "sub", "mul", "xor")},
     **{name: _instruction(f"{name}_") for name in ("and", "or", "not")},
     "shift_left": _instruction("shl"),
     "shift_right_logical": _instruction("lshr"),
-}
-_COMMON_RULES: dict[str, Callable[..., Vector]] = {
-    **dict(
-        zip(("gt", "lt", "ge", "le", "eq", "ne"), map(_comparison_rule, (">", "<", ">=", "<=", "==", "!=")), strict=True)
-    ),
-    "select_n": _select,
-    "convert_element_type": _convert,
-    "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector_type(_MEMORY_TYPES[str(_dtype(eqn.outvars[0]))])),
-    **dict.fromkeys(("copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze"), lambda w, eqn, a: a),
 }
