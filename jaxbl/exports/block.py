@@ -17,7 +17,6 @@ from .lowering import (
     are_same,
     default_precision,
     drop_unread,
-    find_read_variables,
     lower_to_operations,
 )
 
@@ -187,21 +186,18 @@ def lower_block(block: Block) -> Program:
     outputs, read_states = step.results[count:], set[int]()
     while True:
         needed = Routine(step.statements, (*(step.results[i] for i in sorted(read_states)), *outputs))
-        read = find_read_variables(needed)
+        needed, read = drop_unread(needed)
         states_read_now = {i for i, variable in enumerate(state) if variable in read and i not in constant_states}
         if states_read_now == read_states:
             break
         read_states = states_read_now
     kept_indices = sorted(read_states)
+    start_results = *(start_routine.results[i] for i in kept_indices), *start_routine.results[count:]
     return Program(
         block,
         tuple(block.state[i] for i in kept_indices),
-        drop_unread(
-            Routine(
-                start_routine.statements, (*(start_routine.results[i] for i in kept_indices), *start_routine.results[count:])
-            )
-        ),
-        drop_unread(needed),
+        drop_unread(Routine(start_routine.statements, start_results))[0],
+        needed,
         tuple(state[i] for i in kept_indices),
     )
 

@@ -79,13 +79,12 @@ class Operation(NamedTuple):
 
 
 class Repeat(NamedTuple):
-    """A loop: `carried` begin as `start`; the body runs `times` times, and each time they become `results`, all at once."""
+    """A loop: `carried` begin as `start`; the body runs `times` times, each time they become its results, all at once."""
 
     times: int
     carried: tuple[Variable, ...]
     start: tuple[Value, ...]
-    body: "tuple[Statement, ...]"
-    results: tuple[Value, ...]
+    body: "Routine"
     source: str
 
 
@@ -94,8 +93,7 @@ class Choice(NamedTuple):
 
     condition: Value
     outs: tuple[Variable, ...]
-    bodies: "tuple[tuple[Statement, ...], tuple[Statement, ...]]"
-    results: tuple[tuple[Value, ...], tuple[Value, ...]]
+    bodies: "tuple[Routine, Routine]"
     source: str
 
 
@@ -119,15 +117,7 @@ def lower_to_operations(closed: ClosedJaxpr, arguments: Sequence[Any]) -> Routin
     Raises:
         Unsupported: an operation of it is unknown here.
     """
-    lowering = _Lowering()
-    results = lowering.write_jaxpr(closed, arguments)
-    return Routine(tuple(lowering.statements), tuple(results))
-
-
-def drop_unread(routine: Routine) -> Routine:
-    """Drop the statements that no result reads."""
-    statements, _ = _find_needed(routine.statements, routine.results)
-    return Routine(statements, routine.results)
+    return _Lowering().lower_body(closed, arguments)
 
 
 def select_variables(values: Iterable[Value]) -> set[Variable]:
@@ -135,82 +125,64 @@ def select_variables(values: Iterable[Value]) -> set[Variable]:
     return {value for value in values if isinstance(value, Variable)}
 
 
-def find_read_variables(routine: Routine) -> set[Variable]:
-    """Find the variables that a routine reads and does not compute."""
-    return _find_needed(routine.statements, routine.results)[1]
-
-
 def find_constants(routine: Routine) -> list[Constant]:
     """Find the constants of a routine, in the order in which they are first read."""
-    values = chain(_read_values(routine.statements), routine.results)
-    return list(dict.fromkeys(value for value in values if isinstance(value, Constant)))
+    return list(dict.fromkeys(value for value in _read_values(routine) if isinstance(value, Constant)))
+
+
+def _read_values(routine: Routine) -> Iterable[Value]:
+    for statement in routine.statements:
+        if isinstance(statement, Operation):
+            yield from statement.operands
+        elif isinstance(statement, Repeat):
+            yield from chain(statement.start, _read_values(statement.body))
+        else:
+            yield from chain([statement.condition], *map(_read_values, statement.bodies))
+    yield from routine.results
 
 
 def count_operations(routine: Routine) -> Counter[str]:
     """Count how often each operation is done, by name; of a choice the longer body counts."""
-    return _count_in(routine.statements)
-
-
-def _count_in(statements: Iterable[Statement]) -> Counter[str]:
     counts: Counter[str] = Counter()
-    for statement in statements:
+    for statement in routine.statements:
         if isinstance(statement, Operation):
             counts[statement.name] += 1
         elif isinstance(statement, Repeat):
-            counts.update({name: number * statement.times for name, number in _count_in(statement.body).items()})
+            counts.update({name: number * statement.times for name, number in count_operations(statement.body).items()})
         else:
-            counts.update(max(map(_count_in, statement.bodies), key=Counter.total))
+            counts.update(max(map(count_operations, statement.bodies), key=Counter.total))
     return counts
 
 
-def _read_values(statements: Iterable[Statement]) -> Iterable[Value]:
-    for statement in statements:
-        if isinstance(statement, Operation):
-            yield from statement.operands
-        elif isinstance(statement, Repeat):
-            yield from chain(statement.start, _read_values(statement.body), statement.results)
-        else:
-            yield statement.condition
-            for body, results in zip(statement.bodies, statement.results, strict=True):
-                yield from chain(_read_values(body), results)
-
-
-def _find_needed(statements: Sequence[Statement], results: Iterable[Value]) -> tuple[tuple[Statement, ...], set[Variable]]:
-    """Find the statements that the results need, and the variables that these read and do not compute."""
-    needed, needed_statements = select_variables(results), []
-    for statement in reversed(statements):
+def drop_unread(routine: Routine) -> tuple[Routine, set[Variable]]:
+    """Drop the statements that no result reads, and find the variables that the others read and do not compute."""
+    needed, needed_statements = select_variables(routine.results), []
+    for statement in reversed(routine.statements):
         if isinstance(statement, Operation):
             if statement.out not in needed:
                 continue
             needed = needed - {statement.out} | select_variables(statement.operands)
             needed_statements.append(statement)
         elif isinstance(statement, Repeat):
-            alive = [variable in needed for variable in statement.carried]
+            carried = statement.carried
+            alive = [variable in needed for variable in carried]
             while True:
-                body, inside = _find_needed(statement.body, _select_marked(statement.results, alive))
-                before, alive = (
-                    alive,
-                    [is_alive or variable in inside for is_alive, variable in zip(alive, statement.carried, strict=True)],
-                )
+                body, inside = drop_unread(_select_results(statement.body, alive))
+                before, alive = alive, [is_alive or carry in inside for is_alive, carry in zip(alive, carried, strict=True)]
                 if before == alive:
                     break
             if any(alive):
-                carried, start = _select_marked(statement.carried, alive), _select_marked(statement.start, alive)
+                carried, start = _select_marked(carried, alive), _select_marked(statement.start, alive)
                 needed = (needed | inside) - set(carried) | select_variables(start)
-                needed_statements.append(
-                    statement._replace(
-                        carried=carried, start=start, body=body, results=_select_marked(statement.results, alive)
-                    )
-                )
+                needed_statements.append(statement._replace(carried=carried, start=start, body=body))
         else:
             alive = [variable in needed for variable in statement.outs]
             if any(alive):
                 outs = _select_marked(statement.outs, alive)
-                branch_results_alive = tuple(_select_marked(branch_results, alive) for branch_results in statement.results)
-                bodies, inside = zip(*map(_find_needed, statement.bodies, branch_results_alive), strict=True)
+                bodies, inside = zip(*(drop_unread(_select_results(body, alive)) for body in statement.bodies), strict=True)
                 needed = needed.difference(outs).union(*inside, select_variables([statement.condition]))
-                needed_statements.append(statement._replace(outs=outs, bodies=bodies, results=branch_results_alive))
-    return tuple(reversed(needed_statements)), needed
+                needed_statements.append(statement._replace(outs=outs, bodies=bodies))
+    return Routine(tuple(reversed(needed_statements)), routine.results), needed
 
 
 def are_same(first: Value, second: Value) -> bool:
@@ -218,6 +190,10 @@ def are_same(first: Value, second: Value) -> bool:
     if isinstance(first, Constant) and isinstance(second, Constant):
         return first.key[:2] == second.key[:2]
     return first is second
+
+
+def _select_results(routine: Routine, marks: Sequence[bool]) -> Routine:
+    return routine._replace(results=_select_marked(routine.results, marks))
 
 
 def _select_marked(candidates: Sequence[Any], marks: Sequence[bool]) -> tuple[Any, ...]:
@@ -249,11 +225,9 @@ class _Lowering(ScalarWriter):
         if not self._is_in_call:
             self._source = equation_source(eqn)
         results = super().write_equation(eqn, operands)
-        return (
-            [_add_formula(result, eqn.primitive.name, operands) for result in results]
-            if _are_constant(operands)
-            else results
-        )
+        if not _are_constant(operands):
+            return results
+        return [_add_formula(result, eqn.primitive.name, operands) for result in results]
 
     def write_call(self, called, operands):
         was_in_call, self._is_in_call = self._is_in_call, True
@@ -275,8 +249,7 @@ class _Lowering(ScalarWriter):
             return state
         source = self._source
         carried = tuple(self.variable(value.dtype) for value in state)
-        statements, results = self._lower_body(body, [*constants, *carried])
-        self.statements.append(Repeat(times, carried, tuple(state), statements, results, source))
+        self.statements.append(Repeat(times, carried, tuple(state), self.lower_body(body, [*constants, *carried]), source))
         return list(carried)
 
     def write_cond(self, branches, index, operands):
@@ -285,21 +258,21 @@ class _Lowering(ScalarWriter):
         if len(branches) != 2:
             raise Unsupported("cond among more than two")
         condition, source = self._convert_to_bool(index), self._source
-        (no_body, no), (yes_body, yes) = (self._lower_body(branch, operands) for branch in branches)
+        no, yes = (self.lower_body(branch, operands) for branch in branches)
         # what is the same on both ways is no choice
-        differ = [not are_same(a, b) for a, b in zip(yes, no, strict=True)]
-        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes, differ, strict=True)]
-        outs, *results = (_select_marked(values, differ) for values in (merged, yes, no))
-        self.statements.append(Choice(condition, outs, (yes_body, no_body), tuple(results), source))
+        differ = [not are_same(a, b) for a, b in zip(yes.results, no.results, strict=True)]
+        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)]
+        bodies = _select_results(yes, differ), _select_results(no, differ)
+        self.statements.append(Choice(condition, _select_marked(merged, differ), bodies, source))
         return merged
 
-    def _lower_body(self, body: ClosedJaxpr, arguments: Sequence[Value]) -> tuple[tuple[Statement, ...], tuple[Value, ...]]:
+    def lower_body(self, body: ClosedJaxpr, arguments: Sequence[Value]) -> Routine:
         """Lower a body apart: variables that it defines cannot be used after it."""
         outer_statements, outer_variables = self.statements, self._variable_by_operation
         self.statements, self._variable_by_operation = [], dict(outer_variables)
         results = self.write_jaxpr(body, arguments)
         statements, self.statements, self._variable_by_operation = self.statements, outer_statements, outer_variables
-        return tuple(statements), tuple(results)
+        return Routine(tuple(statements), tuple(results))
 
     # operations
 

@@ -15,7 +15,7 @@ from jaxbl.simulate import Experiment, move_plant
 
 from .block import Block, Outputs, Program, Quantity, Values, lower_block, trace_block
 from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
-from .lowering import default_precision, find_read_variables
+from .lowering import default_precision, drop_unread
 
 _INPUT = "u"
 _PARTS = "drive.", "transmission.", "effects.", "initial."
@@ -68,7 +68,7 @@ def build_plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProg
         {
             path: parameter
             for path, parameter in candidates.items()
-            if _make_identifier(path) in {variable.name for variable in find_read_variables(routine)}
+            if _make_identifier(path) in {variable.name for variable in drop_unread(routine)[1]}
         }
         for routine in (program.start, program.step)
     )

@@ -17,8 +17,8 @@ from .lowering import (
     Statement,
     Value,
     Variable,
+    drop_unread,
     find_constants,
-    find_read_variables,
     name_constants,
 )
 
@@ -132,8 +132,8 @@ class Writer(abc.ABC):
             self.declare(variable, self.text(start))
         self.begin_repeat(loop.times)
         self._depth += 1
-        self.write_statements(loop.body)
-        self._assign_together(loop.carried, loop.results)
+        self.write_statements(loop.body.statements)
+        self._assign_together(loop.carried, loop.body.results)
         self._depth -= 1
         self.end("repeat")
 
@@ -153,14 +153,14 @@ class Writer(abc.ABC):
 
     def _write_choice(self, choice: Choice) -> None:
         yes, no = choice.bodies
-        short = not no
-        for variable, value in zip(choice.outs, choice.results[1], strict=True):
+        short = not no.statements
+        for variable, value in zip(choice.outs, no.results, strict=True):
             self.declare(variable, self.text(value) if short else None)
         self.begin_if(self.text(choice.condition))
-        for body, results in zip((yes, no), choice.results, strict=True):
+        for body in choice.bodies:
             self._depth += 1
-            self.write_statements(body)
-            for variable, value in zip(choice.outs, results, strict=True):
+            self.write_statements(body.statements)
+            for variable, value in zip(choice.outs, body.results, strict=True):
                 self.assign(self.name(variable), self.text(value))
             self._depth -= 1
             if short:
@@ -177,7 +177,7 @@ def _shorten_source(source: str) -> str:
 
 def find_unread_names(routine: Routine, quantities: Sequence[Quantity]) -> list[str]:
     """Find the names of quantities that a routine does not read."""
-    read = {variable.name for variable in find_read_variables(routine)}
+    read = {variable.name for variable in drop_unread(routine)[1]}
     return [quantity.name for quantity in quantities if quantity.name not in read]
 
 

@@ -8,9 +8,9 @@ import ctypes
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from llvmlite import binding, ir
 
@@ -313,7 +313,7 @@ class _LoopWriter(ScalarWriter):
         carry_count = len(places["carry"])
         dtypes = [spec.dtype for spec in signature]
         types = [_MEMORY_TYPES[str(dtype)] for dtype in dtypes]
-        if any(not jnp.issubdtype(dtypes[i], jnp.floating) for i in (*places["value"], *places["carry"])):
+        if any(dtypes[i].kind != "f" for i in (*places["value"], *places["carry"])):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
         arrays = [build.load(build.gep(table, [_INT(i)], source_etype=_POINTER), typ=_POINTER) for i in range(len(dtypes))]
 
@@ -442,7 +442,7 @@ class _LoopWriter(ScalarWriter):
         raise Unsupported("cond")
 
     def emit(self, name, dtype, *operands):
-        instruction = (_FLOAT_INSTRUCTIONS if jnp.issubdtype(dtype, jnp.floating) else _INTEGER_INSTRUCTIONS).get(name)
+        instruction = (_FLOAT_INSTRUCTIONS if dtype.kind == "f" else _INTEGER_INSTRUCTIONS).get(name)
         if instruction is None:
             raise Unsupported(f"{name} of {dtype}")
         return instruction(self, dtype, *operands)
@@ -453,12 +453,12 @@ class _LoopWriter(ScalarWriter):
         if new == _BOOL:
             raise Unsupported(f"conversion of {old} to bool")
         build, target = self.build, self.vector_type(_MEMORY_TYPES[str(new)])
-        is_wider, is_signed = old == _BOOL or new.itemsize > old.itemsize, jnp.issubdtype(old, jnp.signedinteger)
-        from_float, to_float = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
+        is_wider, is_signed = old == _BOOL or new.itemsize > old.itemsize, old.kind == "i"
+        from_float, to_float = (dtype.kind == "f" for dtype in (old, new))
         if from_float and to_float:
             return (build.fpext if is_wider else build.fptrunc)(number, target)
         if from_float:
-            return (build.fptosi if jnp.issubdtype(new, jnp.signedinteger) else build.fptoui)(number, target)
+            return (build.fptosi if new.kind == "i" else build.fptoui)(number, target)
         if to_float:
             return (build.sitofp if is_signed else build.uitofp)(number, target)
         if number.type == target:
@@ -502,24 +502,16 @@ def _divide(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
     return w.build.fdiv(a, b)
 
 
-def _extremum(order: str) -> Instruction:
+def _write_extremum(order: str, w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
     """The larger or smaller of two numbers, NaN if either is."""
-
-    def write(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
-        extremum = w.build.select(w.build.fcmp_unordered(order, a, b), a, b)
-        return w.build.select(w.build.fcmp_unordered("uno", b, b), b, extremum)
-
-    return write
+    extremum = w.build.select(w.build.fcmp_unordered(order, a, b), a, b)
+    return w.build.select(w.build.fcmp_unordered("uno", b, b), b, extremum)
 
 
-def _comparison(order: str) -> Instruction:
-    def write(w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
-        if jnp.issubdtype(dtype, jnp.floating):
-            return (w.build.fcmp_unordered if order == "!=" else w.build.fcmp_ordered)(order, a, b)
-        is_signed = jnp.issubdtype(dtype, jnp.signedinteger)
-        return (w.build.icmp_signed if is_signed else w.build.icmp_unsigned)(order, a, b)
-
-    return write
+def _compare(order: str, w: _LoopWriter, dtype: np.dtype, a: Vector, b: Vector) -> Vector:
+    if dtype.kind == "f":
+        return (w.build.fcmp_unordered if order == "!=" else w.build.fcmp_ordered)(order, a, b)
+    return (w.build.icmp_signed if dtype.kind == "i" else w.build.icmp_unsigned)(order, a, b)
 
 
 def _instruction(name: str, **options: Any) -> Instruction:
@@ -531,7 +523,7 @@ def _intrinsic(name: str) -> Instruction:
 
 
 _COMMON_INSTRUCTIONS = {
-    **dict(zip(COMPARISONS, map(_comparison, ("<", "<=", ">", ">=", "==", "!=")), strict=True)),
+    **{name: partial(_compare, order) for name, order in zip(COMPARISONS, ("<", "<=", ">", ">=", "==", "!="), strict=True)},
     "select": _instruction("select"),
 }
 _FLOAT_INSTRUCTIONS: dict[str, Instruction] = _COMMON_INSTRUCTIONS | {
@@ -542,8 +534,8 @@ _FLOAT_INSTRUCTIONS: dict[str, Instruction] = _COMMON_INSTRUCTIONS | {
     **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
     "round_away": _intrinsic("round"),
     "round_even": _intrinsic("rint"),
-    "max": _extremum(">"),
-    "min": _extremum("<"),
+    "max": partial(_write_extremum, ">"),
+    "min": partial(_write_extremum, "<"),
 }
 _INTEGER_INSTRUCTIONS: dict[str, Instruction] = _COMMON_INSTRUCTIONS | {
     **{name: _instruction(name) for name in ("add", "sub", "mul", "xor")},

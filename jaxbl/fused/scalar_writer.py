@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import reduce
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported
@@ -115,7 +114,7 @@ class ScalarWriter(abc.ABC):
         if (called := callee(eqn)) is not None:
             return self.write_call(called, operands)
         dtype = self.check_type(variables[0].aval.dtype)
-        is_float = jnp.issubdtype(dtype, jnp.floating)
+        is_float = dtype.kind == "f"
         if name in FUNCTIONS and is_float:
             return self.write_call(trace_scalar_function(FUNCTIONS[name], dtype), operands)
         rules = self.own_rules, _FLOAT_RULES if is_float else _INTEGER_RULES, _COMMON_RULES
@@ -171,7 +170,7 @@ _FLOAT_RULES: dict[str, Rule] = {
         ("round_away", "round_even")[int(equation_parameter(eqn, "rounding_method"))], dtype, a
     ),
     "is_finite": lambda w, eqn, dtype, a: w.emit(
-        "le", dtype, w.emit("abs", dtype, a), w.literal(jnp.finfo(dtype).max, dtype)
+        "le", dtype, w.emit("abs", dtype, a), w.literal(np.finfo(dtype).max, dtype)
     ),
 }
 _INTEGER_RULES = _operation_rules(
