@@ -130,7 +130,7 @@ class _C(Writer):
         program, block = self.program, self.program.block
         start, step = write_signatures(program)
         self._write_function(start, 0, block.start_inputs, ())
-        self.add_line()
+        self.add_lines("")
         self._write_function(step, 1, block.inputs, program.state_variables)
 
     def _write_function(
@@ -143,28 +143,26 @@ class _C(Writer):
         """One of the two; `state_variables` are variables for the state that it finds."""
         program, block = self.program, self.program.block
         routine = (program.start, program.step)[routine_index]
-        self.add_line(head)
-        self.add_line("{")
+        self.add_lines(head, "{")
         self._depth += 1
         self._write_constants_of_routine(routine_index)
         if not program.state:
-            self.add_line("(void)state;" if routine_index else "state->unused = 0;")
-        for name in find_unread_names(routine, arguments):
-            self.add_line(f"(void){name};")
+            self.add_lines("(void)state;" if routine_index else "state->unused = 0;")
+        self.add_lines(*(f"(void){name};" for name in find_unread_names(routine, arguments)))
         for quantity, variable in zip(program.state, state_variables, strict=routine_index == 1):
             self.give_name(variable, f"old_{quantity.name}")
             self.define(variable, f"state->{quantity.name}")
-        self.add_line()
+        self.add_lines("")
         self._source = ""
         self.write_statements(routine.statements)
-        self.add_line()
+        self.add_lines("")
         states = [f"state->{quantity.name}" for quantity in program.state]
         outputs = [f"outputs->{quantity.name}" for quantity in block.outputs]
         output_count = len(routine.results) - len(states)
         for place, value in zip((*states, *outputs[:output_count]), routine.results, strict=True):
-            self.add_line(f"{place} = {self.text(value)};")
+            self.add_lines(f"{place} = {self.text(value)};")
         self._depth -= 1
-        self.add_line("}")
+        self.add_lines("}")
 
     def define_constants(self, constants: Collection[Constant]) -> list[str]:
         """Write definitions of constants, in the order of the code."""
@@ -178,10 +176,7 @@ class _C(Writer):
     def _write_constants_of_routine(self, routine_index: int) -> None:
         """Define the constants that only this routine reads."""
         definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
-        for line in definitions:
-            self.add_line(line)
-        if definitions:
-            self.add_line()
+        self.add_lines(*definitions, *([""] if definitions else []))
 
     def literal(self, constant):
         kind, value = str(constant.dtype), constant.value.item()
@@ -204,31 +199,27 @@ class _C(Writer):
         return f"/* {text} */"
 
     def define(self, out, text):
-        self.add_line(f"const {c_type(out.dtype)} {self.name(out)} = {text};")
+        self.add_lines(f"const {c_type(out.dtype)} {self.name(out)} = {text};")
 
     def declare(self, out, text):
         zero = self.literal(Constant(np.asarray(0, out.dtype)))
-        self.add_line(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
+        self.add_lines(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
 
     def assign(self, name, text):
-        self.add_line(f"{name} = {text};")
+        self.add_lines(f"{name} = {text};")
 
     def begin_repeat(self, times):
         index = self.make_unique("i")
-        self.add_line(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)")
-        self.add_line("{")
+        self.add_lines(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)", "{")
 
     def begin_if(self, condition):
-        self.add_line(f"if ({condition})")
-        self.add_line("{")
+        self.add_lines(f"if ({condition})", "{")
 
     def begin_else(self):
-        self.add_line("}")
-        self.add_line("else")
-        self.add_line("{")
+        self.add_lines("}", "else", "{")
 
     def end(self, statement):
-        self.add_line("}")
+        self.add_lines("}")
 
     def write_operation(self, operation):
         self.define(operation.out, self._write_expression(operation))

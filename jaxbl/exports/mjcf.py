@@ -101,8 +101,8 @@ def _write_note(path: str, part: Any, answer: Answer, slides: bool = False) -> s
         if value == () or isinstance(value, bool):
             continue
         unit = on_a_line(parameter.unit) if slides else parameter.unit
-        value = " ".join(map(_format_number, value)) if isinstance(value, tuple) else _format_number(value)
-        numbers.append(f"{field.name} = {value} {unit}".rstrip())
+        text = _format_numbers(*value) if isinstance(value, tuple) else _format_numbers(value)
+        numbers.append(f"{field.name} = {text} {unit}".rstrip())
     return f"{path}: {', '.join(numbers)}; {answer.text}"
 
 
@@ -127,8 +127,8 @@ def _write_model(
             if answer.fidelity == fidelity:
                 _add_comments(root, f"{heading}: {path}: {answer.text}")
     ET.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
-    _add_comments(root, f"run.sample_period = {_format_number(experiment.run.sample_period)} s: {steps} steps")
-    option = ET.SubElement(root, "option", timestep=_format_number(step), integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
+    _add_comments(root, f"run.sample_period = {_format_numbers(experiment.run.sample_period)} s: {steps} steps")
+    option = ET.SubElement(root, "option", timestep=_format_numbers(step), integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
     ET.SubElement(option, "flag", contact="disable")
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", pos="0 -1 2", dir="0 0.5 -1")
@@ -136,7 +136,7 @@ def _write_model(
         for field, parameter in parameters(experiment.drive):
             if field.name.startswith(side):
                 unit = on_a_line(parameter.unit) if side_parts.slides else parameter.unit
-                _add_comments(world, f"drive.{field.name} = {_format_number(getattr(experiment.drive, field.name))} {unit}")
+                _add_comments(world, f"drive.{field.name} = {_format_numbers(getattr(experiment.drive, field.name))} {unit}")
         _add_comments(world, *notes.get(side, ()))
         _add_side(world, side, side_parts, 0.25 * i, step)
     root.append(_make_tendons(parts, notes.get("transmission", [])))
@@ -151,7 +151,7 @@ def _write_model(
 
 def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, step: float) -> None:
     """Add the body of a side, with its joint."""
-    body = ET.SubElement(world, "body", name=side, pos=f"{_format_number(offset)} 0 0")
+    body = ET.SubElement(world, "body", name=side, pos=f"{_format_numbers(offset)} 0 0")
     # the inertia of eccentric masses is part of the side's: half of it at most
     arms = [min(_ARM, 0.5 * parts.inertia / len(parts.pendulums) * _GRAVITY / mass.torque) for mass in parts.pendulums]
     round_off = 1e-6 * parts.inertia
@@ -160,12 +160,10 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
     )
     _add_inertia(body, parts.inertia - inertia_of_masses, parts.slides)
     joint = {"name": side, "type": "slide" if parts.slides else "hinge", "axis": "1 0 0" if parts.slides else "0 1 0"}
-    joint["damping"] = (
-        f"{_format_number(parts.viscous)} {_format_number(parts.drag)}" if parts.drag else _format_number(parts.viscous)
-    )
+    joint["damping"] = _format_numbers(parts.viscous, *([parts.drag] if parts.drag else []))
     if parts.dry:
         # as hard as the steps allow: MuJoCo's defaults are softer
-        joint |= {"frictionloss": _format_number(parts.dry), "solreffriction": f"{_format_number(2.0 * step)} 1"}
+        joint |= {"frictionloss": _format_numbers(parts.dry), "solreffriction": f"{_format_numbers(2.0 * step)} 1"}
         joint |= {"solimpfriction": f"{IMPEDANCE} {IMPEDANCE} 0.001"}
     ET.SubElement(body, "joint", joint)
     appearance = {"contype": "0", "conaffinity": "0", "rgba": _COLOURS[side]}
@@ -175,13 +173,13 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
         ET.SubElement(
             body,
             "geom",
-            appearance | {"type": "cylinder", "size": "0.08 0.02", "euler": f"{_format_number(math.pi / 2)} 0 0"},
+            appearance | {"type": "cylinder", "size": "0.08 0.02", "euler": f"{_format_numbers(math.pi / 2)} 0 0"},
         )
         ET.SubElement(
             body, "geom", appearance | {"type": "box", "size": "0.01 0.022 0.03", "pos": "0 0 -0.05", "rgba": "1 1 1 1"}
         )
     for i, (mass, arm) in enumerate(zip(parts.pendulums, arms, strict=True)):
-        mass_position = f"{_format_number(arm * math.sin(mass.phase))} 0 {_format_number(-arm * math.cos(mass.phase))}"
+        mass_position = f"{_format_numbers(arm * math.sin(mass.phase))} 0 {_format_numbers(-arm * math.cos(mass.phase))}"
         eccentric = ET.SubElement(body, "body", name=f"{side}_mass{i}", pos=mass_position)
         _add_inertia(eccentric, round_off, mass=mass.torque / _GRAVITY / arm)
         ET.SubElement(eccentric, "geom", appearance | {"type": "sphere", "size": "0.02"})
@@ -193,14 +191,14 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
             flexible_body,
             "joint",
             joint_attributes
-            | {"stiffness": _format_number(flexible.stiffness), "damping": _format_number(flexible.damping)},
+            | {"stiffness": _format_numbers(flexible.stiffness), "damping": _format_numbers(flexible.damping)},
         )
 
 
 def _add_inertia(body: ET.Element, inertia: float, slides: bool = False, mass: float = 1.0) -> None:
     """Add an inertia to a body: a mass along a line, a moment about the axis."""
-    diagonal = " ".join([_format_number(inertia)] * 3)
-    ET.SubElement(body, "inertial", pos="0 0 0", mass=_format_number(inertia if slides else mass), diaginertia=diagonal)
+    diagonal = _format_numbers(inertia, inertia, inertia)
+    ET.SubElement(body, "inertial", pos="0 0 0", mass=_format_numbers(inertia if slides else mass), diaginertia=diagonal)
 
 
 def _name_behind_spring(side: str, i: int) -> str:
@@ -213,24 +211,24 @@ def _make_tendons(parts: MujocoParts, notes: list[str]) -> ET.Element:
     springs = [spring._replace(low=spring.low - gap, high=spring.high + gap) for spring in parts.springs]
     if springs:
         _add_comments(
-            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {_format_number(parts.ratio)}", *notes
+            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {_format_numbers(parts.ratio)}", *notes
         )
     if parts.damping and gap:
         # the limits are springs with dampers as well, being weak constraints: they act from the gap on, and do not pull
         stiffness = sum(spring.linear for spring in springs)
         springs[0] = springs[0]._replace(linear=springs[0].linear - stiffness)
         limits = {
-            "range": f"{_format_number(-gap)} {_format_number(gap)}",
+            "range": f"{_format_numbers(-gap)} {_format_numbers(gap)}",
             "limited": "true",
-            "solreflimit": " ".join(_format_number(-x * parts.mobility) for x in (stiffness, parts.damping)),
+            "solreflimit": _format_numbers(-stiffness * parts.mobility, -parts.damping * parts.mobility),
             "solimplimit": "0.0001 0.0001 0.001",
         }
     elif parts.damping:
-        limits = {"damping": _format_number(parts.damping)}
+        limits = {"damping": _format_numbers(parts.damping)}
     for i, spring in enumerate(springs):
         tendon = ET.SubElement(tendons, "fixed", {"name": f"gear{i}"} | _spring_attributes(spring) | ({} if i else limits))
         ET.SubElement(tendon, "joint", joint="motor", coef="1")
-        ET.SubElement(tendon, "joint", joint="load", coef=_format_number(-float(parts.ratio or 0.0)))
+        ET.SubElement(tendon, "joint", joint="load", coef=_format_numbers(-float(parts.ratio or 0.0)))
     for side, side_parts in parts.sides.items():
         for i, spring in enumerate(side_parts.springs):
             tendon = ET.SubElement(tendons, "fixed", {"name": f"{side}_spring{i}"} | _spring_attributes(spring))
@@ -239,35 +237,29 @@ def _make_tendons(parts: MujocoParts, notes: list[str]) -> ET.Element:
 
 
 def _spring_attributes(spring: Spring) -> dict[str, str]:
-    stiffness = (
-        f"{_format_number(spring.linear)} 0 {_format_number(spring.cubic)}"
-        if spring.cubic
-        else _format_number(spring.linear)
-    )
-    return {"stiffness": stiffness, "springlength": f"{_format_number(spring.low)} {_format_number(spring.high)}"}
+    stiffness = _format_numbers(spring.linear, *([0, spring.cubic] if spring.cubic else []))
+    return {"stiffness": stiffness, "springlength": _format_numbers(spring.low, spring.high)}
 
 
 def _make_actuators(parts: MujocoParts, notes: list[str], step: float) -> ET.Element:
     """Make the input, and passive motors for friction and torques over the position."""
     actuators, chain = ET.Element("actuator"), parts.actuator
-    attributes = {"name": "input", "joint": "motor", "gainprm": _format_number(chain.gain)}
+    attributes = {"name": "input", "joint": "motor", "gainprm": _format_numbers(chain.gain)}
     if chain.lag is not None:
-        attributes |= {"dyntype": "filterexact", "dynprm": _format_number(chain.lag)}
+        attributes |= {"dyntype": "filterexact", "dynprm": _format_numbers(chain.lag)}
     for name, limit in (("ctrl", chain.limit), ("force", chain.torque_limit)):
         if math.isfinite(limit):
-            attributes |= {f"{name}range": f"{_format_number(-limit)} {_format_number(limit)}", f"{name}limited": "true"}
+            attributes |= {f"{name}range": f"{_format_numbers(-limit)} {_format_numbers(limit)}", f"{name}limited": "true"}
     _add_comments(actuators, "The input u, held from sample to sample", *notes)
     driven = ET.SubElement(actuators, "general", attributes)
     if chain.delay:
-        driven.attrib.update(delay=_format_number(chain.delay), nsample=str(math.ceil(chain.delay / step) + 2))
+        driven.attrib.update(delay=_format_numbers(chain.delay), nsample=str(math.ceil(chain.delay / step) + 2))
     for side, side_parts in parts.sides.items():
         passive = {"joint": side, "input": "none", "motorconst": "0", "resistance": "1"}
         for i, wave in enumerate(side_parts.waves):
-            ET.SubElement(actuators, "dcmotor", passive, name=f"{side}_wave{i}", cogging=" ".join(map(_format_number, wave)))
+            ET.SubElement(actuators, "dcmotor", passive, name=f"{side}_wave{i}", cogging=_format_numbers(*wave))
         for i, bristles in enumerate(side_parts.bristles):
-            ET.SubElement(
-                actuators, "dcmotor", passive, name=f"{side}_friction{i}", lugre=" ".join(map(_format_number, bristles))
-            )
+            ET.SubElement(actuators, "dcmotor", passive, name=f"{side}_friction{i}", lugre=_format_numbers(*bristles))
     return actuators
 
 
@@ -289,10 +281,10 @@ def _make_keyframe(experiment: Experiment, parts: MujocoParts) -> ET.Element:
     for side, side_parts in parts.sides.items():
         start = (getattr(experiment.initial, f"{side}_{name}") for name in ("position", "velocity"))
         for numbers, value in zip((positions, velocities), start, strict=True):
-            numbers.append(_format_number(value))
+            numbers.append(_format_numbers(value))
         # what is behind a spring stands still: its joint's velocity is that against the side
         positions += ["0"] * len(side_parts.flexible_inertias)
-        velocities += [_format_number(-getattr(experiment.initial, f"{side}_velocity"))] * len(side_parts.flexible_inertias)
+        velocities += [_format_numbers(-getattr(experiment.initial, f"{side}_velocity"))] * len(side_parts.flexible_inertias)
     _add_comments(keyframe, "initial.*: the state at t = 0")
     ET.SubElement(keyframe, "key", name="initial", qpos=" ".join(positions), qvel=" ".join(velocities))
     return keyframe
@@ -306,6 +298,6 @@ def _add_comments(parent: ET.Element, *texts: str) -> None:
         parent.append(ET.Comment(f" {text} "))
 
 
-def _format_number(value: Any) -> str:
-    """A number with all its digits."""
-    return repr(float(value) + 0.0).removesuffix(".0")
+def _format_numbers(*values: Any) -> str:
+    """Write numbers with all their digits, with spaces between them."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)

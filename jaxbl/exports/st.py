@@ -49,28 +49,27 @@ class _St(Writer):
         for quantity, variable in zip(program.state, program.state_variables, strict=True):
             self.give_name(variable, quantity.name)
         self._depth = 1
-        self.add_line("IF restart OR NOT started THEN")
+        self.add_lines("IF restart OR NOT started THEN")
         self._depth += 1
         self.write_statements(program.start.statements)
         for variable, value in zip(program.state_variables, program.start.results, strict=True):
             self.assign(self.name(variable), self.text(value))
         self.assign("started", "TRUE")
         self._depth -= 1
-        self.add_line("END_IF;")
-        self.add_line()
+        self.add_lines("END_IF;", "")
         self._source = ""
         self.write_statements(program.step.statements)
-        self.add_line()
+        self.add_lines("")
         count = len(program.state)
         # outputs first: some are states as they were
         for quantity, value in zip(block.outputs, program.step.results[count:], strict=True):
             self.assign(quantity.name, self.text(value))
-        self.add_line()
+        self.add_lines("")
         self._assign_together(program.state_variables, program.step.results[:count])
         body = self.lines
         inputs = {quantity.name: quantity for quantity in (*block.start_inputs, *block.inputs)}.values()
         self.lines, self._depth = [f"(* {head_lines[0]}", *(f"   {line}".rstrip() for line in head_lines[1:]), "*)"], 0
-        self.add_line(f"FUNCTION_BLOCK {block.name}")
+        self.add_lines(f"FUNCTION_BLOCK {block.name}")
         self._declare_variables(
             "VAR_INPUT",
             [(quantity.name, quantity.dtype, quantity) for quantity in inputs],
@@ -90,17 +89,15 @@ class _St(Writer):
     def _declare_variables(self, kind: str, variables: Sequence[tuple], *more_lines: str) -> None:
         if not variables and not more_lines:
             return
-        self.add_line(kind)
+        self.add_lines(kind)
         for name, dtype, quantity in variables:
             remark = (
                 f" (* {quantity.description}{f', {quantity.unit}' if quantity.unit else ''} *)"
                 if quantity is not None
                 else ""
             )
-            self.add_line(f"    {name}: {st_type(dtype)};{remark}")
-        for line in more_lines:
-            self.add_line(f"    {line}")
-        self.add_line("END_VAR")
+            self.add_lines(f"    {name}: {st_type(dtype)};{remark}")
+        self.add_lines(*(f"    {line}" for line in more_lines), "END_VAR")
 
     def literal(self, constant):
         kind, value = st_type(constant.dtype), constant.value.item()
@@ -127,20 +124,20 @@ class _St(Writer):
             self.assign(self.name(out), text)
 
     def assign(self, name, text):
-        self.add_line(f"{name} := {text};")
+        self.add_lines(f"{name} := {text};")
 
     def begin_repeat(self, times):
         index = self._add_temporary(np.dtype(np.int32), "turn")
-        self.add_line(f"FOR {index} := 1 TO {times} DO")
+        self.add_lines(f"FOR {index} := 1 TO {times} DO")
 
     def begin_if(self, condition):
-        self.add_line(f"IF {condition} THEN")
+        self.add_lines(f"IF {condition} THEN")
 
     def begin_else(self):
-        self.add_line("ELSE")
+        self.add_lines("ELSE")
 
     def end(self, statement):
-        self.add_line("END_FOR;" if statement == "repeat" else "END_IF;")
+        self.add_lines("END_FOR;" if statement == "repeat" else "END_IF;")
 
     def _add_temporary(self, dtype: np.dtype, name: str) -> str:
         """A variable more."""
@@ -156,7 +153,7 @@ class _St(Writer):
             # controllers stop at a division by zero
             self.declare(out, None)
             zero = f"{kind}#0.0"
-            self._add_lines(
+            self.add_lines(
                 f"IF {texts[1]} <> {zero} THEN",
                 f"    {self.name(out)} := {texts[0]} / {texts[1]};",
                 "ELSE",
@@ -191,10 +188,6 @@ class _St(Writer):
         operation = self._operation_by_variable.get(value)
         return operation is not None and operation.name in ("floor", "ceil", "round_even")
 
-    def _add_lines(self, *lines: str) -> None:
-        for line in lines:
-            self.add_line(line)
-
     def _write_rounding(self, operation: Operation, x: str) -> None:
         """Write a rounding by a conversion, whichever neighbour it takes. Numbers beyond 2^30 stay as they are."""
         kind, out = st_type(operation.out.dtype), self.name(operation.out)
@@ -213,7 +206,7 @@ class _St(Writer):
                 "END_IF;",
             ],
         }[operation.name]
-        self._add_lines(
+        self.add_lines(
             f"{out} := {x};",
             f"IF ABS({x}) < {kind}#1073741824.0 THEN",
             f"    {n} := {kind}_TO_DINT({x});",
@@ -231,7 +224,7 @@ class _St(Writer):
             self._add_temporary(np.dtype(np.int32), "remaining"),
             self._add_temporary(operation.out.dtype, "factor"),
         )
-        self._add_lines(
+        self.add_lines(
             f"{out} := {kind}#1.0;",
             f"{factor} := SEL({n} < DINT#0, {kind}#2.0, {kind}#0.5);",
             f"{left} := ABS({n});",

@@ -85,9 +85,9 @@ class Writer(abc.ABC):
 
     # what they have in common
 
-    def add_line(self, text: str = "") -> None:
-        """Add a line at the present depth."""
-        self.lines.append(f"{self.indent * self._depth}{text}" if text else "")
+    def add_lines(self, *lines: str) -> None:
+        """Add lines at the present depth."""
+        self.lines += [f"{self.indent * self._depth}{line}" if line else "" for line in lines]
 
     def text(self, value: Value) -> str:
         """Write a value in an expression."""
@@ -119,7 +119,7 @@ class Writer(abc.ABC):
             file = statement.source.partition(":")[0]
             if file and file != self._source:
                 self._source = file
-                self.add_line(self.remark(_shorten_source(statement.source)))
+                self.add_lines(self.remark(_shorten_source(statement.source)))
             if isinstance(statement, Operation):
                 self.write_operation(statement)
             elif isinstance(statement, Repeat):

@@ -88,26 +88,26 @@ def simulate_plants(
         runs = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), arguments) for i in range(len(torque))]
         states = [_simulate_by_xla(experiment, gain, *run) for run in runs]  # pyright: ignore[reportCallIssue]
         return jax.tree.map(lambda *x: np.stack(x), *states)
-    gains = [float(number) for side in sides for number in (gain or {})[side]]
     columns = [torque, *((measured or {})[side] for side in sides), *varying.values()]
-    return _run_loop(loop, structure.read_numbers(experiment), structure.state_tree, starts, columns, time, gains)
+    gains = [(gain or {})[side] for side in sides]
+    return _run_loop(loop, structure.read_numbers(experiment), starts, columns, time, gains)
 
 
 def _run_loop(
     loop: Any,
     numbers: np.ndarray,
-    state_tree: Any,
     starts: PlantState,
     columns: Sequence[np.ndarray],
     time: np.ndarray,
-    gains: Sequence[float],
+    gains: Sequence[np.ndarray],
 ) -> PlantState:
-    """Simulate several runs by a loop; `columns` are the inputs of each sample, torque first, `(runs, samples)` each."""
+    """Simulate several runs by a loop; `columns` are the inputs of each sample, torque first, `(runs, samples)` each, and
+    `gains` those of each side."""
     from .llvm import ArrayRows
 
     runs, samples = columns[0].shape
     columns = [np.ascontiguousarray(column, float) for column in columns]
-    constants = np.concatenate([numbers, [0.0], gains])
+    constants = np.concatenate([numbers, [0.0], *gains])
     time_index = len(numbers)
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(starts)]
     states, index = [np.empty((runs, samples)) for _ in leaves], np.arange(samples, dtype=np.int32)
@@ -120,7 +120,7 @@ def _run_loop(
         loop([*carry, ArrayRows(run_constants), index, *inputs, *outputs], samples, 1)
 
     map_in_threads(simulate_run, range(runs))
-    return state_tree.unflatten(states)
+    return jax.tree.structure(starts).unflatten(states)
 
 
 class PlantSimulator:
@@ -136,7 +136,6 @@ class PlantSimulator:
     def __init__(self, experiment: Experiment, state: PlantState, varied: Sequence[str], sides: Sequence[str]):
         self.experiment, self.varied, self.sides = experiment, tuple(varied), tuple(sorted(sides))
         structure = _PlantStructure.of(experiment, state)
-        self.state_tree = structure.state_tree
         self.loop = _trajectory_loop(structure, self.sides, ())
         if self.loop is not None:
             self.numbers, read = np.array(structure.read_numbers(experiment), float), _read_indices(structure)
@@ -160,8 +159,7 @@ class PlantSimulator:
             if place >= 0:
                 numbers[place] = values[path]
         columns = [torque, *(measured[side] for side in self.sides)]
-        gains = [float(number) for side in self.sides for number in gain[side]]
-        return _run_loop(self.loop, numbers, self.state_tree, starts, columns, time, gains)
+        return _run_loop(self.loop, numbers, starts, columns, time, [gain[side] for side in self.sides])
 
 
 def step_derivatives(
