@@ -145,7 +145,9 @@ class _C(Writer):
         routine = (program.start, program.step)[routine_index]
         self.add_lines(head, "{")
         self._depth += 1
-        self._write_constants_of_routine(routine_index)
+        # constants that only this routine reads
+        definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
+        self.add_lines(*definitions, *([""] if definitions else []))
         if not program.state:
             self.add_lines("(void)state;" if routine_index else "state->unused = 0;")
         self.add_lines(*(f"(void){name};" for name in find_unread_names(routine, arguments)))
@@ -172,11 +174,6 @@ class _C(Writer):
                 remark = describe_constant(self.program, constant)
                 lines.append(f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; /* {remark} */")
         return lines
-
-    def _write_constants_of_routine(self, routine_index: int) -> None:
-        """Define the constants that only this routine reads."""
-        definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
-        self.add_lines(*definitions, *([""] if definitions else []))
 
     def literal(self, constant):
         kind, value = str(constant.dtype), constant.value.item()

@@ -301,18 +301,12 @@ def _write_description(
     declared = [(i, variable) for i, variable in enumerate(variables) if fmi == 3 or variable.causality != "independent"]
     for i, variable in declared:
         _write_variable(model_variables, i, variable, fmi)
-    outputs = [i for i, variable in enumerate(variables) if variable.causality == "output"]
-    if fmi == 3:
-        for i in outputs:
-            ET.SubElement(structure, "Output", valueReference=str(i), dependencies="")
-        for i in outputs:
-            ET.SubElement(structure, "InitialUnknown", valueReference=str(i))
-    else:
-        for group, more in (("Outputs", {"dependencies": ""}), ("InitialUnknowns", {})):
-            parent = ET.SubElement(structure, group)
-            for place, (i, _) in enumerate(declared, 1):
-                if i in outputs:
-                    ET.SubElement(parent, "Unknown", {"index": str(place)} | more)
+    for tag, more in (("Output", {"dependencies": ""}), ("InitialUnknown", {})):
+        parent = structure if fmi == 3 else ET.SubElement(structure, f"{tag}s")
+        for place, (i, variable) in enumerate(declared, 1):
+            if variable.causality == "output":
+                element_name, key, number = (tag, "valueReference", i) if fmi == 3 else ("Unknown", "index", place)
+                ET.SubElement(parent, element_name, {key: str(number)} | more)
     return _write_xml(root)
 
 

@@ -95,15 +95,17 @@ def _collect_parts(
 
 def _write_note(path: str, part: Any, answer: Answer, slides: bool = False) -> str:
     """Write a comment: config path of a part, its numbers and units, and the element of the model."""
-    numbers = []
+    return f"{path}: {', '.join(_describe_numbers(part, slides))}; {answer.text}"
+
+
+def _describe_numbers(part: Any, slides: bool) -> Iterable[str]:
+    """Write each number of a part with its name and unit."""
     for field, parameter in parameters(part):
         value = getattr(part, field.name)
-        if value == () or isinstance(value, bool):
-            continue
-        unit = on_a_line(parameter.unit) if slides else parameter.unit
-        text = _format_numbers(*value) if isinstance(value, tuple) else _format_numbers(value)
-        numbers.append(f"{field.name} = {text} {unit}".rstrip())
-    return f"{path}: {', '.join(numbers)}; {answer.text}"
+        if value != () and not isinstance(value, bool):
+            unit = on_a_line(parameter.unit) if slides else parameter.unit
+            text = _format_numbers(*value) if isinstance(value, tuple) else _format_numbers(value)
+            yield f"{field.name} = {text} {unit}".rstrip()
 
 
 # XML
@@ -133,10 +135,8 @@ def _write_model(
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", pos="0 -1 2", dir="0 0.5 -1")
     for i, (side, side_parts) in enumerate(parts.sides.items()):
-        for field, parameter in parameters(experiment.drive):
-            if field.name.startswith(side):
-                unit = on_a_line(parameter.unit) if side_parts.slides else parameter.unit
-                _add_comments(world, f"drive.{field.name} = {_format_numbers(getattr(experiment.drive, field.name))} {unit}")
+        numbers = _describe_numbers(experiment.drive, side_parts.slides)
+        _add_comments(world, *(f"drive.{number}" for number in numbers if number.startswith(side)))
         _add_comments(world, *notes.get(side, ()))
         _add_side(world, side, side_parts, 0.25 * i, step)
     root.append(_make_tendons(parts, notes.get("transmission", [])))

@@ -17,7 +17,6 @@ from .jaxprs import (
     ClosedJaxpr,
     JaxprEqn,
     Literal,
-    Var,
     callee,
     cond_branches,
     equation_parameter,
@@ -90,11 +89,11 @@ class ScalarWriter(abc.ABC):
     def write_jaxpr(self, closed: ClosedJaxpr, arguments: Sequence[Any]) -> list[Any]:
         """Write the equations of a jaxpr, and return its results."""
         jaxpr = closed.jaxpr
-        env: dict[Var, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
-        env |= {v: self.literal(number, v.aval.dtype) for v, number in zip(jaxpr.constvars, closed.consts, strict=True)}
+        env: dict[Any, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
+        env |= {v: self.literal(number, _type_of(v)) for v, number in zip(jaxpr.constvars, closed.consts, strict=True)}
 
-        def read(v: Var | Literal) -> Any:
-            return self.literal(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]  # type: ignore[attr-defined]
+        def read(v: Any) -> Any:
+            return self.literal(v.val, _type_of(v)) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
             results = self.write_equation(eqn, [read(v) for v in eqn.invars])
@@ -113,14 +112,19 @@ class ScalarWriter(abc.ABC):
             return self.write_cond(cond_branches(eqn), operands[0], operands[1:])
         if (called := callee(eqn)) is not None:
             return self.write_call(called, operands)
-        dtype = self.check_type(variables[0].aval.dtype)
+        dtype = self.check_type(_type_of(variables[0]))
         is_float = dtype.kind == "f"
         if name in FUNCTIONS and is_float:
             return self.write_call(trace_scalar_function(FUNCTIONS[name], dtype), operands)
-        rules = self.own_rules, _FLOAT_RULES if is_float else _INTEGER_RULES, _COMMON_RULES
-        for rule in filter(None, (table.get(name) for table in rules)):
-            return [rule(self, eqn, dtype, *operands)]
-        return self.write_unknown(eqn, operands, str(dtype))
+        rule = (
+            self.own_rules.get(name) or (_FLOAT_RULES if is_float else _INTEGER_RULES).get(name) or _COMMON_RULES.get(name)
+        )
+        return self.write_unknown(eqn, operands, str(dtype)) if rule is None else [rule(self, eqn, dtype, *operands)]
+
+
+def _type_of(v: Any) -> Any:
+    """The type of a variable or literal of a jaxpr."""
+    return v.aval.dtype
 
 
 def _operation_rules(*names: str) -> dict[str, Rule]:
@@ -152,11 +156,7 @@ def _one_minus_square(w: ScalarWriter, eqn: JaxprEqn, dtype: np.dtype, a: Any) -
 def _select(w: ScalarWriter, eqn: JaxprEqn, dtype: np.dtype, condition: Any, *cases: Any) -> Any:
     if len(cases) != 2 or dtype != np.dtype(bool):
         raise Unsupported("select_n among more than two")
-    return w.emit("select", eqn.outvars[0].aval.dtype, condition, cases[1], cases[0])  # type: ignore[attr-defined]
-
-
-def _result_type(w: ScalarWriter, eqn: JaxprEqn) -> np.dtype:
-    return w.check_type(eqn.outvars[0].aval.dtype)  # type: ignore[attr-defined]
+    return w.emit("select", _type_of(eqn.outvars[0]), condition, cases[1], cases[0])
 
 
 _FLOAT_RULES: dict[str, Rule] = {
@@ -181,7 +181,7 @@ _COMMON_RULES: dict[str, Rule] = {
     "sign": _sign,
     "clamp": lambda w, eqn, dtype, low, a, high: w.emit("min", dtype, w.emit("max", dtype, a, low), high),
     "select_n": _select,
-    "convert_element_type": lambda w, eqn, dtype, a: w.convert(a, dtype, _result_type(w, eqn)),
-    "bitcast_convert_type": lambda w, eqn, dtype, a: w.bitcast(a, _result_type(w, eqn)),
+    "convert_element_type": lambda w, eqn, dtype, a: w.convert(a, dtype, w.check_type(_type_of(eqn.outvars[0]))),
+    "bitcast_convert_type": lambda w, eqn, dtype, a: w.bitcast(a, w.check_type(_type_of(eqn.outvars[0]))),
     **dict.fromkeys(("copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze"), lambda w, eqn, dtype, a: a),
 }
