@@ -397,14 +397,14 @@ def _number_table(summary: JsonObject) -> PageTable:
 
 
 @style()
-def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
+def draw_diagnosis(diagnosis: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
-    if not found.located:
-        return [_verdict(found.summary), *draw_motor_alone(found)]
-    unit = found.record.unit_of("motor.torque", "N m")
-    residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
-    tables = [_tables(found)] if "torque_tables" in found.summary else []
-    return [_verdict(found.summary), _over_time(found), *tables, *residuals]
+    if not diagnosis.located:
+        return [_verdict(diagnosis.summary), *draw_motor_alone(diagnosis)]
+    unit = diagnosis.record.unit_of("motor.torque", "N m")
+    residuals = draw_residuals(diagnosis.residuals, diagnosis.coordinates, diagnosis.located, unit, diagnosis.observed)
+    tables = [_tables(diagnosis)] if "torque_tables" in diagnosis.summary else []
+    return [_verdict(diagnosis.summary), _over_time(diagnosis), *tables, *residuals]
 
 
 def _tables(found: Diagnosis) -> Drawn:
