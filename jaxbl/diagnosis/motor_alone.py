@@ -235,7 +235,7 @@ def _summary(
     deviation = np.sqrt(np.diag(alone.found.spread.covariance))
     errors = dict.fromkeys(values, float("nan"))
     errors |= {one.path: values[one.path] * deviation[i] for i, one in enumerate(alone.found.free)}
-    holdout = alone_on_holdout(task.config, held_out, alone, search.none)["position"]["motor"]
+    holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
     on_log = float(np.sqrt(alone.point.variance))
     limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
     left, size = model.unexplained(alone.point), input_rms(record)

@@ -182,7 +182,7 @@ def _from_motor(
             # follows from a number that was not found
             summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
-        summary["holdout"] = alone_on_holdout(config, task.holdout.open(), alone)
+        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone)
     done()
     return Identification(
         config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing

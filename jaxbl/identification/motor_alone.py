@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.config import Config
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
@@ -242,15 +241,14 @@ def gap_summary(alone: Alone) -> JsonObject | None:
     }
 
 
-def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
+def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
     """How well the numbers found predict another log of the motor, beside the nominal ones.
 
     `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
     """
     fitted, smoothness = alone.model, alone.point.smoothness
-    segments = segments_of(record, ["motor"], config.log.initial_state == "rest")
-    experiment = at_period(fitted.experiment, record.sample_period)
-    model = UnseenLoad(experiment, fitted.free, fitted.width, segments, config.log.initial_state == "rest")
+    segments = segments_of(record, ["motor"], fitted.rest)
+    model = dataclasses.replace(fitted, experiment=at_period(fitted.experiment, record.sample_period), segments=segments)
     if nominal is None:
         nominal = np.zeros(len(model.free))
     after, before = (float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
