@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
-from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.drive.parameters import as_arrays, parameters, units_of
 from jaxbl.errors import InputError
 from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.identification.intervals import UNSEEN, Spread
@@ -25,7 +25,7 @@ from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, 
 from jaxbl.identification.segments import segments_of, signal_sizes
 from jaxbl.identification.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
 
@@ -75,6 +75,10 @@ class _Search(NamedTuple):
         """Path of an effect's number."""
         return self.model.free[self.effects[name]].path
 
+    def frictions(self, out: Sequence[str]) -> list[str]:
+        """Names of the frictions that are not taken out."""
+        return [name for name, i in self.effects.items() if name not in out and not is_gap(self.model.free[i])]
+
     def without(self, names: Sequence[str]) -> UnseenLoad:
         """The model in which some effects do nothing."""
         return replace(self.model, held=[self.effects[name] for name in names])
@@ -111,18 +115,16 @@ def _set_up(task: DiagnosisTask) -> _Search:
     names, size, ratio = sought(bare, config.uncertainty.exact), input_rms(record), float(bare.drive.ratio("load"))
     # the fit chooses where it begins; these are scales
     begun = {
-        name: {
-            field.name: 0.1 * size * (ratio if name.startswith("load.") else 1.0) for field, _ in parameters(EFFECTS[name])
-        }
+        name: dict.fromkeys(units_of(EFFECTS[name]), 0.1 * size * (ratio if name.startswith("load.") else 1.0))
         for name in names
     }
     added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in begun.items()]
     model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
     own = default_paths(config, bare)
-    paths = {name: f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()}
+    paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()]
     rest = config.log.initial_state == "rest"
     segments = segments_of(record, ["motor"], rest)
-    free = make_free_parameters(model, [*own, *paths.values()], signal_sizes(bare, segments))
+    free = make_free_parameters(model, [*own, *paths], signal_sizes(bare, segments))
     width = widths(free, np.e)
     width[: len(own)] = config.uncertainty.relative
     effects = {name: len(own) + i for i, name in enumerate(names)}
@@ -182,10 +184,7 @@ def _needed(search: _Search, point: Point, out: list[str], history: list[Step]) 
     """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
     tried goes into the history."""
     while True:
-        tried = {}
-        for name, i in search.effects.items():
-            if name not in out and not is_gap(search.model.free[i]):
-                tried[name] = search.finish(point, [*out, name])
+        tried = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
         worth = search.without(out).spread(point).inflation
         gains = {name: _gain(search, name, one, point, worth) for name, one in tried.items()}
         least = min(gains, key=lambda name: gains[name], default=None)
@@ -213,16 +212,11 @@ def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]
     """The fit as of :meth:`UnseenLoad.settled`, without frictions whose size the log leaves open; these join `out`."""
     while True:
         point, width = search.without(out).settled(point)
-        open_ = {
-            name: size
-            for name, i in search.effects.items()
-            if name not in out
-            and not is_gap(search.model.free[i])
-            and not (size := float(width.covariance[i, i]) ** 0.5) < UNSEEN
-        }
+        deviation = {name: float(width.covariance[i, i]) ** 0.5 for name, i in search.effects.items()}
+        open_ = [name for name in search.frictions(out) if not deviation[name] < UNSEEN]
         if not open_:
             return point, width
-        out.append(max(open_, key=lambda name: open_[name]))
+        out.append(max(open_, key=lambda name: deviation[name]))
         point = search.finish(point, out)
 
 
@@ -231,7 +225,7 @@ def _summary(
 ) -> JsonObject:
     """As `diagnosis.json`."""
     record, model, values = task.record, search.model, alone.values
-    noise, unit = model.noise, record.statistics.channels[POSITION_CHANNELS["motor"]].unit
+    noise, unit = model.noise, record.unit_of("motor.position", "rad")
     deviation = np.sqrt(np.diag(alone.found.spread.covariance))
     errors = dict.fromkeys(values, float("nan"))
     errors |= {one.path: values[one.path] * deviation[i] for i, one in enumerate(alone.found.free)}
@@ -268,7 +262,7 @@ def _summary(
     if alone.why:
         kept = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.needed else ""
         notes.append(f"No gap is shown: {alone.why}.{kept}")
-    part = held_out.segments
+    part, gap = held_out.segments, gap_summary(alone)
     times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
@@ -282,7 +276,7 @@ def _summary(
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing
         "explained_share": None if before <= limit**2 else 1.0 - min(max(after - noise**2, 0.0) / (before - noise**2), 1.0),
-        "backlash": None if alone.gap is None else {**(gap_summary(alone) or {}), "nominal": None},
+        "backlash": gap and gap | {"nominal": None},
         "gap": {
             "holdout": {
                 "file": str(held_out.path.resolve()), "separate": task.separate, "window": None,

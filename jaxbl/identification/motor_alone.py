@@ -22,6 +22,7 @@ from .free_parameters import FreeParameter
 from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .log_columns import join_columns, motion_columns
+from .logs import arrays
 from .search import Found
 from .segments import Segment, at_period, segments_of
 from .trajectory import Fit, cut
@@ -50,7 +51,7 @@ class Alone(NamedTuple):
     @property
     def experiment(self) -> Experiment:
         """The model with these numbers."""
-        return set_leaves(self.model.experiment, {path: np.asarray(value) for path, value in self.values.items()})
+        return set_leaves(self.model.experiment, arrays(self.values))
 
     @property
     def doubtful(self) -> bool:
@@ -133,11 +134,11 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
         return (
             f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
         )
-    if not gap.needed and gap.at_most >= gap.travel:
-        return f"any half gap fits; {both_ways}"
-    if not gap.needed and gap.crossings < _REVERSALS:
-        return f"the torque in the gear hardly changes its sign; {both_ways}"
     if not gap.needed:
+        if gap.at_most >= gap.travel:
+            return f"any half gap fits; {both_ways}"
+        if gap.crossings < _REVERSALS:
+            return f"the torque in the gear hardly changes its sign; {both_ways}"
         return (
             f"without one the motor's readings are met as well (noise {model.noise:.2g} {unit}); half gaps of up to "
             f"{gap.at_most:.3g} {unit} are not ruled out; faster reversals would show smaller ones"
@@ -196,25 +197,24 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     `torque`), with the same torque by the motor's side (`torque_by_motor`); NaN in parts of the log that are too short.
     """
     assert record.torque is not None
-    fitted, model, point = alone.experiment, alone.model, alone.point
+    fitted, model, pieces = alone.experiment, alone.model, []
     plant = fitted.plant
-    states = model.states(point)
-    pieces = []
-    for segment, one in zip(model.segments, states, strict=True):
-        piece = motion_columns(segment, "motor")
-        piece["motor.residual"] = segment.readings["motor"] - np.asarray(one.position["motor"])
-        for name in ("position", "velocity"):
-            piece[f"load.modelled_{name}"] = getattr(one, name)["load"]
-        k = segment.kinematics
-        one = jax.tree.map(jnp.asarray, one)
-        through = jax.vmap(plant.transmitted_torque)(one.position, one.velocity, one.effects)[0]
-        position, velocity = one.position | k.position, one.velocity | k.velocity
-        none = jnp.zeros_like(through)
-        total, level = jax.vmap(plant.side_torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
-        resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
+    for segment, state in zip(model.segments, model.states(alone.point), strict=True):
+        k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
+        through = jax.vmap(plant.transmitted_torque)(state.position, state.velocity, state.effects)[0]
+        motion = state.position | k.position, state.velocity | k.velocity, state.effects
+        total, level = jax.vmap(plant.side_torques)(*motion, k.torque, k.time, jnp.zeros_like(through))["motor"]
+        speed = k.velocity["motor"]
+        resisting = fitted.drive.viscous("motor") * speed + level * jnp.sign(speed)
         pieces.append(
-            piece
-            | {"torque": through, "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"]}
+            motion_columns(segment, "motor")
+            | {
+                "motor.residual": segment.readings["motor"] - state.position["motor"],
+                "load.modelled_position": state.position["load"],
+                "load.modelled_velocity": state.velocity["load"],
+                "torque": through,
+                "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"],
+            }
         )
     columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
     return columns | join_columns(len(record.time), model.segments, pieces)
@@ -236,7 +236,7 @@ def gap_summary(alone: Alone) -> JsonObject | None:
         "gain": gap.gain,
         "needed": SHOWN,
         "crossings": gap.crossings,
-        "starts": [list(one) for one in gap.starts],
+        "starts": gap.starts,
         "why": alone.why or None,
     }
 
