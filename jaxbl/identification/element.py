@@ -158,10 +158,10 @@ def _summary(task: ElementTask, found: Element) -> JsonObject:
             {"direction": {_path(name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in found.open
         ],
-        "method": {"element": {"terms": list(found.terms), "gains": found.gains, "reversals": found.reversals}},
+        "method": {"element": {"terms": found.terms, "gains": found.gains, "reversals": found.reversals}},
         "torque": {"element": {"rms": found.residual, "relative": found.share, "unit": found.numbers["offset"].unit}},
-        "warnings": list(record.warnings),
-        "notes": list(record.notes),
+        "warnings": record.warnings,
+        "notes": record.notes,
     }
     if task.holdout is not None:
         error = element_error(found, make_rig_log(task.holdout, task.gear_ratio))

@@ -87,7 +87,7 @@ def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: 
         parameter.path: {
             "value": float(parameter.value(theta[i])),
             "standard_error": float(parameter.slope(theta[i])) * deviation[i],
-            "interval": list(interval(parameter, theta[i], deviation[i])),
+            "interval": interval(parameter, theta[i], deviation[i]),
             "unit": record.unit_of(parameter.path, parameter.unit),
             "nominal": parameter.nominal,
         }
@@ -145,8 +145,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         correlation = width / np.outer(deviation, deviation)
     parameters = _parameters(record, found.free, found.fit, found.spread)
     for path, one in profiles.items():
-        points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
-        parameters[path] |= {"profile_interval": list(one.interval), "profile": points}
+        parameters[path] |= {"profile_interval": one.interval, "profile": np.column_stack([one.values, one.deviance])}
     parameters |= _derived(fitted, found)
     residual = {
         side: describe_position(

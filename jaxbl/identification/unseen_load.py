@@ -260,8 +260,11 @@ class UnseenLoad:
         """Half gap, stiffness and gear ratio without the free numbers."""
         plant = self.experiment.plant
         assert plant.transmission is not None
-        known = {"transmission.stiffness": float(plant.transmission.stiffness), "ratio": float(plant.drive.ratio("load"))}
-        return known | {"half": plant.half_gap}
+        return {
+            "transmission.stiffness": float(plant.transmission.stiffness),
+            "ratio": float(plant.drive.ratio("load")),
+            "half": plant.half_gap,
+        }
 
     def _runs(self, point: Point, place: int, starts: np.ndarray) -> PlantState:
         """Simulate a segment from several starts, shape (runs, 4)."""
