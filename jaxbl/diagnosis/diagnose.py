@@ -15,6 +15,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import Logs, arrays, gains_for
+from jaxbl.identification.segments import at_period
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
@@ -44,7 +45,6 @@ from .neutral_effects import without
 from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
 from .proof import Proof, prove
-from .reference_log import at_period
 from .residuals import Residual, SideResiduals, residual_torques
 from .setup import Setup, set_up
 

@@ -77,21 +77,13 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
         # what has the larger torque matters more
         "findings": sorted(
             (
-                _finding(record, one, values, errors, where)
+                describe_finding(record, one, values, errors, where)
                 | {"share": fitted.share(one.effect), "z": chosen.gains.get(one.effect)}
                 for one in found.findings
             ),
             key=lambda one: -one["share"],
         ),
-        "parameters": {
-            one.path: {
-                "value": values[one.path],
-                "standard_error": errors[one.path],
-                "nominal": one.nominal,
-                "unit": record.unit_of(one.path, one.unit),
-            }
-            for one in setup.own
-        },
+        "parameters": describe_parameters(record, setup.own, values, errors),
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "withdrawn": list(chosen.withdrawn),
@@ -100,7 +92,21 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
     }
 
 
-def _finding(record: Record, one: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
+def describe_parameters(record: Record, own: Sequence[FreeParameter], values: Numbers, errors: Numbers) -> JsonObject:
+    """The model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
+    return {
+        number.path: {
+            "value": values[number.path],
+            "standard_error": errors[number.path],
+            "nominal": number.nominal,
+            "unit": record.unit_of(number.path, number.unit),
+        }
+        for number in own
+    }
+
+
+def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
+    """A finding as in `diagnosis.json`, but for its share and gain; values and standard errors by path, `where` by side."""
     units = units_of(EFFECTS[one.effect])
     numbers = {
         leaf: {

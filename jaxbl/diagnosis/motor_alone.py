@@ -6,7 +6,8 @@ after the other. The held-out data are predicted with the numbers found, initial
 Reference: R. Kass, A. Raftery, Bayes factors, J. American Statistical Association 90 (1995), for the probabilities.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,22 +16,22 @@ from scipy.special import expit
 
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
-from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.drive.parameters import as_arrays, parameters, units_of
 from jaxbl.errors import InputError
 from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.identification.intervals import UNSEEN, Spread
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
-from jaxbl.identification.segments import reading_noise, segments_of, signal_sizes
-from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
+from jaxbl.identification.segments import segments_of, signal_sizes
+from jaxbl.identification.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
-from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.records.signal_quality import estimate_white_noise
+from jaxbl.records import Record
 from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
 
-from .diagnosis_summary import extended_study
+from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
+from .effect_search import FAR, Finding
 from .expected_errors import LEVEL
 from .history import Step
 from .neutral_effects import candidates, with_added
@@ -41,8 +42,6 @@ _NOISE_ERROR = 0.25
 """Relative error of an estimated noise."""
 _LEAST = 0.01
 """Torque over the driving torque that is too small to be named: without the load's encoder ten times that with it."""
-_FAR = 5.0
-"""Standard deviations of `[uncertainty]` that a number of the model may change by."""
 
 
 class Found(NamedTuple):
@@ -67,13 +66,28 @@ class _Search(NamedTuple):
     effects: dict[str, int]
     none: np.ndarray
 
-    def held(self, without: Sequence[str]) -> np.ndarray:
-        """Which numbers stay as they are where some effects are left out."""
-        return np.isin(np.arange(len(self.none)), [self.effects[name] for name in without])
+    @property
+    def own(self) -> Sequence[FreeParameter]:
+        """The model's own numbers, which are the first."""
+        return self.model.free[: len(self.none) - len(self.effects)]
 
-    def at(self, theta: np.ndarray, start: np.ndarray, smoothness: float, without: Sequence[str]) -> Point:
-        """A point without some effects."""
-        return self.model.at(np.where(self.held(without), self.none, theta), start, smoothness)
+    def path(self, name: str) -> str:
+        """Path of an effect's number."""
+        return self.model.free[self.effects[name]].path
+
+    def frictions(self, out: Sequence[str]) -> list[str]:
+        """Names of the frictions that are not taken out."""
+        return [name for name, i in self.effects.items() if name not in out and not is_gap(self.model.free[i])]
+
+    def without(self, names: Sequence[str]) -> UnseenLoad:
+        """The model in which some effects do nothing."""
+        return replace(self.model, held=[self.effects[name] for name in names])
+
+    def finish(self, point: Point, names: Sequence[str]) -> Point:
+        """Fit without some effects, from a point with them."""
+        model, theta = self.without(names), point.theta.copy()
+        theta[model.held] = self.none[model.held]
+        return model.finished(model.evaluate(point._replace(theta=theta)))
 
 
 def sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str]:
@@ -101,18 +115,16 @@ def _set_up(task: DiagnosisTask) -> _Search:
     names, size, ratio = sought(bare, config.uncertainty.exact), input_rms(record), float(bare.drive.ratio("load"))
     # the fit chooses where it begins; these are scales
     begun = {
-        name: {
-            field.name: 0.1 * size * (ratio if name.startswith("load.") else 1.0) for field, _ in parameters(EFFECTS[name])
-        }
+        name: dict.fromkeys(units_of(EFFECTS[name]), 0.1 * size * (ratio if name.startswith("load.") else 1.0))
         for name in names
     }
     added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in begun.items()]
     model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
     own = default_paths(config, bare)
-    paths = {name: f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()}
+    paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()]
     rest = config.log.initial_state == "rest"
     segments = segments_of(record, ["motor"], rest)
-    free = make_free_parameters(model, [*own, *paths.values()], signal_sizes(bare, segments))
+    free = make_free_parameters(model, [*own, *paths], signal_sizes(bare, segments))
     width = widths(free, np.e)
     width[: len(own)] = config.uncertainty.relative
     effects = {name: len(own) + i for i, name in enumerate(names)}
@@ -132,10 +144,10 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     play = next((name for name, i in search.effects.items() if is_gap(model.free[i])), None)
     if model.gap is not None:
         # the model's own, or one that it lacks
-        gap = find_gap(model)
+        gap = GapSearch(model).run()
         point = gap.best if gap.needed or play is None else gap.without
     else:
-        point = fitted(model)
+        point = model.fit()
     if not np.isfinite(point.deviance):
         raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
     done()
@@ -145,47 +157,35 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     point, gains = _needed(search, point, out, history)
     if gap is not None and gap.needed and play is not None:
         gains[play] = gap.gain
-    point, width, slope = _seen(search, point, out)
-    held = search.held(out)
+    point, width = _seen(search, point, out)
     if gap is not None:
         # what is said of it is said of the model that is left
-        gap = gap.of(model, point, width, slope)
+        gap = gap.of(point, width)
         why = why_not(gap, model, np.e, task.record)
-    alone = alone_of(model, point, width, slope, held, gap, why)
+    alone = alone_of(model, point, width, [search.effects[name] for name in out], gap, why)
     done()
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
     held_out = task.holdout.open()
     summary = _summary(task, held_out, search, alone, gains, out) | {"history": [step._asdict() for step in history]}
-    numbers = {name: _numbers(alone, name) for name in search.effects if name not in out}
-    own = {one.path: alone.values[one.path] for one in _own(search)}
-    study = extended_study(task.config, numbers, own)
+    numbers = {name: _numbers(search, alone, name) for name in search.effects if name not in out}
+    study = extended_study(task.config, numbers, {number.path: alone.values[number.path] for number in search.own})
     done()
     return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)), held_out)
 
 
-def _own(search: _Search) -> list[FreeParameter]:
-    """The model's own numbers."""
-    return [one for i, one in enumerate(search.model.free) if i not in search.effects.values()]
-
-
-def _numbers(alone: Alone, name: str) -> Numbers:
+def _numbers(search: _Search, alone: Alone, name: str) -> Numbers:
     """Numbers of an effect, by name."""
-    start = f"effects.{name}."
-    return {path.removeprefix(start): value for path, value in alone.values.items() if path.startswith(start)}
+    path = search.path(name)
+    return {path.rpartition(".")[2]: alone.values[path]}
 
 
 def _needed(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
     """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
     tried goes into the history."""
     while True:
-        tried = {}
-        for name, i in search.effects.items():
-            if name not in out and not is_gap(search.model.free[i]):
-                without = [*out, name]
-                begun = search.at(point.theta, point.start, point.smoothness, without)
-                tried[name] = search.model.finished(begun, search.held(without))
-        worth = search.model.spread(point, search.held(out))[0].inflation
+        tried = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
+        worth = search.without(out).spread(point).inflation
         gains = {name: _gain(search, name, one, point, worth) for name, one in tried.items()}
         least = min(gains, key=lambda name: gains[name], default=None)
         needless = least is not None and not gains[least] >= SHOWN
@@ -208,44 +208,42 @@ def _gain(search: _Search, name: str, without: Point, point: Point, inflation: n
     return float((without.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
 
 
-def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread, np.ndarray]:
+def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]:
     """The fit as of :meth:`UnseenLoad.settled`, without frictions whose size the log leaves open; these join `out`."""
     while True:
-        point, width, slope = search.model.settled(point, search.held(out))
-        open_ = {
-            name: size
-            for name, i in search.effects.items()
-            if name not in out
-            and not is_gap(search.model.free[i])
-            and not (size := float(width.covariance[i, i]) ** 0.5) < UNSEEN
-        }
+        point, width = search.without(out).settled(point)
+        deviation = {name: float(width.covariance[i, i]) ** 0.5 for name, i in search.effects.items()}
+        open_ = [name for name in search.frictions(out) if not deviation[name] < UNSEEN]
         if not open_:
-            return point, width, slope
-        out.append(max(open_, key=lambda name: open_[name]))
-        point = search.model.finished(search.at(point.theta, point.start, point.smoothness, out), search.held(out))
+            return point, width
+        out.append(max(open_, key=lambda name: deviation[name]))
+        point = search.finish(point, out)
 
 
 def _summary(
-    task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Mapping[str, float], out: Sequence[str]
+    task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Numbers, out: Sequence[str]
 ) -> JsonObject:
     """As `diagnosis.json`."""
-    record, model = task.record, search.model
-    noise, unit = reading_noise(model.segments)["motor"], record.statistics.channels[POSITION_CHANNELS["motor"]].unit
-    deviation = {one.path: alone.found.spread.covariance[i, i] ** 0.5 for i, one in enumerate(alone.found.free)}
-    values = {one.path: (one, alone.values[one.path], deviation.get(one.path)) for one in model.free}
-    holdout = alone_on_holdout(task.config, held_out, alone, search.none)["position"]["motor"]
+    record, model, values = task.record, search.model, alone.values
+    noise, unit = model.noise, record.unit_of("motor.position", "rad")
+    deviation = np.sqrt(np.diag(alone.found.spread.covariance))
+    errors = dict.fromkeys(values, float("nan"))
+    errors |= {one.path: values[one.path] * deviation[i] for i, one in enumerate(alone.found.free)}
+    holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
     on_log = float(np.sqrt(alone.point.variance))
     limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
     left, size = model.unexplained(alone.point), input_rms(record)
     # noise of the recorded torque, which is known within a factor of two
-    allowed = max(2.0 * estimate_white_noise([one.torque for one in model.segments]), _LEAST * size)
-    far = {one.path: theta / task.config.uncertainty.relative for one, theta in _changes(search, alone)}
-    far = {path: z for path, z in far.items() if abs(z) > _FAR}
-    # a gap that the readings call for, or leave to be so wide that the load is never met, but do not show
-    doubtful = bool(alone.why) and alone.gap is not None and (alone.gap.needed or alone.gap.unmet)
-    names = [name for name, i in search.effects.items() if name not in out and not (doubtful and is_gap(model.free[i]))]
+    allowed = max(2.0 * model.torque_noise, _LEAST * size)
+    changes = zip(search.own, alone.point.theta / task.config.uncertainty.relative, strict=False)
+    far = {number.path: float(z) for number, z in changes if abs(z) > FAR}
+    names = [
+        name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
+    ]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
-    verdict = "unknown_effect" if failed or remainder or far or doubtful else "explained" if names else "no_discrepancy"
+    verdict = (
+        "unknown_effect" if failed or remainder or far or alone.doubtful else "explained" if names else "no_discrepancy"
+    )
     force = record.unit_of("motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
@@ -255,45 +253,22 @@ def _summary(
     )
     findings = []
     for name in sorted(names, key=lambda name: -gains[name]):
-        places = [one for one in model.free if one.path.startswith(f"effects.{name}.")]
-        findings.append(
-            {
-                "effect": name,
-                "confidence": float(expit(0.5 * (gains[name] - np.log(model.count)))),
-                "parameters": {
-                    one.path.rpartition(".")[2]: {
-                        "value": alone.values[one.path],
-                        "standard_error": alone.values[one.path] * (deviation.get(one.path) or float("nan")),
-                        "unit": record.unit_of(one.path, one.unit),
-                    }
-                    for one in places
-                },
-                "alternatives": [],
-                "where": {"place": name.partition(".")[0], "sentences": {}},
-                "share": _share(search, alone, name, size),
-                "z": float(np.sqrt(max(gains[name], 0.0))),
-            }
-        )
+        chance = float(expit(0.5 * (gains[name] - np.log(model.count))))
+        finding = Finding(name, chance, _numbers(search, alone, name), ())
+        weight = {"share": _share(search, alone, name, size), "z": float(np.sqrt(max(gains[name], 0.0)))}
+        findings.append(describe_finding(record, finding, values, errors, {}) | weight)
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
     if alone.why:
         kept = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.needed else ""
         notes.append(f"No gap is shown: {alone.why}.{kept}")
-    part = held_out.segments
+    part, gap = held_out.segments, gap_summary(alone)
     times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
         "verdict": verdict,
         "findings": findings,
-        "parameters": {
-            one.path: {
-                "value": values[one.path][1],
-                "standard_error": values[one.path][1] * (values[one.path][2] or float("nan")),
-                "nominal": one.nominal,
-                "unit": record.unit_of(one.path, one.unit),
-            }
-            for one in _own(search)
-        },
+        "parameters": describe_parameters(record, search.own, values, errors),
         "where": {"motor": {"sentence": sentence}},
         "rest": {},
         "withdrawn": [],
@@ -301,7 +276,7 @@ def _summary(
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing
         "explained_share": None if before <= limit**2 else 1.0 - min(max(after - noise**2, 0.0) / (before - noise**2), 1.0),
-        "backlash": None if alone.gap is None else {**(gap_summary(alone) or {}), "nominal": None},
+        "backlash": gap and gap | {"nominal": None},
         "gap": {
             "holdout": {
                 "file": str(held_out.path.resolve()), "separate": task.separate, "window": None,
@@ -322,17 +297,10 @@ def _summary(
     }  # fmt: skip
 
 
-def _changes(search: _Search, alone: Alone) -> list[tuple[FreeParameter, float]]:
-    """Changes of the model's own numbers (theta)."""
-    places = {one.path: float(x) for one, x in zip(search.model.free, alone.point.theta, strict=True)}
-    return [(one, places[one.path]) for one in _own(search)]
-
-
 def _share(search: _Search, alone: Alone, name: str, size: float) -> float:
     """Torque of an effect over the driving torque: of a friction its level, of a gap what the shaft would take instead."""
-    (value,) = _numbers(alone, name).values()
-    plant = alone.experiment.plant
+    value, plant = alone.values[search.path(name)], alone.experiment.plant
     if is_gap(search.model.free[search.effects[name]]):
         assert plant.transmission is not None
         return min(value * float(plant.transmission.stiffness) / size, 1.0)
-    return value / (float(plant.drive.ratio("load")) if name.startswith("load.") else 1.0) / size
+    return value / float(plant.drive.ratio(name.partition(".")[0])) / size

@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import simulate_plants
-from jaxbl.identification.segments import Segment, reading_noise, windows_of
+from jaxbl.identification.segments import Segment, at_period, reading_noise, windows_of
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
@@ -47,11 +46,6 @@ _BEFORE = 512
 """Samples before a window whose inputs its model may remember: several time constants of most lags."""
 _STATES, _STATES_OF_ONE_RUN = 8, 3
 """Initial states tried for each window, and for a free run, which determines its own much better."""
-
-
-def at_period(experiment: Experiment, period: float) -> Experiment:
-    """A model at the sampling period of another log, s."""
-    return eqx.tree_at(lambda e: e.run.sample_period, experiment, np.asarray(period, float))
 
 
 Errors = dict[str, float]

@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFriction
@@ -19,6 +18,8 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, element_error
 from jaxbl.records.inspection import element_displacement, fit_record_element, make_rig_log
+
+from .logs import SealedRecord
 
 # number -> where a study has it: an effect and its key
 _EFFECTS = {
@@ -49,13 +50,9 @@ class ElementTask:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = [self.table.model_dump(), self.gear_ratio, version("jaxbl")]
-        total = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
-        for record in (self.record, self.holdout):
-            if record is not None:
-                for values in (record.time, record.torque, *record.positions.values()):
-                    total.update(np.ascontiguousarray(values).tobytes())
-        return total.hexdigest()[:16]
+        text = json.dumps([self.table.model_dump(), self.gear_ratio, version("jaxbl")], sort_keys=True)
+        hashes = [SealedRecord(record).hash for record in (self.record, self.holdout) if record is not None]
+        return hashlib.sha256(b"".join([text.encode(), *hashes])).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -161,10 +158,10 @@ def _summary(task: ElementTask, found: Element) -> JsonObject:
             {"direction": {_path(name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in found.open
         ],
-        "method": {"element": {"terms": list(found.terms), "gains": found.gains, "reversals": found.reversals}},
+        "method": {"element": {"terms": found.terms, "gains": found.gains, "reversals": found.reversals}},
         "torque": {"element": {"rms": found.residual, "relative": found.share, "unit": found.numbers["offset"].unit}},
-        "warnings": list(record.warnings),
-        "notes": list(record.notes),
+        "warnings": record.warnings,
+        "notes": record.notes,
     }
     if task.holdout is not None:
         error = element_error(found, make_rig_log(task.holdout, task.gear_ratio))

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +19,7 @@ from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, sprea
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors, regress
 from .search import Found, is_noise
-from .segments import long_enough, reading_noise, segments_of, windows_of
+from .segments import at_period, long_enough, reading_noise, segments_of, windows_of
 from .trajectory import Fit, projected_residual
 
 
@@ -30,10 +29,14 @@ def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinema
     return {name: one | {"unit": record.unit_of(name, "N m")} for name, one in found.items()}
 
 
+def describe_position(record: Record, side: str, noise: float, **errors: float) -> JsonObject:
+    """Errors of a side's predicted position, by key, beside the readings' noise, with the unit."""
+    return errors | {"noise": noise, "unit": record.unit_of(f"{side}.position", "rad")}
+
+
 def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> JsonObject:
     """How well the numbers found serve another log, beside the nominal ones, in windows of `samples` where it is so long."""
-    period = jnp.asarray(record.sample_period)
-    rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
+    rebased = [at_period(one, record.sample_period) for one in (nominal, fitted)]
     rest = config.log.initial_state == "rest"
     segments = segments_of(record, nominal.sides, rest)
     noise = reading_noise(segments)
@@ -43,8 +46,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.unit_of(f"{side}.position", "rad")
-        position[side] = {"rms": after, "nominal_rms": before, "noise": noise[side], "unit": unit}
+        position[side] = describe_position(record, side, noise[side], rms=after, nominal_rms=before)
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
     before, torque = (torque_errors(record, one, parts, factor) for one in rebased)
@@ -85,7 +87,7 @@ def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: 
         parameter.path: {
             "value": float(parameter.value(theta[i])),
             "standard_error": float(parameter.slope(theta[i])) * deviation[i],
-            "interval": list(interval(parameter, theta[i], deviation[i])),
+            "interval": interval(parameter, theta[i], deviation[i]),
             "unit": record.unit_of(parameter.path, parameter.unit),
             "nominal": parameter.nominal,
         }
@@ -143,15 +145,12 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         correlation = width / np.outer(deviation, deviation)
     parameters = _parameters(record, found.free, found.fit, found.spread)
     for path, one in profiles.items():
-        points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
-        parameters[path] |= {"profile_interval": list(one.interval), "profile": points}
+        parameters[path] |= {"profile_interval": one.interval, "profile": np.column_stack([one.values, one.deviance])}
     parameters |= _derived(fitted, found)
     residual = {
-        side: {
-            "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
-            "noise": noise[side],
-            "unit": record.unit_of(f"{side}.position", "rad"),
-        }
+        side: describe_position(
+            record, side, noise[side], rms=noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2)))
+        )
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }
     return {

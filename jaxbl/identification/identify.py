@@ -172,15 +172,17 @@ def _from_motor(
     trace = pd.DataFrame(columns_alone(record, alone))
     summary = summary_of(task, alone.experiment, alone.found, {})
     summary["method"] = {"recursive": {}, "trajectory": by_trajectories(alone.found, record)}
-    summary["torque"], summary["backlash"] = {}, gap_summary(alone)
-    for one in summary["refused"]:
-        if summary["backlash"] and alone.gap_path in one["direction"] and summary["backlash"]["why"]:
-            one["why"] = summary["backlash"]["why"]
-    if alone.why and (alone.gap_path or "").startswith("transmission."):
-        # follows from a number that was not found
-        summary["parameters"].pop("transmission.half_gap", None)
+    gap = gap_summary(alone)
+    summary["torque"], summary["backlash"] = {}, gap
+    if gap is not None and gap["why"]:
+        for refusal in summary["refused"]:
+            if gap["path"] in refusal["direction"]:
+                refusal["why"] = gap["why"]
+        if gap["path"].startswith("transmission."):
+            # follows from a number that was not found
+            summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
-        summary["holdout"] = alone_on_holdout(config, task.holdout.open(), alone)
+        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone)
     done()
     return Identification(
         config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing

@@ -22,6 +22,8 @@ _Points = list[tuple[float, float]]
 """Steps of theta from the best value, and the deviance there."""
 NORMAL = float(ndtri(0.975))
 """Standard errors on either side of a value that a 95 % interval reaches to."""
+LIMIT = float(chdtri(1.0, 0.05))
+"""Deviance at the ends of a 95 % interval of one number."""
 UNSEEN = 0.5
 """Relative standard deviation beyond which a direction counts as not shown by the record."""
 _PASSES = 4
@@ -79,11 +81,18 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: in
         inverse = _pseudo_inverse(normal / scale)
         plain = variance * inverse / scale
         sandwich = inverse @ middle @ inverse / scale
-        inflation = np.sqrt(np.diag(sandwich) / np.diag(plain))
-        # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
-        more = np.maximum(1.0 / inflation, 1.0)
-        covariance = sandwich * np.outer(more, more)
-        return Spread(covariance, normal / variance, variance, inflation * more)
+        covariance, inflation = without_gain(sandwich, plain)
+        return Spread(covariance, normal / variance, variance, inflation)
+
+
+def without_gain(sandwich: np.ndarray, plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A covariance that counts the correlation of residuals, nowhere below the plain one, and the factor on its errors.
+
+    Elimination of initial states leaves a little negative correlation behind: nothing to gain confidence from.
+    """
+    inflation = np.sqrt(np.maximum(np.diag(sandwich), np.finfo(float).tiny) / np.diag(plain))
+    more = np.maximum(1.0 / inflation, 1.0)
+    return sandwich * np.outer(more, more), inflation * more
 
 
 def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
@@ -167,7 +176,7 @@ def profile(
     The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
     :func:`spread`.
     """
-    count, limit = len(free), float(chdtri(1.0, 0.05))
+    count = len(free)
     centre, covariance = np.asarray(best.theta), width.covariance
     deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
@@ -175,7 +184,7 @@ def profile(
 
     which = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)
-    steps = np.sqrt(limit) * deviation[which]
+    steps = np.sqrt(LIMIT) * deviation[which]
     others = covariance[:, which].T / np.diag(covariance)[which, None]
     tried = [[(0.0, 0.0)] for _ in which]
     for _ in range(_PASSES):
@@ -189,23 +198,23 @@ def profile(
         # start the next fits where these ended
         others = (found - centre[None, :]) / (sign * steps)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            factor = np.sqrt(limit / np.maximum(deviance, 0.0))
+            factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
         steps = steps * np.clip(np.where(np.isfinite(factor), factor, 0.3), 0.3, 3.0)
-    return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1], limit) for i, one in enumerate(free)}
+    return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1]) for i, one in enumerate(free)}
 
 
-def _gathered(one: FreeParameter, centre: float, below: _Points, above: _Points, limit: float) -> Profile:
-    lower, upper = (_end(points, limit) for points in (below, above))
+def _gathered(one: FreeParameter, centre: float, below: _Points, above: _Points) -> Profile:
+    lower, upper = map(step_at_limit, (below, above))
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
     low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
     values = np.array([float(one.value(centre + step)) for step, _ in points])
     return Profile((low if one.minimum is None else max(low, one.minimum), high), values, np.array([d for _, d in points]))
 
 
-def _end(points: _Points, limit: float) -> float:
-    """Step at which the root of the deviance, which is nearly straight, reaches that of its limit."""
+def step_at_limit(points: _Points) -> float:
+    """Step at which the root of the deviance, which is nearly straight, reaches that of its limit, :data:`LIMIT`."""
     steps, roots = (np.array(x) for x in zip(*sorted((s, np.sqrt(max(d, 0.0))) for s, d in points), strict=True))
-    goal = np.sqrt(limit)
+    goal = np.sqrt(LIMIT)
     beyond = np.flatnonzero(roots >= goal)
     if len(beyond) == 0:
         return np.inf if steps[-1] >= _FURTHEST else float(steps[-1] * goal / max(roots[-1], 1e-9))

@@ -1,30 +1,32 @@
 """An identification from the motor's encoder and torque alone, in the form that one from both encoders has."""
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.config import Config
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, PlantState
 
 from .free_parameters import FreeParameter
+from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .log_columns import join_columns, motion_columns
+from .logs import arrays
 from .search import Found
-from .segments import Segment, reading_noise, segments_of
-from .trajectory import Windows
-from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, half_gap_of, inverse, is_known, widths
+from .segments import Segment, at_period, segments_of
+from .trajectory import Fit, cut
+from .unseen_load import SHOWN, Gap, GapSearch, Point, UnseenLoad, half_gap_of, inverse, is_known, widths
 
 
 class Alone(NamedTuple):
@@ -49,12 +51,12 @@ class Alone(NamedTuple):
     @property
     def experiment(self) -> Experiment:
         """The model with these numbers."""
-        return set_leaves(self.model.experiment, {path: np.asarray(value) for path, value in self.values.items()})
+        return set_leaves(self.model.experiment, arrays(self.values))
 
     @property
-    def gap_path(self) -> str | None:
-        """Path of the number that makes the gap, if it is sought."""
-        return None if self.model.gap is None else self.model.free[self.model.gap].path
+    def doubtful(self) -> bool:
+        """Whether a gap is not shown that the readings call for, or leave to be so wide that the load is never met."""
+        return bool(self.why) and self.gap is not None and (self.gap.needed or self.gap.unmet)
 
 
 def search_alone(
@@ -71,20 +73,21 @@ def search_alone(
         InputError: the model diverges.
     """
     model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, rest)
-    held, gap, why = np.zeros(len(free), bool), None, ""
+    absent: list[int] = []
+    gap, why = None, ""
     if model.gap is None:
-        point, width, slope = model.settled(fitted(model))
+        point, width = model.settled(model.fit())
     else:
-        gap = find_gap(model)
-        point, width, slope = gap.best, gap.spread, gap.slope
+        gap = GapSearch(model).run()
+        point, width = gap.best, gap.spread
         why = why_not(gap, model, settings.spread, record)
-        held[model.gap] = bool(why)
+        absent = [model.gap] if why else []
         if not gap.needed:
-            point, width, slope = model.settled(gap.without, held)
+            point, width = dataclasses.replace(model, held=absent).settled(gap.without)
     if not np.isfinite(point.deviance):
         raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
-    alone = alone_of(model, point, width, slope, held, gap, why)
-    if not_met(model, point, record) or (why and gap is not None and (gap.needed or gap.unmet)):
+    alone = alone_of(model, point, width, absent, gap, why)
+    if not_met(model, point, record) or alone.doubtful:
         # numbers of a model that the log contradicts, with a gap of any size, or without a load have no interval
         nothing = np.full_like(alone.found.spread.covariance, np.inf)
         found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
@@ -92,14 +95,12 @@ def search_alone(
     return alone
 
 
-def alone_of(
-    model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, held: np.ndarray, gap: Gap | None, why: str
-) -> Alone:
-    """A fit in which `held` numbers are none that was found; width and slope as of :meth:`UnseenLoad.settled`."""
-    values = {path: float(value) for path, value in model.numbers(point.theta).items()}
+def alone_of(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int], gap: Gap | None, why: str) -> Alone:
+    """A fit in which the numbers at some places (`absent`) are none that was found; `width`: its covariance."""
+    values = model.numbers(point.theta)
     if gap is not None and not gap.needed and model.gap is not None:
         values[model.free[model.gap].path] = 0.0
-    return Alone(_found(model, point, width, slope, held), values, gap, why, model, point)
+    return Alone(_found(model, point, width, absent), values, gap, why, model, point)
 
 
 _FACTOR, _LEFT = 6.0, 0.05
@@ -115,7 +116,7 @@ went wrong."""
 def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     """Why a fit cannot be right, in a clause: a torque moves the motor that is in neither; "" if there is none."""
     left, size = model.unexplained(point), model.torque
-    if left <= max(_FACTOR * estimate_white_noise([one.torque for one in model.segments]), _LEFT * size):
+    if left <= max(_FACTOR * model.torque_noise, _LEFT * size):
         return ""
     return (
         f"a torque of {left:.2g} {record.unit_of('motor.torque', 'N m')} rms ({100.0 * left / size:.2g} % of the driving "
@@ -125,7 +126,7 @@ def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
 
 def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     """Why a log does not show a gap, and what would, in one clause; "" where it does."""
-    noise, unit = reading_noise(model.segments)["motor"], record.unit_of("motor.position", "rad")
+    unit = record.unit_of("motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
     if wrong := not_met(model, gap.best if gap.needed else gap.without, record):
         return wrong
@@ -133,13 +134,13 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
         return (
             f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
         )
-    if not gap.needed and gap.at_most >= gap.travel:
-        return f"any half gap fits; {both_ways}"
-    if not gap.needed and gap.crossings < _REVERSALS:
-        return f"the torque in the gear hardly changes its sign; {both_ways}"
     if not gap.needed:
+        if gap.at_most >= gap.travel:
+            return f"any half gap fits; {both_ways}"
+        if gap.crossings < _REVERSALS:
+            return f"the torque in the gear hardly changes its sign; {both_ways}"
         return (
-            f"without one the motor's readings are met as well (noise {noise:.2g} {unit}); half gaps of up to "
+            f"without one the motor's readings are met as well (noise {model.noise:.2g} {unit}); half gaps of up to "
             f"{gap.at_most:.3g} {unit} are not ruled out; faster reversals would show smaller ones"
         )
     if gap.crossings < 1:
@@ -157,30 +158,30 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     return ""
 
 
-def _found(model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, held: np.ndarray) -> Found:
+def _found(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int]) -> Found:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
-    sought = np.flatnonzero(~held)
+    sought = np.setdiff1d(np.arange(len(model.free)), absent)
     every = _only(width, sought)
     refused, condition = refusals([model.free[i] for i in sought], every)
     seen = sought[np.sqrt(np.diag(every.covariance)) < UNSEEN]
-    if held.any():
-        refused = [Refusal({model.free[i].path: 1.0}, float("inf")) for i in np.flatnonzero(held)] + refused
-    noise = reading_noise(model.segments)["motor"]
-    size = np.sqrt(point.variance) / noise
-    fit = as_fit(point.theta[seen], point.errors / noise, slope[:, seen] * size)
     torque, readings = (
-        jnp.asarray(np.concatenate(each)[None])
-        for each in ([one.torque for one in model.segments], [one.readings["motor"] for one in model.segments])
+        np.concatenate(pieces)
+        for pieces in zip(*((segment.torque, segment.readings["motor"]) for segment in model.segments), strict=True)
     )
-    windows = Windows(
-        torque, {"motor": readings}, jnp.zeros(1), fit.start, {"motor": jnp.asarray(noise)}, jnp.asarray([model.rest]),
-        jnp.zeros(fit.residual.shape),
+    # all of the log as one window, without a state of its own
+    windows = cut(
+        torque, {"motor": readings}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque),
+        rest=model.rest,
     )  # fmt: skip
+    residual = (point.errors / model.noise)[None, :, None]
+    cost = 0.5 * np.sum(residual**2)
+    fit = Fit(jnp.asarray(point.theta[seen]), windows.start, residual, np.zeros((*residual.shape, 0)), cost, np.True_)
     return Found(
         free=tuple(model.free[i] for i in seen), fit=fit,
-        spread=_only(width, seen)._replace(variance=size**2),
+        spread=_only(width, seen)._replace(variance=point.variance / model.noise**2),
         windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
-        refused=refused, held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
+        refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
+        held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
     )  # fmt: skip
 
 
@@ -196,25 +197,24 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     `torque`), with the same torque by the motor's side (`torque_by_motor`); NaN in parts of the log that are too short.
     """
     assert record.torque is not None
-    fitted, model, point = alone.experiment, alone.model, alone.point
+    fitted, model, pieces = alone.experiment, alone.model, []
     plant = fitted.plant
-    states = model.states(point.theta, point.start, point.smoothness)
-    pieces = []
-    for segment, one in zip(model.segments, states, strict=True):
-        piece = motion_columns(segment, "motor")
-        piece["motor.residual"] = segment.readings["motor"] - np.asarray(one.position["motor"])
-        for name in ("position", "velocity"):
-            piece[f"load.modelled_{name}"] = getattr(one, name)["load"]
-        k = segment.kinematics
-        one = jax.tree.map(jnp.asarray, one)
-        through = jax.vmap(plant.transmitted_torque)(one.position, one.velocity, one.effects)[0]
-        position, velocity = one.position | k.position, one.velocity | k.velocity
-        none = jnp.zeros_like(through)
-        total, level = jax.vmap(plant.side_torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
-        resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
+    for segment, state in zip(model.segments, model.states(alone.point), strict=True):
+        k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
+        through = jax.vmap(plant.transmitted_torque)(state.position, state.velocity, state.effects)[0]
+        motion = state.position | k.position, state.velocity | k.velocity, state.effects
+        total, level = jax.vmap(plant.side_torques)(*motion, k.torque, k.time, jnp.zeros_like(through))["motor"]
+        speed = k.velocity["motor"]
+        resisting = fitted.drive.viscous("motor") * speed + level * jnp.sign(speed)
         pieces.append(
-            piece
-            | {"torque": through, "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"]}
+            motion_columns(segment, "motor")
+            | {
+                "motor.residual": segment.readings["motor"] - state.position["motor"],
+                "load.modelled_position": state.position["load"],
+                "load.modelled_velocity": state.velocity["load"],
+                "torque": through,
+                "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"],
+            }
         )
     columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
     return columns | join_columns(len(record.time), model.segments, pieces)
@@ -230,32 +230,28 @@ def gap_summary(alone: Alone) -> JsonObject | None:
         "shown": not alone.why,
         "path": number.path,
         "nominal": number.nominal * half_gap_of(number),
-        "half_gap": None if alone.why else gap.half,
+        "half_gap": None if alone.why else model.half_gap(gap.best.theta),
         "at_most": gap.at_most,
         "unmet": gap.unmet,
         "gain": gap.gain,
         "needed": SHOWN,
         "crossings": gap.crossings,
-        "starts": [list(one) for one in gap.starts],
+        "starts": gap.starts,
         "why": alone.why or None,
     }
 
 
-def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
+def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
     """How well the numbers found predict another log of the motor, beside the nominal ones.
 
     `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
     """
     fitted, smoothness = alone.model, alone.point.smoothness
-    period = jnp.asarray(record.sample_period)
-    experiment = eqx.tree_at(lambda e: e.run.sample_period, fitted.experiment, period)
-    rest = config.log.initial_state == "rest"
-    segments = segments_of(record, ["motor"], rest)
-    model = UnseenLoad(experiment, fitted.free, fitted.width, segments, rest)
-    given = np.zeros(len(model.free)) if nominal is None else nominal
-    sizes = [float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (given, alone.point.theta)]
-    noise = reading_noise(segments)["motor"]
-    unit = record.unit_of("motor.position", "rad")
-    position = {"rms": sizes[1], "nominal_rms": sizes[0], "noise": noise, "unit": unit}
+    segments = segments_of(record, ["motor"], fitted.rest)
+    model = dataclasses.replace(fitted, experiment=at_period(fitted.experiment, record.sample_period), segments=segments)
+    if nominal is None:
+        nominal = np.zeros(len(model.free))
+    after, before = (float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
+    position = describe_position(record, "motor", model.noise, rms=after, nominal_rms=before)
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

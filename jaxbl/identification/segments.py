@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import cached_property, partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,6 +167,11 @@ def _held(experiment: Experiment, segment: Segment, states: EffectStates) -> Eff
         still = segment.smoothed[side].held(segment.period)
         found[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(rest), states[i])
     return tuple(found)
+
+
+def at_period(experiment: Experiment, period: float) -> Experiment:
+    """A model at the sampling period of another log, s."""
+    return eqx.tree_at(lambda e: e.run.sample_period, experiment, np.asarray(period, float))
 
 
 def windows_of(

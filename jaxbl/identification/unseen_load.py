@@ -13,7 +13,7 @@ backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -32,11 +32,10 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
-from .intervals import Spread, long_run
+from .intervals import LIMIT, Spread, long_run, step_at_limit, without_gain
 from .prediction import kalman_gain
 from .regression import begun
 from .segments import Segment, reading_noise
-from .trajectory import Fit
 
 _STEP, _SHORTEST = 1e-2, 1e-6
 """Largest and least change of theta, or of a start, for derivatives."""
@@ -72,7 +71,6 @@ _RESOLVED = 0.15
 """Of a plant step times the fastest frequency of the drive: Moreau's rule is then off by a thousandth of it."""
 SHOWN = float(chdtri(1.0, 1e-3))
 """Gain in minus twice the log-likelihood over the model without a gap from which on a gap is shown: 1 in 1000 by chance."""
-_LIMIT = float(chdtri(1.0, 0.05))
 _SKIPPED = 0.15
 """Share of each part of a log in which the load finds its way: where it begins is not known, and many places would fit."""
 _APART = 0.2
@@ -94,15 +92,15 @@ class Point(NamedTuple):
             what half gap and wind-up make; load speed off the motor's. Shape (segments, 4).
         smoothness: of the predictor.
         errors: prediction errors of the motor, all segments one after the other without their beginnings, rad, shape
-            (count,).
+            (count,); none before they are computed.
         deviance: minus twice the log-likelihood, the noise that suits it best, with the priors; up to a constant.
     """
 
     theta: np.ndarray
     start: np.ndarray
     smoothness: float
-    errors: np.ndarray
-    deviance: float
+    errors: np.ndarray = np.empty(0)
+    deviance: float = np.inf
 
     @property
     def variance(self) -> float:
@@ -121,6 +119,7 @@ class UnseenLoad:
         width: prior standard deviation of each one's theta, shape (free,).
         segments: of the log, with the motor's motion.
         rest: whether each begins at rest.
+        held: places of free numbers that stay where a fit begins.
     """
 
     experiment: Experiment
@@ -128,6 +127,7 @@ class UnseenLoad:
     width: np.ndarray
     segments: Sequence[Segment]
     rest: bool
+    held: list[int] = field(default_factory=list)
 
     def __post_init__(self):
         # half gaps are sought over decades
@@ -140,6 +140,12 @@ class UnseenLoad:
         self._open = np.array([[motion.deviation(i)[0] for i in (0, 1)] for motion in motions])
         self._speed = rms(np.concatenate([motion.velocity for motion in motions]))
         self.torque = rms(np.concatenate([segment.torque for segment in self.segments]))
+        self.noise = reading_noise(self.segments)["motor"]
+
+    @cached_property
+    def torque_noise(self) -> float:
+        """White noise of the recorded torque, N m."""
+        return estimate_white_noise([segment.torque for segment in self.segments])
 
     @property
     def gap(self) -> int | None:
@@ -165,14 +171,11 @@ class UnseenLoad:
 
         From a friction that is too large no way leads back: the load sticks, and nothing depends on it.
         """
-        rows, torque = [], []
-        for one in self.segments:
-            k = one.kinematics
-            speed = k.velocity["motor"]
-            rows.append(np.stack([k.acceleration["motor"], speed, np.sign(speed), np.ones(len(speed))], axis=1))
-            torque.append(k.torque)
-        matrix, torque = np.concatenate(rows), np.concatenate(torque)
-        moving = np.abs(matrix[:, 1]) > 0.1 * self._speed
+        motions = [segment.kinematics for segment in self.segments]
+        columns = [(k.acceleration["motor"], k.velocity["motor"], k.torque) for k in motions]
+        acceleration, speed, torque = map(np.concatenate, zip(*columns, strict=True))
+        matrix = np.stack([acceleration, speed, np.sign(speed), np.ones(len(speed))], axis=1)
+        moving = np.abs(speed) > 0.1 * self._speed
         found = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
         total, begun = np.maximum(found[1:3], least), []
@@ -211,27 +214,29 @@ class UnseenLoad:
         number = self.free[self.gap]
         return half_gap_of(number) * self.numbers(theta)[number.path]
 
-    def states(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> list[PlantState]:
+    def states(self, point: Point) -> list[PlantState]:
         """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
-        return [jax.tree.map(lambda x: x[0], self._runs(theta, i, one[None], smoothness)) for i, one in enumerate(start)]
+        return [jax.tree.map(lambda x: x[0], self._runs(point, i, start[None])) for i, start in enumerate(point.start)]
 
-    def at(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> Point:
-        """Prediction errors of some numbers."""
-        found = self.states(theta, start, smoothness)
-        return self._point(theta, start, smoothness, np.concatenate([self._errors(i, one) for i, one in enumerate(found)]))
+    def evaluate(self, point: Point) -> Point:
+        """A point with its prediction errors by this model."""
+        errors = [self._errors(point, i, start[None])[0] for i, start in enumerate(point.start)]
+        return self._with_errors(point, errors)
 
-    def _errors(self, which: int, states: PlantState) -> np.ndarray:
-        """What the readings of a segment differ from predictions, last axis (counted samples,)."""
+    def _errors(self, point: Point, place: int, starts: np.ndarray) -> np.ndarray:
+        """What the readings of a segment differ from predictions from several starts, shape (runs, counted samples)."""
+        states = self._runs(point, place, starts)
         with _ignore_divergence():
-            errors = self.segments[which].readings["motor"] - np.asarray(states.position["motor"])
-        return errors[..., self.skipped[which] :]
+            errors = self.segments[place].readings["motor"] - np.asarray(states.position["motor"])
+        return errors[:, self.skipped[place] :]
 
-    def _point(self, theta: np.ndarray, start: np.ndarray, smoothness: float, errors: np.ndarray) -> Point:
-        prior = np.sum((theta / self.width) ** 2) + np.sum((start - self._expected(start)) ** 2)
+    def _with_errors(self, point: Point, segment_errors: Sequence[np.ndarray]) -> Point:
+        errors = np.concatenate(segment_errors)
+        prior = np.sum((point.theta / self.width) ** 2) + np.sum((point.start - self._expected(point.start)) ** 2)
         # a model that diverges
         with _ignore_divergence():
             deviance = self.count * np.log(np.mean(errors**2)) + prior
-        return Point(theta, start, smoothness, errors, float(deviance) if np.isfinite(deviance) else np.inf)
+        return point._replace(errors=errors, deviance=float(deviance) if np.isfinite(deviance) else np.inf)
 
     @staticmethod
     def _expected(start: np.ndarray) -> np.ndarray:
@@ -255,52 +260,54 @@ class UnseenLoad:
         """Half gap, stiffness and gear ratio without the free numbers."""
         plant = self.experiment.plant
         assert plant.transmission is not None
-        known = {"transmission.stiffness": float(plant.transmission.stiffness), "ratio": float(plant.drive.ratio("load"))}
-        return known | {"half": plant.half_gap}
+        return {
+            "transmission.stiffness": float(plant.transmission.stiffness),
+            "ratio": float(plant.drive.ratio("load")),
+            "half": plant.half_gap,
+        }
 
-    def _runs(self, theta: np.ndarray, which: int, starts: np.ndarray, smoothness: float) -> PlantState:
-        """Of a segment from several starts, shape (runs, 4)."""
-        segment, numbers = self.segments[which], self.numbers(theta)
+    def _runs(self, point: Point, place: int, starts: np.ndarray) -> PlantState:
+        """Simulate a segment from several starts, shape (runs, 4)."""
+        segment, numbers = self.segments[place], self.numbers(point.theta)
         known = self._own | numbers
         ratio = known.get("drive.gear_ratio", known["ratio"])
-        position = self._first[which, 0] + self._open[which, 0] * starts[:, 0]
-        velocity = self._first[which, 1] + self._open[which, 1] * starts[:, 1]
-        twist = starts[:, 2] * (self.half_gap(theta) + self.torque / known["transmission.stiffness"])
+        position, velocity = (self._first[place] + self._open[place] * starts[:, :2]).T
+        twist = starts[:, 2] * (self.half_gap(point.theta) + self.torque / known["transmission.stiffness"])
         load = velocity + _APART * self._speed * starts[:, 3]
         if self.rest:
             velocity, load = np.zeros_like(velocity), np.zeros_like(load)
-        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._settled[which])
+        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._settled[place])
         state = PlantState(
             {"motor": position, "load": (position - twist) / ratio}, {"motor": velocity, "load": load / ratio}, effects
         )
         shape = len(starts), len(segment)
         torque, readings = (np.broadcast_to(x, shape) for x in (segment.torque, segment.readings["motor"]))
         time = np.full(len(starts), float(segment.time[0]))
-        gain = kalman_gain(float(smoothness), self.period)
+        gain = kalman_gain(float(point.smoothness), self.period)
         return self._model(numbers, state, torque, time, {"motor": readings}, {"motor": gain})
 
     def begun(self, theta: np.ndarray, smoothness: float) -> Point:
         """With each segment beginning where in the gap, and with which speed of the load, suits it best."""
         tries = np.array([[0.0, 0.0, twist, speed] for twist in (1.0, -1.0, 1e-3) for speed in (0.0, 2.0, -2.0)])
-        start, errors = [], []
+        point, errors = Point(theta, np.zeros((len(self.segments), _STATES)), smoothness), []
         for i in range(len(self.segments)):
-            each = self._errors(i, self._runs(theta, i, tries, smoothness))
+            runs = self._errors(point, i, tries)
             with _ignore_divergence():
-                squares = np.sum(each**2, axis=1)
+                squares = np.sum(runs**2, axis=1)
             best = int(np.argmin(np.where(np.isfinite(squares), squares, np.inf)))
-            start.append(tries[best])
-            errors.append(each[best])
-        return self._point(theta, np.array(start), smoothness, np.concatenate(errors))
+            point.start[i] = tries[best]
+            errors.append(runs[best])
+        return self._with_errors(point, errors)
 
     def predicted(self, theta: np.ndarray, smoothness: float) -> Point:
         """Prediction errors of given numbers; initial states alone are fitted, first with predictors that follow closely."""
-        held = np.ones(len(self.free), bool)
-        point = self.begun(theta, _FOLLOWING[0])
-        for one in (*_FOLLOWING, smoothness):
-            point = self.resume(point, _FEW, held, one)
+        model = replace(self, held=list(range(len(self.free))))
+        point = model.begun(theta, _FOLLOWING[0])
+        for following in (*_FOLLOWING, smoothness):
+            point = model.resume(point, _FEW, following)
         return point
 
-    def slopes(self, point: Point, held: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+    def slopes(self, point: Point, size: np.ndarray | None = None) -> np.ndarray:
         """Derivatives of the errors by theta and by the starts, rad, shape (samples, free + 4 segments); 0 where held.
 
         `size`: standard errors, all else known; shape (free + 4 segments,).
@@ -308,44 +315,44 @@ class UnseenLoad:
         count, states = len(self.free), point.start.size
         step = np.full(count + states, 1e-2 * _STEP) if size is None else np.clip(_SHARE * size, _SHORTEST, _STEP)
         found = np.zeros((self.count, count + states))
-        for i in np.flatnonzero(~held):
+        for i in {*range(count)} - {*self.held}:
             theta = point.theta.copy()
             theta[i] += step[i]
-            found[:, i] = (self.at(theta, point.start, point.smoothness).errors - point.errors) / step[i]
+            found[:, i] = (self.evaluate(point._replace(theta=theta)).errors - point.errors) / step[i]
         row, column = 0, count
         for i, start in enumerate(point.start):
             own = step[column : column + _STATES]
-            each = self._errors(i, self._runs(point.theta, i, start + np.diag(own), point.smoothness))
+            each = self._errors(point, i, start + np.diag(own))
             rows = slice(row, row + each.shape[1])
             found[rows, column : column + _STATES] = ((each - point.errors[rows]) / own[:, None]).T
             row, column = rows.stop, column + _STATES
         return np.where(np.isfinite(found), found, 0.0)
 
-    def solve(self, point: Point, steps: int, held: np.ndarray | None = None) -> Point:
-        """Levenberg-Marquardt from a point, with its predictor; `held` numbers stay where they are."""
-        held = np.zeros(len(self.free), bool) if held is None else held
-        precision = np.concatenate([self.width**-2.0, np.ones(point.start.size)])
+    def _precision(self) -> np.ndarray:
+        """What is known of theta and of the starts before, shape (free + 4 segments,)."""
+        return np.concatenate([self.width**-2.0, np.ones(_STATES * len(self.segments))])
+
+    def solve(self, point: Point, steps: int) -> Point:
+        """Levenberg-Marquardt from a point, with its predictor."""
+        precision, count = self._precision(), len(self.free)
         best, damping, size = point, 1e-3, None
         for _ in range(steps):
             if not np.isfinite(best.deviance):
                 break
-            slope = self.slopes(best, held, size)
+            slope = self.slopes(best, size)
             away = np.concatenate([best.theta, (best.start - self._expected(best.start)).ravel()])
             matrix = slope.T @ slope / best.variance + np.diag(precision)
             size = np.diag(matrix) ** -0.5
             towards = slope.T @ best.errors / best.variance + precision * away
-            fixed = np.concatenate([held, np.zeros(point.start.size, bool)])
-            towards[fixed] = 0.0
-            matrix[fixed], matrix[:, fixed] = 0.0, 0.0
-            matrix[fixed, fixed] = 1.0
+            towards[self.held] = 0.0
+            matrix[self.held], matrix[:, self.held] = 0.0, 0.0
+            matrix[self.held, self.held] = 1.0
             gained = 0.0
             for _ in range(_MOST_REJECTED):
                 change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), towards)
                 change = np.clip(change, -1.0, 1.0)
-                count = len(self.free)
-                tried = self.at(
-                    best.theta + change[:count], best.start + change[count:].reshape(-1, _STATES), best.smoothness
-                )
+                theta, start = best.theta + change[:count], best.start + change[count:].reshape(-1, _STATES)
+                tried = self.evaluate(best._replace(theta=theta, start=start))
                 gained = best.deviance - tried.deviance
                 if gained > 0.0:
                     best, damping = tried, max(0.1 * damping, 1e-9)
@@ -355,69 +362,69 @@ class UnseenLoad:
                 break
         return best
 
-    def resume(self, point: Point, steps: int, held: np.ndarray | None = None, smoothness: float | None = None) -> Point:
+    def resume(self, point: Point, steps: int, smoothness: float | None = None) -> Point:
         """Go on from the numbers of a point, of another model or with another predictor; as :meth:`solve`."""
-        return self.solve(self.at(point.theta, point.start, smoothness or point.smoothness), steps, held)
+        return self.solve(self.evaluate(point._replace(smoothness=smoothness or point.smoothness)), steps)
 
-    def predictor(self, point: Point) -> Point:
-        """The same numbers with the predictor whose errors are least."""
-        return _likeliest([point, *(self.at(point.theta, point.start, float(one)) for one in _SMOOTHNESS)])
-
-    def finished(self, point: Point, held: np.ndarray | None = None) -> Point:
-        """Fit with the predictor that suits it best: chosen, fitted, and so on."""
+    def finished(self, point: Point) -> Point:
+        """Fit with the predictor that suits it best: the one whose errors are least is chosen, fitted, and so on."""
         for _ in range(_CHOICES):
             before = point.smoothness
-            point = self.solve(self.predictor(point), _MORE, held)
+            predictors = [self.evaluate(point._replace(smoothness=float(one))) for one in _SMOOTHNESS]
+            point = self.solve(_likeliest([point, *predictors]), _MORE)
             if point.smoothness == before:
                 break
         return point
 
-    def followed(self, point: Point, held: np.ndarray | None = None) -> Point:
+    def followed(self, point: Point) -> Point:
         """From a predictor that follows the readings closely to the one that suits the model."""
-        return self.finished(self.resume(point, _MORE, held, _FOLLOWING[-1]), held)
+        return self.finished(self.resume(point, _MORE, _FOLLOWING[-1]))
+
+    def fit(self) -> Point:
+        """Fit without a gap to be found, from the nominal numbers."""
+        coarse = self.coarse()
+        ends = [coarse.followed(coarse.begun(theta, _FOLLOWING[0])) for theta in self.beginnings()]
+        return self.finished(_likeliest(ends))
 
     def unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
-        noise = reading_noise(self.segments)["motor"]
         inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
-        return inertia * float(np.sqrt(point.smoothness)) * noise / self.period**2
+        return inertia * float(np.sqrt(point.smoothness)) * self.noise / self.period**2
 
-    def settled(self, point: Point, held: np.ndarray | None = None) -> tuple[Point, Spread, np.ndarray]:
-        """The best of a point and of fits beside it; covariance and derivatives of the errors there, as of :meth:`spread`.
+    def settled(self, point: Point) -> tuple[Point, Spread]:
+        """The best of a point and of fits beside it, and the covariance there.
 
         Impacts make the likelihood rough over less than its standard errors, and plant steps are finite: what predictors
         with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error; so does
         what noise in the recorded torque, once more as much, changes.
         """
         announce("standard errors")
-        others = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW, held)]
-        others += [self.resume(point, _FEW, held, factor * point.smoothness) for factor in _OTHERS]
-        best = _likeliest([point, *(self.resume(other, _BACK, held, point.smoothness) for other in others)])
-        width, slope = self.spread(best, held)
-        others += self._noisier(best, held)
+        others = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW)]
+        others += [self.resume(point, _FEW, factor * point.smoothness) for factor in _OTHERS]
+        best = _likeliest([point, *(self.resume(other, _BACK, point.smoothness) for other in others)])
+        others += self._noisier(best)
         # not their mean: some end in the valley that they came from, and say nothing
-        return best, width.with_error(*(one.theta - best.theta for one in others if np.isfinite(one.deviance))), slope
+        changes = [other.theta - best.theta for other in others if np.isfinite(other.deviance)]
+        return best, self.spread(best).with_error(*changes)
 
-    def _noisier(self, point: Point, held: np.ndarray | None) -> list[Point]:
+    def _noisier(self, point: Point) -> list[Point]:
         """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
-        noise = estimate_white_noise([one.torque for one in self.segments])
-        if noise < _QUIET * self.torque:
+        if self.torque_noise < _QUIET * self.torque:
             return []
         found = []
         for seed in range(_DRAWS):
-            random = np.random.default_rng(seed)
-            segments = [replace(one, torque=one.torque + noise * random.standard_normal(len(one))) for one in self.segments]
-            found.append(replace(self, segments=segments).resume(point, _FEW, held))
+            draw = np.random.default_rng(seed).standard_normal
+            segments = [replace(one, torque=one.torque + self.torque_noise * draw(len(one))) for one in self.segments]
+            found.append(replace(self, segments=segments).resume(point, _FEW))
         return found
 
-    def spread(self, point: Point, held: np.ndarray | None = None) -> tuple[Spread, np.ndarray]:
-        """Covariance of theta, of data and priors together, and the derivatives of the errors by theta over their size."""
-        held = np.zeros(len(self.free), bool) if held is None else held
-        count = len(self.free)
-        precision = np.concatenate([np.where(held, 1e12, self.width**-2.0), np.ones(point.start.size)])
+    def spread(self, point: Point) -> Spread:
+        """Covariance of theta, of data and priors together."""
+        count, precision = len(self.free), self._precision()
+        precision[self.held] = 1e12
         size = None
         for _ in range(2):
-            slope = self.slopes(point, held, size) / np.sqrt(point.variance)
+            slope = self.slopes(point, size) / np.sqrt(point.variance)
             size = (np.sum(slope**2, axis=0) + precision) ** -0.5
         assert size is not None
         scores = slope * size * (point.errors / np.sqrt(point.variance))[:, None]
@@ -429,21 +436,8 @@ class UnseenLoad:
         # by a root of the middle: never negative, whatever rounding does
         size_of, ways = np.linalg.eigh(middle)
         half = (white @ (ways * np.sqrt(np.maximum(size_of, 0.0))))[:count]
-        sandwich = half @ half.T * scale
-        # a little negative correlation is nothing to gain confidence from
-        more = np.sqrt(np.maximum(np.diag(inner) / np.maximum(np.diag(sandwich), np.finfo(float).tiny), 1.0))
-        covariance = sandwich * np.outer(more, more)
-        inflation = np.sqrt(np.diag(covariance) / np.diag(inner))
-        return Spread(covariance, inverse(inner), point.variance, inflation), slope[:, :count]
-
-
-def as_fit(theta: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> Fit:
-    """A fit of one channel as one window: residuals over their size, shape (samples,), derivatives (samples, numbers)."""
-    start = PlantState({"motor": jnp.zeros(1)}, {"motor": jnp.zeros(1)}, ())
-    return Fit(
-        jnp.asarray(theta), start, jnp.asarray(residual[None, :, None]), jnp.asarray(jacobian[None, :, None, :]),
-        jnp.asarray(0.5 * float(np.sum(residual**2))), jnp.asarray(True),
-    )  # fmt: skip
+        covariance, inflation = without_gain(half @ half.T * scale, inner)
+        return Spread(covariance, inverse(inner), point.variance, inflation)
 
 
 _QUIET = 1e-4
@@ -471,12 +465,10 @@ class Gap(NamedTuple):
         best: the fit with all numbers.
         without: the best fit without a gap.
         spread: covariance of the best fit's theta.
-        slope: derivatives of its errors by theta over their size, shape (samples, free).
         gain: of minus twice the log-likelihood by the gap, correlation of the errors counted.
         crossings: of the gap from flank to flank; of changes of sign of the transmitted torque without a gap.
         at_most: the largest half gap that the log does not rule out, where it does not show one (95 %), rad.
         starts: half gap that each fit began at, rad, and its deviance above the least.
-        half: the half gap of the best fit, rad.
         travel: of the motor, rad.
         unmet: whether a load that is never met, in a gap wider than the motor's travel, meets the readings as well as none.
     """
@@ -484,12 +476,10 @@ class Gap(NamedTuple):
     best: Point
     without: Point
     spread: Spread
-    slope: np.ndarray
     gain: float
     crossings: int
     at_most: float
     starts: list[tuple[float, float]]
-    half: float
     travel: float
     unmet: bool = False
 
@@ -498,11 +488,9 @@ class Gap(NamedTuple):
         """Whether the readings cannot be met without a gap."""
         return self.gain >= SHOWN
 
-    def of(self, model: UnseenLoad, point: Point, spread: Spread, slope: np.ndarray) -> "Gap":
+    def of(self, point: Point, spread: Spread) -> "Gap":
         """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settled`."""
-        if not self.needed or model.gap is None:
-            return self._replace(without=point)
-        return self._replace(best=point, spread=spread, slope=slope, half=model.half_gap(point.theta))
+        return self._replace(best=point, spread=spread) if self.needed else self._replace(without=point)
 
 
 def _likeliest(points: Sequence[Point]) -> Point:
@@ -540,8 +528,8 @@ _NONE = 1e-9
 """Half gap over the motor's travel that stands for none."""
 
 
-class _Search:
-    """The search for a gap.
+class GapSearch:
+    """The search for a gap: fits from many half gaps, and without one.
 
     Args:
         model: with the gap among its free numbers.
@@ -552,47 +540,49 @@ class _Search:
         width = np.where([is_known(one) for one in model.free], np.minimum(_NEAR, model.width), model.width)
         width = np.where([is_gap(one) for one in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
         self.near = replace(self.coarse, width=width)
-        self.part = replace(self.near, segments=[max(model.segments, key=len).first(_PART)])
         assert model.gap is not None
         self.place: int = model.gap
-        self.held = np.arange(len(model.free)) == self.place
+        # the same with the gap as it is
+        self.model_held, self.coarse_held, self.near_held = (
+            replace(each, held=[self.place]) for each in (model, self.coarse, self.near)
+        )
+        self.part = replace(self.near_held, segments=[max(model.segments, key=len).first(_PART)])
         self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
-        self.noise = reading_noise(model.segments)["motor"]
 
-    def theta(self, half: float) -> float:
-        """Of the gap's number, at a half gap in rad."""
+    def _with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
+        """Theta with a half gap, rad."""
         number = self.model.free[self.place]
-        return number.theta(half / half_gap_of(number))
+        return np.where(np.arange(len(theta)) == self.place, number.theta(half / half_gap_of(number)), theta)
 
     def run(self) -> Gap:
+        """Search."""
         announce("trying half gaps")
         starts = self._starts()
         announce("fitting the gap")
-        best, spread, slope = self.model.settled(self._best(starts))
+        best, spread = self.model.settled(self._best(starts))
         announce("fitting without a gap")
         without = self._without(best)
         worth = float(spread.inflation[self.place]) ** 2
         gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)
         least = min(one.variance for _, one in starts)
         tried = [(half, self.model.count * float(np.log(one.variance / least))) for half, one in starts]
-        half = self.model.half_gap(best.theta)
-        found = Gap(best, without, spread, slope, gain, 0, self.travel, tried, half, self.travel)
-        if gain < SHOWN and self._unmet(without, starts[-1][1], worth):
+        found = Gap(best, without, spread, gain, 0, self.travel, tried, self.travel)
+        if found.needed:
+            return found._replace(crossings=self._turns(best, self.model.experiment, self.model.half_gap(best.theta)))
+        if self._unmet(without, starts[-1][1], worth):
             return found._replace(unmet=True)
-        if gain < SHOWN:
-            return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
-        return found._replace(crossings=self._turns(best, self.model.experiment, half))
+        return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
 
     def _starts(self) -> list[tuple[float, Point]]:
         """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
-        low = max(2.0 * self.noise, 1e-4 * self.travel)
+        low = max(2.0 * self.model.noise, 1e-4 * self.travel)
         grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
-        return [(float(half), self._begun(self.theta(half))) for half in grid]
+        return [(float(half), self._begun(half)) for half in grid]
 
-    def _begun(self, gap: float) -> Point:
-        """A short fit at theta of the gap, the other numbers held near to what is known of them."""
-        starts = [self.part.begun(np.where(self.held, gap, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
-        return min((self.part.solve(one, _FEW, self.held) for one in starts), key=lambda one: one.variance)
+    def _begun(self, half: float) -> Point:
+        """A short fit at a half gap, the other numbers held near to what is known of them."""
+        starts = [self.part.begun(self._with_gap(half, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
+        return min((self.part.solve(start, _FEW) for start in starts), key=lambda point: point.variance)
 
     def _best(self, starts: Sequence[tuple[float, Point]]) -> Point:
         """The best fit from the half gaps that are better than their neighbours."""
@@ -602,49 +592,47 @@ class _Search:
         found = [starts[i][1].theta for i in chosen]
         for smoothness, kept in zip(_FOLLOWING, (_FINALISTS, 2), strict=True):
             points = [self.near.solve(self.near.begun(theta, smoothness), _MORE) for theta in found]
-            least = min(one.variance for one in points)
-            points = [one for one in points if one.variance < _HOPELESS * least]
-            found = [one.theta for one in sorted(points, key=lambda one: one.variance)[:kept]]
+            points.sort(key=lambda point: point.variance)
+            found = [point.theta for point in points[:kept] if point.variance < _HOPELESS * points[0].variance]
         ends = [self.coarse.followed(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
         return self.model.finished(_likeliest(ends))
 
     def _without(self, best: Point) -> Point:
         """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
-        none = self.theta(_NONE * self.travel)
+        none = _NONE * self.travel
         found = []
-        for theta in (self._begun(none).theta, np.where(self.held, none, best.theta)):
-            point = self.near.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW, self.held)
-            found.append(self.coarse.resume(point, _MORE, self.held, _FOLLOWING[1]))
-        return self.model.finished(self.coarse.followed(_likeliest(found), self.held), self.held)
+        for theta in (self._begun(none).theta, self._with_gap(none, best.theta)):
+            point = self.near_held.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW)
+            found.append(self.coarse_held.resume(point, _MORE, _FOLLOWING[1]))
+        return self.model_held.finished(self.coarse_held.followed(_likeliest(found)))
 
     def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
         """Whether the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
-        point = self.near.resume(middle, _FEW, self.held, _FOLLOWING[0])
-        point = self.model.finished(self.coarse.followed(point, self.held), self.held)
-        if not (point.deviance - without.deviance) / worth <= _LIMIT:
+        point = self.near_held.resume(middle, _FEW, _FOLLOWING[0])
+        point = self.model_held.finished(self.coarse_held.followed(point))
+        if not (point.deviance - without.deviance) / worth <= LIMIT:
             return False
         plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
         # on one flank, where a weight may hold the load, the load is met
         met = []
-        for one, skip in zip(self.model.states(point.theta, point.start, point.smoothness), self.model.skipped, strict=True):
+        for one, skip in zip(self.model.states(point), self.model.skipped, strict=True):
             motion = jax.tree.map(jnp.asarray, (one.position, one.velocity, one.effects))
             met.append(np.asarray(jax.vmap(plant.transmitted_torque)(*motion)[0])[skip:])
         return rms(np.concatenate(met)) < _TOUCH * self.model.torque
 
     def _at_most(self, without: Point, worth: float) -> float:
         """The largest half gap that fits about as well as none; the motor's travel where all do."""
-        half = max(0.5 * self.noise, 1e-5 * self.travel)
-        point, last, before = without, half, 0.0
+        half = max(0.5 * self.model.noise, 1e-5 * self.travel)
+        point, tried = without, [(half, 0.0)]
         while half < self.travel:
-            theta = np.where(self.held, self.theta(half), point.theta)
-            point = self.model.resume(point._replace(theta=theta), _FEW, self.held, without.smoothness)
-            gone = (point.deviance - without.deviance) / worth
-            if gone > _LIMIT:
-                root = np.sqrt(max(before, 0.0))
-                return float(last + (np.sqrt(_LIMIT) - root) / (np.sqrt(gone) - root) * (half - last))
-            last, before, half = half, gone, 1.6 * half
+            point = point._replace(theta=self._with_gap(half, point.theta))
+            point = self.model_held.resume(point, _FEW, without.smoothness)
+            tried.append((half, (point.deviance - without.deviance) / worth))
+            if tried[-1][1] > LIMIT:
+                return step_at_limit(tried)
+            half *= 1.6
         return self.travel
 
     def _reversals(self, point: Point) -> int:
@@ -656,22 +644,10 @@ class _Search:
     def _turns(self, point: Point, experiment: Experiment, size: float) -> int:
         """Changes of sign of the twist between values of at least some size, rad: of flanks, where it is the half gap."""
         ratio = float(experiment.drive.ratio("load"))
-        states = self.model.states(point.theta, point.start, point.smoothness)
+        states = self.model.states(point)
         return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), size) for one in states)
 
 
 def _changes(values: np.ndarray, size: float) -> int:
     """Changes of sign between values of at least some size."""
     return int(np.count_nonzero(np.diff(np.sign(values[np.abs(values) >= size]))))
-
-
-def fitted(model: UnseenLoad) -> Point:
-    """Fit of a model without a gap to be found, from its nominal numbers."""
-    coarse = model.coarse()
-    found = [coarse.followed(coarse.begun(theta, _FOLLOWING[0])) for theta in model.beginnings()]
-    return model.finished(_likeliest(found))
-
-
-def find_gap(model: UnseenLoad) -> Gap:
-    """Fit from many half gaps and without one."""
-    return _Search(model).run()

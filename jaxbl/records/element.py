@@ -14,7 +14,7 @@ blocks of the log to which its size was not fitted.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -167,7 +167,20 @@ class _Rig:
     def half_range(self) -> float:
         return 0.5 * (float(self.position.max()) - float(self.position.min()))
 
-    def compute_columns(self, terms: Sequence[str], shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    @property
+    def fitted_torque(self) -> np.ndarray:
+        return self.torque[self.rows]
+
+    def compute_torque(self, model: "_Model | Element") -> np.ndarray:
+        """Return the torque of a model, N m (N), shape (rows,)."""
+        return self.compute_columns(model.terms, model.shapes) @ model.sizes
+
+    def compute_error(self, model: "_Model | Element") -> tuple[float, float]:
+        """Return the rms torque error of a model, N m (N), and the same over the rms of the torque about its mean."""
+        error = rms(self.fitted_torque - self.compute_torque(model))
+        return error, error / float(np.std(self.fitted_torque))
+
+    def compute_columns(self, terms: Sequence[str], shapes: np.ndarray) -> np.ndarray:
         """Return the torque per unit of stiffness, offset, and sizes of terms in order; shape (rows, linear numbers)."""
         shapes_by_name = dict(zip(_shape_names(terms), shapes, strict=True))
         x = self.position - shapes_by_name.get("centre", 0.0)
@@ -183,7 +196,7 @@ class _Rig:
         if "hysteresis" in terms:
             signals["hysteresis"] = self._compute_hysteresis(deflection, shapes_by_name["length"])
         columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
-        return np.stack([column[rows] for column in columns], axis=1)
+        return np.stack([column[self.rows] for column in columns], axis=1)
 
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
@@ -291,12 +304,11 @@ def _find_reversals(values: np.ndarray, least: float) -> list[int]:
 
 
 class _Model(NamedTuple):
-    """A model on a log: its terms, shapes, linear numbers, and mean square error."""
+    """A model on a log: its terms, shapes, and linear numbers."""
 
     terms: tuple[str, ...]
     shapes: np.ndarray
     sizes: np.ndarray
-    error: float
 
     @property
     def is_possible(self) -> bool:
@@ -378,34 +390,30 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
         "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
     }
 
-    def compute_residual(shapes: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        columns = rig.compute_columns(terms, shapes, rows)
-        return rig.torque[rows] - columns @ _fit_sizes(columns, rig.torque[rows])
+    def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
+        columns = rig.compute_columns(terms, shapes)
+        return rig.fitted_torque - columns @ _fit_sizes(columns, rig.fitted_torque)
 
     shapes = np.empty(0)
     if names:
         low, high = np.array([choices[name][1:] for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
-        few_rows = rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)]
+        few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
         starts = itertools.product(*([near_shapes[name]] if name in near_shapes else choices[name][0] for name in names))
-        starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few_rows) ** 2)))[:3]
+        starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few) ** 2)))[:3]
         inside = low + 1e-9 * half, high - 1e-9 * half
-        solutions = [search(np.clip(np.array(start), *inside), args=(few_rows,)) for start in starts]
+        solutions = [search(np.clip(np.array(start), *inside), args=(few,)) for start in starts]
         best = min(solutions, key=lambda solution: solution.cost)
-        shapes = search(best.x, args=(rig.rows,)).x
-    columns = rig.compute_columns(terms, shapes, rig.rows)
-    sizes = _fit_sizes(columns, rig.torque[rig.rows])
-    return _Model(terms, shapes, sizes, float(np.mean((rig.torque[rig.rows] - columns @ sizes) ** 2)))
+        shapes = search(best.x, args=(rig,)).x
+    return _Model(terms, shapes, _fit_sizes(rig.compute_columns(terms, shapes), rig.fitted_torque))
 
 
 def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
     """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
-    columns, torque = rig.compute_columns(model.terms, model.shapes, rig.rows), rig.torque[rig.rows]
+    columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
     errors = []
     for block in np.array_split(np.arange(len(torque)), _FOLDS):
-        is_fitted = np.ones(len(torque), dtype=bool)
-        is_fitted[block] = False
-        sizes = _fit_sizes(columns[is_fitted], torque[is_fitted])
+        sizes = _fit_sizes(np.delete(columns, block, axis=0), np.delete(torque, block))
         errors.append(float(np.mean((torque[block] - columns[block] @ sizes) ** 2)))
     # rounding, for a log without noise
     return np.array(errors) + 1e-24 * float(np.mean(torque**2))
@@ -433,14 +441,13 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         *_shape_names(model.terms),
     ]
     values = np.concatenate([model.sizes, model.shapes])
-    columns = rig.compute_columns(model.terms, model.shapes, rig.rows)
     slopes, step = [], 1e-4 * rig.half_range
     for offset in step * np.eye(len(model.shapes)):
         ends = model.shapes - offset, model.shapes + offset
-        low, high = (rig.compute_columns(model.terms, shapes, rig.rows) @ model.sizes for shapes in ends)
+        low, high = (rig.compute_torque(model._replace(shapes=shapes)) for shapes in ends)
         slopes.append((high - low) / (2.0 * step))
-    jacobian = np.column_stack([columns, *slopes])
-    residual = rig.torque[rig.rows] - columns @ model.sizes
+    jacobian = np.column_stack([rig.compute_columns(model.terms, model.shapes), *slopes])
+    residual = rig.fitted_torque - rig.compute_torque(model)
     _, errors = fit_with_jackknife(residual + jacobian @ values, jacobian)
     quantile = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
@@ -457,21 +464,10 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         unit = on_a_line(_UNITS[name]) if linear else _UNITS[name]
         numbers[name] = Number(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
-    torque[full_rig.rows] = full_rig.compute_columns(model.terms, model.shapes, full_rig.rows) @ model.sizes
-    spread = float(np.std(rig.torque[rig.rows]))
-    residual_rms = rms(residual)
+    torque[full_rig.rows] = full_rig.compute_torque(model)
     reversals = len(rig.stretches) - sum(rig.begins)
     return Element(
-        numbers,
-        tuple(open_),
-        gains,
-        model.terms,
-        torque,
-        residual_rms,
-        residual_rms / spread,
-        reversals,
-        model.shapes,
-        model.sizes,
+        numbers, tuple(open_), gains, model.terms, torque, *rig.compute_error(model), reversals, model.shapes, model.sizes
     )
 
 
@@ -488,8 +484,4 @@ def element_error(element: Element, log: RigLog) -> tuple[float, float] | None:
     None if the log cannot be fitted.
     """
     rig = _prepare_rig(log)
-    if rig is None:
-        return None
-    residual = rig.torque[rig.rows] - rig.compute_columns(element.terms, element.shapes, rig.rows) @ element.sizes
-    residual_rms = rms(residual)
-    return residual_rms, residual_rms / float(np.std(rig.torque[rig.rows]))
+    return None if rig is None else rig.compute_error(element)

@@ -330,10 +330,11 @@ def _flank_signal(angle: float, velocity: np.ndarray, acceleration: np.ndarray, 
     return np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
 
 
-def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics) -> float:
-    """Return the rms noise and resolution of both encoders together, at the motor, in their unit."""
-    noise = [motor.noise, ratio * load.noise, motor.resolution / 12.0**0.5, ratio * load.resolution / 12.0**0.5]
-    return float(np.hypot.reduce(noise))
+def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics | None) -> float:
+    """Return the rms noise and resolution of both encoders together, or of one, at the motor, in their unit."""
+    encoders = [(1.0, motor)] if load is None else [(1.0, motor), (ratio, load)]
+    noise = [factor * encoder.noise for factor, encoder in encoders]
+    return float(np.hypot.reduce([*noise, *(factor * encoder.resolution / 12.0**0.5 for factor, encoder in encoders)]))
 
 
 def _regress_motor(

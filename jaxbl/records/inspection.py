@@ -162,14 +162,9 @@ def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
     """Return displacement and torque of an element; the noise is that of its readings with their resolution."""
     assert record.torque is not None
     statistics = record.statistics.channels
-    ratio = {"theta_e": 1.0, "theta_s": gear_ratio or 1.0}
-    noise = [
-        (factor * statistics[name].noise, factor * statistics[name].resolution / 12.0**0.5)
-        for name, factor in ratio.items()
-        if name in statistics
-    ]
-    displacement, reading_noise = element_displacement(record, gear_ratio), float(np.hypot.reduce(np.ravel(noise)))
-    return RigLog(displacement, record.torque, record.segments, record.sample_period, reading_noise)
+    noise = twist_noise(gear_ratio or 1.0, statistics["theta_e"], statistics.get("theta_s"))
+    displacement = element_displacement(record, gear_ratio)
+    return RigLog(displacement, record.torque, record.segments, record.sample_period, noise)
 
 
 _ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap"} | SIZE_NAMES
