@@ -9,10 +9,9 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
-# The honest proof and logs read for what they are stand at 402 200 for now: they are done at 400 548.
 CEILINGS = {
-    "all": (402200, 2.43, 3.12, 3.35),
-    "report": (61018, 0.33, 1.19, 0.67),
+    "all": (400107, 2.33, 3.05, 3.33),
+    "report": (61018, 0.25, 1.19, 0.67),
     "diagnosis": (65090, 9.87, 11.77, 11.51),
     "records": (48180, 0.0, 0.0, 0.0),
     "gains": (39326, 0.0, 0.0, 0.0),
