@@ -96,16 +96,3 @@ def take_folds(whole: Comparison, folds: Sequence[Comparison]) -> Comparison:
             rows = np.array_split(np.arange(len(values)), len(folds))[i]
             values[rows] = fold.samples[name][rows]
     return whole.with_samples(samples)
-
-
-def multiply_by_blocks(columns: np.ndarray, count: int) -> np.ndarray:
-    """Products of columns with one another, shape (columns, rows), block by block; shape (blocks, columns, columns)."""
-    return np.stack([block @ block.T for block in np.array_split(columns, count, axis=1)])
-
-
-def solve_products(products: np.ndarray) -> np.ndarray:
-    """Coefficients of all columns but the last, the target, from products; 0 of a column that is 0."""
-    inner, right = products[:-1, :-1], products[:-1, -1]
-    size = np.sqrt(np.diag(inner))
-    size[size <= 0.0] = np.inf
-    return np.linalg.lstsq(inner / np.outer(size, size), right / size, rcond=1e-10)[0] / size

@@ -16,9 +16,8 @@ import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
-from jaxbl.records.least_squares import BLOCKS, jackknife_variance, rms
+from jaxbl.records.least_squares import BlockRegression, rms
 
-from .blocks import multiply_by_blocks, solve_products
 from .diagnosis_task import DiagnosisTask
 from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
@@ -118,7 +117,7 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         for one, at in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
-    products, torque, lost, count = [], np.zeros(len(moved)), np.full(len(moved), np.inf), 1
+    sides, torque, lost, count = [], np.zeros(len(moved)), np.full(len(moved), np.inf), 1
     for i, (side, every_row) in enumerate(now.items()):
         friction, moving = log.lacking_friction(fitted.experiment, side)
         missing, noise = every_row[moving], noises[side][moving]
@@ -131,21 +130,17 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
             lost = np.fmin(lost, np.mean(noise**2) / size**2)
         beside = np.zeros((len(friction) * len(now), len(missing)))
         beside[i * len(friction) : (i + 1) * len(friction)] = friction[:, moving]
-        columns = np.concatenate([slopes, beside, -missing[None]]) / max(rms(every_row), 1e-300)
-        products.append(multiply_by_blocks(columns, BLOCKS))
-    blocks = np.sum(products, axis=0)
-    total = np.sum(blocks, axis=0)
+        size = max(rms(every_row), 1e-300)
+        sides.append(BlockRegression.of(-missing / size, np.concatenate([slopes, beside]).T / size))
+    regression = BlockRegression(np.sum([one.products for one in sides], axis=0), sides[0].counts)
     own = slice(len(moved))
-    change, without = solve_products(total)[own], [solve_products(total - one)[own] for one in blocks]
-    error = np.sqrt(jackknife_variance(without))
+    change, error = regression.fit()[own], regression.errors()[own]
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
-    size = np.sqrt(np.diag(total)[:-1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.linalg.pinv(np.nan_to_num(total[:-1, :-1] / np.outer(size, size)), rcond=1e-10, hermitian=True)
+    inverse, size = np.linalg.pinv(regression.unit_matrix[0], rcond=1e-10, hermitian=True), regression.unit_matrix[1]
     inflation = np.diag(inverse)[own]
-    alone = (size[own] > 0.0) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
+    alone = np.isfinite(size[own]) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 
 

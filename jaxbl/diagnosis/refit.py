@@ -20,7 +20,7 @@ from jaxbl.identification.free_parameters import FreeParameter, set_free_paramet
 from jaxbl.identification.intervals import spread_of
 from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
-from jaxbl.records.least_squares import sum_over_blocks
+from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
@@ -156,14 +156,11 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     Returns:
         Changes, shape (quarters, numbers).
     """
-    _, grams, towards = sum_over_blocks(errors.ravel(), slopes.reshape(errors.size, -1), QUARTERS)
-    whole = grams.sum(axis=0) + prior
+    products = BlockRegression.of(errors.ravel(), slopes.reshape(errors.size, -1), QUARTERS).products
+    whole = products.sum(axis=0)[:-1, :-1] + prior
     # no number moves by more than once its size: beyond that a first order says nothing
     return np.stack(
-        [
-            np.clip(np.linalg.lstsq(whole - gram, by, rcond=None)[0], -1.0, 1.0)
-            for gram, by in zip(grams, towards, strict=True)
-        ]
+        [np.clip(np.linalg.lstsq(whole - part[:-1, :-1], part[:-1, -1], rcond=None)[0], -1.0, 1.0) for part in products]
     )
 
 

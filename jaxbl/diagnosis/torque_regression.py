@@ -15,8 +15,9 @@ from scipy.special import ndtr
 
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.identification.segments import Segment
+from jaxbl.records.least_squares import BlockRegression
 
-from .blocks import SEEN, multiply_by_blocks, solve_products, standard_errors_better
+from .blocks import SEEN, standard_errors_better
 from .candidates import Candidate, Forces, Numbers, are_possible, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .fitted_model import FittedModel
@@ -180,21 +181,17 @@ class _Regression:
             self.places[one] = np.arange(at, at + one.width), (at + one.width if one.offset else -1)
             at += one.width + one.offset
         self.base = np.concatenate([np.arange(0), *(self.places[one][0] for one in base)]).astype(int)
-        self.grams = [
-            multiply_by_blocks(
-                np.concatenate(
-                    [
-                        _with_target(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
-                        for force, segment, residual in zip(forces, log.segments, lacking[side], strict=True)
-                    ],
-                    axis=1,
-                ),
-                _BLOCKS,
-            )
-            for i, side in enumerate(self.sides)
-        ]
-        # each side over its own missing torque
-        self.grams = [one / np.sum(one[:, -1, -1]) for one in self.grams]
+        self.regressions = []
+        for i, side in enumerate(self.sides):
+            pieces = zip(forces, log.segments, lacking[side], strict=True)
+            seen = [
+                _with_target(_on_side(force, i, len(part)), part, left, side, log.bandwidth[side])
+                for force, part, left in pieces
+            ]
+            *columns, target = np.concatenate(seen, axis=1)
+            # each side over its own missing torque
+            size = np.sqrt(np.sum(target**2))
+            self.regressions.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
         self.without = self._crossed(np.array([*range(len(model.names)), *self.base]), -1)[0]
 
     def tried(self, candidate: Candidate) -> _Proposal | None:
@@ -217,18 +214,10 @@ class _Regression:
 
         Columns act on all sides with one coefficient, each side over its own missing torque.
         """
-        index = [*at, *([offset] if offset >= 0 else []), -1]
-        products = [one[:, index][:, :, index] for one in self.grams]
-        if offset >= 0:
-            products = [_less_column(one) for one in products]
-        total = np.sum(products, axis=0)
-        whole = np.sum(total, axis=0)
-        squares: list[list[float]] = [[] for _ in self.sides]
-        for b in range(_BLOCKS):
-            fit = np.append(-solve_products(whole - total[b]), 1.0)
-            for side, one in zip(squares, products, strict=True):
-                side.append(float(fit @ one[b] @ fit))
-        return [np.array(one) for one in squares], solve_products(whole)
+        parts = [one.select(at, [offset] if offset >= 0 else []) for one in self.regressions]
+        both = BlockRegression(np.sum([one.products for one in parts], axis=0), parts[0].counts)
+        fits = both.fit_without_each()
+        return [one.held_out(fits) for one in parts], both.fit()
 
 
 def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
@@ -240,12 +229,3 @@ def _with_target(columns: np.ndarray, segment: Segment, residual: Residual, side
     """Torques as the missing torque of a side is seen, and that torque; shape (columns + 1, rows)."""
     seen = low_passed(as_smoothed(columns, segment.smoothed[side], segment.period), residual, cutoff)
     return np.concatenate([seen, narrowed(residual, cutoff)[0].torque[None]])
-
-
-def _less_column(products: np.ndarray) -> np.ndarray:
-    """Products with the last column but one taken off the last, the target, and left out."""
-    less = products.copy()
-    less[:, -1] -= less[:, -2]
-    less[:, :, -1] -= less[:, :, -2]
-    kept = [*range(less.shape[1] - 2), -1]
-    return less[:, kept][:, :, kept]

@@ -15,7 +15,7 @@ from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.segments import Segment
 from jaxbl.json_types import JsonObject
-from jaxbl.records.least_squares import sum_over_blocks
+from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment, with_effects
 
 from .blocks import QUARTERS, SURE, is_worse, standard_errors_better, take_folds
@@ -205,22 +205,9 @@ class _Fit:
             penalty[at : at + width, at : at + width] += stiffness * second.T @ second
             at += width
         penalty *= np.mean(matrix**2) * len(target)
-        blocks, grams, towards = sum_over_blocks(target, matrix, _BLOCKS)
-        inner, right = np.sum(grams, axis=0), np.sum(towards, axis=0)
-
-        def solve_without(out: Sequence[int] | np.ndarray) -> np.ndarray:
-            share = 1.0 - sum(len(blocks[i]) for i in out) / len(target)
-            return np.linalg.solve(inner - grams[out].sum(axis=0) + share * penalty, right - towards[out].sum(axis=0))
-
-        squares = [np.mean((target[rows] - matrix[rows] @ solve_without([i])) ** 2) for i, rows in enumerate(blocks)]
-        left_out = np.stack([solve_without(part) for part in np.array_split(np.arange(len(blocks)), QUARTERS)])
-        inverse = np.linalg.inv(inner + penalty)
-        values = inverse @ right
-        # scatter of the blocks' gradients: errors within a block are correlated
-        scores = towards - grams @ values
-        scores -= scores.mean(axis=0)
-        covariance = inverse @ (scores.T @ scores * _BLOCKS / (_BLOCKS - 1)) @ inverse
-        return cls(values, np.sqrt(np.diag(covariance)), np.array(squares), left_out)
+        regression = BlockRegression.of(target, matrix, _BLOCKS, penalty)
+        left_out = np.stack([regression.fit(quarter) for quarter in np.array_split(np.arange(_BLOCKS), QUARTERS)])
+        return cls(regression.fit(), regression.errors(), regression.held_out(), left_out)
 
 
 def _numbers(tables: Sequence[Table]) -> JsonObject:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
-from jaxbl.records.least_squares import fit_without_blocks, sum_over_blocks
+from jaxbl.records.least_squares import BlockRegression
 from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
@@ -304,14 +304,8 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
 def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " blocks"]:
     """Power of a torque that its means over ranges of a channel predict, in each block of the log from the other blocks."""
     ranges = np.eye(_BINS)[np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)]
-    blocks, counts, sums = sum_over_blocks(torque, ranges, _BLOCKS)
-    means = fit_without_blocks(counts, sums)
-    return np.array(
-        [
-            np.mean(torque[rows] ** 2 - (torque[rows] - ranges[rows] @ mean) ** 2)
-            for rows, mean in zip(blocks, means, strict=True)
-        ]
-    )
+    left = BlockRegression.of(torque, ranges, _BLOCKS).held_out()
+    return np.array([np.mean(part**2) for part in np.array_split(torque, _BLOCKS)]) - left
 
 
 def shortest(factor: int) -> int:

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .least_squares import (
+    BlockRegression,
     fit_with_jackknife,
-    fit_without_blocks,
     residual_mean_square,
     rms,
     scale_columns,
-    sum_over_blocks,
 )
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .resampling import Grid
@@ -220,19 +219,12 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
         if abs(steps[0]) + abs(steps[1]) * half < 1e-3 * period:
             break
     assert fit is not None and constant is not None
-    gains = np.log(_held_out_errors(*constant[:2]) / _held_out_errors(fit[0], fit[1]))
+    before, after = (BlockRegression.of(target, rows, _FOLDS).held_out() for target, rows, *_ in (constant, fit))
+    gains = np.log(before / after)
     better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
     if not better or abs(drift) < 6.0 * error or abs(drift) * half < 0.05 * period:
         return None
     return Drift(drift, error, skew, abs(drift) * half)
-
-
-def _held_out_errors(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the mean square error on each block of a regression on all other blocks, shape (blocks,)."""
-    scaled = scale_columns(rows)
-    blocks, grams, moments = sum_over_blocks(target, scaled, _FOLDS)
-    fits = zip(blocks, fit_without_blocks(grams, moments), strict=True)
-    return np.array([np.mean((target[block] - scaled[block] @ values) ** 2) for block, values in fits])
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:

@@ -1,6 +1,7 @@
 """Least squares with standard errors that hold for correlated residuals."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,40 +24,89 @@ def scale_columns(columns: np.ndarray) -> np.ndarray:
     return columns / (np.abs(columns).max(axis=0) + 1e-300)
 
 
+@dataclass(frozen=True)
+class BlockRegression:
+    """Least squares of a target on columns, by products over blocks of consecutive rows.
+
+    A block that is left out tells how well the others predict it. How far the coefficients scatter without one block after
+    the other is their standard error, whatever the correlation of the residuals within a block.
+    References: S. Arlot, A. Celisse, A survey of cross-validation procedures, Statistics Surveys 4 (2010), section 8;
+    B. Efron, C. Stein, The jackknife estimate of variance, Annals of Statistics 9 (1981).
+
+    Attributes:
+        products: of the columns and, last, the target with one another, shape (blocks, columns + 1, columns + 1).
+        counts: rows of each block, shape (blocks,).
+        penalty: quadratic form of the coefficients that is added to the sum of squares, shape (columns, columns).
+    """
+
+    products: np.ndarray
+    counts: np.ndarray
+    penalty: np.ndarray | float = 0.0
+
+    @classmethod
+    def of(
+        cls, target: np.ndarray, columns: np.ndarray, blocks: int = BLOCKS, penalty: np.ndarray | float = 0.0
+    ) -> "BlockRegression":
+        """Prepare the regression of a target, shape (rows,), on columns, shape (rows, columns)."""
+        parts = np.array_split(np.column_stack([columns, target]), blocks)
+        return cls(np.array([part.T @ part for part in parts]), np.array([len(part) for part in parts]), penalty)
+
+    def select(self, columns: Sequence[int] | np.ndarray, known: Sequence[int] = ()) -> "BlockRegression":
+        """Keep some columns; those whose coefficient is `known` to be 1 are taken off the target."""
+        index = [*columns, *known, -1]
+        products = self.products[:, index][:, :, index]
+        for column in range(len(columns), len(index) - 1):
+            products[:, -1] -= products[:, column]
+            products[:, :, -1] -= products[:, :, column]
+        chosen = [*range(len(columns)), -1]
+        return BlockRegression(products[:, chosen][:, :, chosen], self.counts)
+
+    def fit(self, left_out: Sequence[int] | np.ndarray = ()) -> np.ndarray:
+        """Fit the coefficients without some blocks; 0 of a column of zeros, the least ones where columns are alike."""
+        total = self.products.sum(axis=0) - self.products[list(left_out)].sum(axis=0)
+        unit, size = _scale_matrix(total[:-1, :-1] + self.penalty)
+        return np.linalg.lstsq(unit, total[:-1, -1] / size, rcond=1e-12)[0] / size
+
+    @property
+    def unit_matrix(self) -> tuple[np.ndarray, np.ndarray]:
+        """Products of the columns over their sizes, and these; infinite of a column of zeros."""
+        return _scale_matrix(self.products.sum(axis=0)[:-1, :-1] + self.penalty)
+
+    def fit_without_each(self) -> np.ndarray:
+        """Fit the coefficients without each of the blocks, shape (blocks, columns)."""
+        return np.array([self.fit([block]) for block in range(len(self.products))])
+
+    def errors(self) -> np.ndarray:
+        """Return the standard errors of the coefficients (delete-a-block jackknife)."""
+        return np.sqrt(jackknife_variance(self.fit_without_each()))
+
+    def held_out(self, without_each: np.ndarray | None = None) -> np.ndarray:
+        """Return the mean squared error on each block by the others' coefficients, or by those given, shape (blocks,)."""
+        fits = self.fit_without_each() if without_each is None else without_each
+        weights = np.column_stack([-fits, np.ones(len(fits))])
+        return np.einsum("bi,bij,bj->b", weights, self.products, weights) / self.counts
+
+
+def _scale_matrix(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide a matrix by the sizes of its columns, the roots of its diagonal; infinite of a column of zeros."""
+    size = np.sqrt(np.diag(matrix))
+    size[size <= 0.0] = np.inf
+    return matrix / np.outer(size, size), size
+
+
 def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit coefficients of regressors, shape (samples, terms), by least squares.
 
     Returns:
-        Coefficients and standard errors (delete-a-block jackknife), shape (terms,); NaN if they are not determined. The
-        errors hold for residuals of any correlation in time.
+        Coefficients and standard errors of :class:`BlockRegression`, shape (terms,); NaN if they are not determined.
     """
-    scale = column_rms(regressors)
-    scale[scale == 0.0] = 1.0
-    scaled = regressors / scale
-    _, grams, moments = sum_over_blocks(target, scaled, BLOCKS)
-    gram, moment = grams.sum(axis=0), moments.sum(axis=0)
-    if np.linalg.cond(gram) > 1e13:
-        return np.full(len(scale), np.nan), np.full(len(scale), np.nan)
-    best = np.linalg.solve(gram, moment)
-    return best / scale, np.sqrt(jackknife_variance(fit_without_blocks(grams, moments))) / scale
+    regression = BlockRegression.of(target, regressors)
+    if not np.linalg.cond(regression.unit_matrix[0]) <= 1e13:
+        return np.full(regressors.shape[1], np.nan), np.full(regressors.shape[1], np.nan)
+    return regression.fit(), regression.errors()
 
 
-def sum_over_blocks(
-    target: np.ndarray, regressors: np.ndarray, count: int
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Return the rows of each of `count` blocks, its normal matrix and its right-hand side."""
-    blocks = np.array_split(np.arange(len(target)), count)
-    grams = np.array([regressors[b].T @ regressors[b] for b in blocks])
-    return blocks, grams, np.array([regressors[b].T @ target[b] for b in blocks])
-
-
-def fit_without_blocks(grams: np.ndarray, moments: np.ndarray) -> list[np.ndarray]:
-    """Fit the coefficients without each of the blocks of :func:`sum_over_blocks`."""
-    matrices, sides = grams.sum(axis=0) - grams, moments.sum(axis=0) - moments
-    return [np.linalg.lstsq(matrix, side, rcond=1e-12)[0] for matrix, side in zip(matrices, sides, strict=True)]
-
-
-def jackknife_variance(without: Sequence[np.ndarray] | Sequence[float]) -> np.ndarray:
+def jackknife_variance(without: np.ndarray | Sequence[float]) -> np.ndarray:
     """Return the variance of estimates, each of them without one of the blocks of a log."""
     deviations = np.array(without) - np.mean(without, axis=0)
     return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
