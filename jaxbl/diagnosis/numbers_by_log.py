@@ -132,7 +132,7 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         beside[i * len(friction) : (i + 1) * len(friction)] = friction[:, moving]
         size = max(rms(every_row), 1e-300)
         sides.append(BlockRegression.of(-missing / size, np.concatenate([slopes, beside]).T / size))
-    regression = BlockRegression(np.sum([one.products for one in sides], axis=0), sides[0].counts)
+    regression = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
     own = slice(len(moved))
     change, error = regression.fit()[own], regression.errors()[own]
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it

@@ -157,10 +157,10 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
         Changes, shape (quarters, numbers).
     """
     products = BlockRegression.of(errors.ravel(), slopes.reshape(errors.size, -1), QUARTERS).products
-    whole = products.sum(axis=0)[:-1, :-1] + prior
+    precision = products.sum(axis=0)[:-1, :-1] + prior
     # no number moves by more than once its size: beyond that a first order says nothing
     return np.stack(
-        [np.clip(np.linalg.lstsq(whole - part[:-1, :-1], part[:-1, -1], rcond=None)[0], -1.0, 1.0) for part in products]
+        [np.clip(np.linalg.lstsq(precision - part[:-1, :-1], part[:-1, -1], rcond=None)[0], -1.0, 1.0) for part in products]
     )
 
 

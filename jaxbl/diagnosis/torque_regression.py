@@ -131,12 +131,12 @@ def _with_one_more(
 
 
 def _less(after: Comparison, before: Comparison) -> bool:
-    """Whether some missing torque has become smaller by a share that matters."""
+    """Tell whether some missing torque has become smaller by a share that matters."""
     return any(after.errors[name] < (1.0 - _GAIN) * value for name, value in before.errors.items() if "torque" in name)
 
 
 def _replaced(name: str, by: str) -> bool:
-    """Whether an effect gives way to another one: its special case, or of the same word at one place."""
+    """Tell whether an effect gives way to another one: its special case, or of the same word at one place."""
     return contains(by, name) or exclusive(by, [name])
 
 
@@ -153,7 +153,7 @@ def _proposals(search: EffectSearch, model: Model, lacking: SideResiduals, log: 
     regression = _Regression(model, lacking, log, base, variants)
     found: dict[str, _Proposal] = {}
     for one in variants:
-        proposal = regression.tried(one)
+        proposal = regression.propose(one)
         if proposal is not None and proposal.gain > (found[one.name].gain if one.name in found else _GAIN):
             found[one.name] = proposal
     return sorted(found.values(), key=lambda one: -one.gain)
@@ -184,22 +184,22 @@ class _Regression:
         self.regressions = []
         for i, side in enumerate(self.sides):
             pieces = zip(forces, log.segments, lacking[side], strict=True)
-            seen = [
-                _with_target(_on_side(force, i, len(part)), part, left, side, log.bandwidth[side])
-                for force, part, left in pieces
+            rows = [
+                _with_target(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
+                for force, segment, residual in pieces
             ]
-            *columns, target = np.concatenate(seen, axis=1)
+            *columns, target = np.concatenate(rows, axis=1)
             # each side over its own missing torque
             size = np.sqrt(np.sum(target**2))
             self.regressions.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
-        self.without = self._crossed(np.array([*range(len(model.names)), *self.base]), -1)[0]
+        self.without = self._cross_validate(np.array([*range(len(model.names)), *self.base]), -1)[0]
 
-    def tried(self, candidate: Candidate) -> _Proposal | None:
-        """A candidate beside the model's effects; None where it is not allowed or not surely better."""
+    def propose(self, candidate: Candidate) -> _Proposal | None:
+        """Try a candidate beside the model's effects; None where it is not allowed or not surely better."""
         columns, offset = self.places[candidate]
         kept = [i for i, name in enumerate(self.names) if not _replaced(name, candidate.name)]
         at = np.array([*columns, *kept, *self.base])
-        squares, values = self._crossed(at, offset)
+        squares, values = self._cross_validate(at, offset)
         gains = np.sum(
             [one / np.mean(one) - new / np.mean(one) for one, new in zip(self.without, squares, strict=True)], axis=0
         )
@@ -209,15 +209,15 @@ class _Regression:
         numbers = candidate.numbers(values[: len(columns)].tolist())
         return None if numbers is None else _Proposal(candidate.name, numbers, 1.0 - float(np.sqrt(ratio)))
 
-    def _crossed(self, at: np.ndarray, offset: int) -> tuple[list[np.ndarray], np.ndarray]:
+    def _cross_validate(self, at: np.ndarray, offset: int) -> tuple[list[np.ndarray], np.ndarray]:
         """Mean squared errors of each block left out, by side, and the coefficients by all blocks.
 
         Columns act on all sides with one coefficient, each side over its own missing torque.
         """
-        parts = [one.select(at, [offset] if offset >= 0 else []) for one in self.regressions]
-        both = BlockRegression(np.sum([one.products for one in parts], axis=0), parts[0].counts)
-        fits = both.fit_without_each()
-        return [one.held_out(fits) for one in parts], both.fit()
+        sides = [side.select(at, [offset] if offset >= 0 else []) for side in self.regressions]
+        joined = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
+        fits = joined.fit_without_each()
+        return [side.held_out(fits) for side in sides], joined.fit()
 
 
 def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:

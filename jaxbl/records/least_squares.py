@@ -51,9 +51,9 @@ class BlockRegression:
         parts = np.array_split(np.column_stack([columns, target]), blocks)
         return cls(np.array([part.T @ part for part in parts]), np.array([len(part) for part in parts]), penalty)
 
-    def select(self, columns: Sequence[int] | np.ndarray, known: Sequence[int] = ()) -> "BlockRegression":
-        """Keep some columns; those whose coefficient is `known` to be 1 are taken off the target."""
-        index = [*columns, *known, -1]
+    def select(self, columns: Sequence[int] | np.ndarray, fixed: Sequence[int] = ()) -> "BlockRegression":
+        """Keep some columns; those whose coefficient is `fixed` at 1 are taken off the target."""
+        index = [*columns, *fixed, -1]
         products = self.products[:, index][:, :, index]
         for column in range(len(columns), len(index) - 1):
             products[:, -1] -= products[:, column]
