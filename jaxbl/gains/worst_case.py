@@ -155,17 +155,20 @@ def _march(
     return jax.tree.map(partial(jnp.where, has_event), _runge_kutta(slope, state, h), state), has_event
 
 
-def least_lambda_simulated(alpha: Values, f_plus: Values, *, damping: Values | float = 0.0) -> Values:
-    """Return the least lambda (rad^0.5/s) at which an error of 1 rad/s shrinks in the simulated worst case.
+def least_lambda_simulated(
+    alpha: Values, f_plus: Values, *, damping: Values | float = 0.0, speed: Values | float = 1.0
+) -> Values:
+    """Return the least lambda (rad^0.5/s) at which an error of this speed (rad/s) shrinks in the simulated worst case.
 
     It is found by bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f). It is 0 if damping alone is enough, and
     `inf` if no lambda up to 4 sqrt(alpha + f) is.
     """
-    alpha, f_plus, damping = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping)))
+    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
+    alpha, f_plus, damping, speed = arguments
     high = 4.0 * jnp.sqrt(alpha + f_plus)
 
     def shrinks(lambda_: Values) -> Values:
-        return half_cycle(lambda_, alpha, f_plus, damping=damping).ratio < 1.0
+        return half_cycle(lambda_, alpha, f_plus, damping=damping, speed=speed).ratio < 1.0
 
     low, least_lambda = bisect(shrinks, high, _HALVINGS)
     least_lambda = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(least_lambda)), 0.0, least_lambda), least_lambda)

@@ -219,7 +219,11 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
         if abs(steps[0]) + abs(steps[1]) * half < 1e-3 * period:
             break
     assert fit is not None and constant is not None
-    before, after = (BlockRegression.of(target, rows, _FOLDS).held_out() for target, rows, *_ in (constant, fit))
+    # of what a fit leaves, since squares of a position hide those of its errors
+    before, after = (
+        BlockRegression.of(target - rows @ np.nan_to_num(values), rows, _FOLDS).held_out()
+        for target, rows, values, *_ in (constant, fit)
+    )
     gains = np.log(before / after)
     better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
     if not better or abs(drift) < 6.0 * error or abs(drift) * half < 0.05 * period:

@@ -84,7 +84,9 @@ class BlockRegression:
         """Return the mean squared error on each block by the others' coefficients, or by those given, shape (blocks,)."""
         fits = self.fit_without_each() if without_each is None else without_each
         weights = np.column_stack([-fits, np.ones(len(fits))])
-        return np.einsum("bi,bij,bj->b", weights, self.products, weights) / self.counts
+        squares = np.einsum("bi,bij,bj->b", weights, self.products, weights) / self.counts
+        # squares below zero are rounding
+        return np.maximum(squares, np.finfo(float).tiny)
 
 
 def _scale_matrix(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
