@@ -148,7 +148,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         tables = choice.tabulate(chosen, lacking_after)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         values = free_values(setup.own, fitted.theta) | gain_values
-        model = extended_study(task.config, fitted.numbers, values, tables.effects() if tables else ())
+        model = extended_study(task.config, fitted.numbers, values, task.record, tables.effects() if tables else ())
         done()
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
@@ -181,7 +181,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             better = standard_errors_better(proof.log, proof.after, with_tables)
             summary["torque_tables"] = tables.summarise(with_tables.errors, better)
         if chosen.found.wrong is not None:
-            summary["rival"] = rival_tables(task.config, setup.own, chosen.found.wrong)
+            summary["rival"] = rival_tables(task.config, task.record, setup.own, chosen.found.wrong)
         done()
     pairs = {
         side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]

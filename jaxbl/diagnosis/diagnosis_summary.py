@@ -15,11 +15,12 @@ from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
 from jaxbl.identification.free_parameters import FreeParameter
+from jaxbl.identification.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
-from .candidates import EffectNumbers
+from .candidates import EffectNumbers, are_possible
 from .choice import Chosen
 from .diagnosis_task import input_rms
 from .effect_search import Finding, Model
@@ -193,10 +194,14 @@ def extended_study(
     config: Config,
     numbers: EffectNumbers,
     values: Numbers,
+    record: Record,
     tables: Sequence[JsonObject] = (),
 ) -> Config:
-    """The study with effects more, some of them tables of torques, and with these numbers."""
+    """The study with effects more, some of them tables of torques, and with these numbers; at the log's period where
+    effects cannot be simulated at its own (a dead time of more samples than a model remembers)."""
     data = config.to_dict()
+    if not are_possible(numbers, config.run.sample_period):
+        data["run"] = data.get("run", {}) | run_of(config, record)
     added = [*({"kind": name, **one} for name, one in numbers.items()), *tables]
     data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
     return with_values(read_config(data), values)
@@ -210,9 +215,9 @@ def tied(summary: JsonObject) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def rival_tables(config: Config, own: Sequence[FreeParameter], rival: Model) -> JsonObject:
+def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Model) -> JsonObject:
     """The best model with another effect, as tables of a study."""
-    data = extended_study(config, rival.numbers, free_values(own, rival.theta)).to_dict()
+    data = extended_study(config, rival.numbers, free_values(own, rival.theta), record).to_dict()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
 
 

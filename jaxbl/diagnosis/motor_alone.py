@@ -169,7 +169,8 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     held_out = task.holdout.open()
     summary = _summary(task, held_out, search, alone, gains, out) | {"history": [step._asdict() for step in history]}
     numbers = {name: _numbers(search, alone, name) for name in search.effects if name not in out}
-    study = extended_study(task.config, numbers, {number.path: alone.values[number.path] for number in search.own})
+    own = {number.path: alone.values[number.path] for number in search.own}
+    study = extended_study(task.config, numbers, own, task.record)
     done()
     return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)), held_out)
 
