@@ -138,8 +138,8 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
-    inverse, size = np.linalg.pinv(regression.unit_matrix[0], rcond=1e-10, hermitian=True), regression.unit_matrix[1]
-    inflation = np.diag(inverse)[own]
+    unit, size = regression.unit_matrix
+    inflation = np.diag(np.linalg.pinv(unit, rcond=1e-10, hermitian=True))[own]
     alone = np.isfinite(size[own]) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 

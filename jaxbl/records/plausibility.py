@@ -273,7 +273,7 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
     power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
     if power_ratio is not None and power_ratio >= _DOUBTFUL_FRICTION:
-        power_ratio = viscous / nominal_viscous if shows_viscous else None
+        power_ratio = max(viscous / nominal_viscous, 1.0) if shows_viscous else None
     has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
     sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
     text, ratio, doubtful_ratio, sure_ratio = "", 1.0, math.inf, math.inf
@@ -298,8 +298,9 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < sure_ratio)
     if power_ratio is not None and not has_usual_friction and not is_doubtful:
         text = (
-            f"friction takes {friction_power:.3g} W, but for dry friction {power_ratio:.3g} times what the nominal viscous "
-            "friction would"
+            f"friction takes {friction_power:.3g} W, in what is viscous {power_ratio:.3g} times the nominal"
+            if power_ratio > 1.0
+            else f"friction takes {friction_power:.3g} W, {power_ratio:.3g} times what the nominal viscous friction would"
         )
         # the nominal friction may be wrong, so this alone is not sure
         is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio

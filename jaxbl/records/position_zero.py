@@ -185,11 +185,13 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     rows_in_segments = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))
     speed = np.abs(rows_in_segments.columns[:, 1])
     rows = speed > MIN_SPEED_SHARE * rms(speed)
+    if np.sum(rows) <= _MIN_ROWS:
+        return None
     moving_rows = _MovingRows(*(columns_of_rows[rows] for columns_of_rows in rows_in_segments))
     if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
         # in one direction the sign of the velocity is a constant
         moving_rows.columns[:, 2] = 1.0
-    return moving_rows if len(moving_rows.torque) > _MIN_ROWS else None
+    return moving_rows
 
 
 def _parabola_minimum(squares: np.ndarray) -> float:

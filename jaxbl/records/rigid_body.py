@@ -88,10 +88,10 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
     if not targets:
         return None
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
-    if np.ptp(target) == 0.0:
-        return None
     # what holds a drive at rest is no function of its motion
     moves = np.abs(rows[:, 1]) > MIN_SPEED_SHARE * rms(rows[:, 1])
+    if not moves.any() or np.ptp(target[moves]) == 0.0:
+        return None
     coefficients, errors = fit_with_jackknife(target[moves], rows[moves])
     if not np.isfinite(coefficients).all():
         # two terms are proportional to each other

@@ -85,3 +85,8 @@ def test_the_smallest_of_equal_places_is_taken():
 )
 def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
     assert find_zero_shift(first, second) is None
+
+
+def test_a_log_that_stands_still_is_not_turned():
+    still = simulate_turning_log(2, 0.4)._replace(motor=np.full(8000, 0.4))
+    assert find_zero_shift(simulate_turning_log(1, 0.0), still) is None
