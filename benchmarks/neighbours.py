@@ -1,13 +1,15 @@
 """Neighbours of logs that were once read wrongly: ten machines of each kind, and the truth beside them.
 
     python benchmarks/neighbours.py                       # all kinds, ten of each
-    python benchmarks/neighbours.py --kind slow_turn --count 3 --seed 2
+    python benchmarks/neighbours.py --kind zeros --count 3 --seed 2
 
 - contradiction: three logs of one pendulum whose model lacks the dry friction: they do not contradict each other;
 - wrong_units: a slow drive with dry friction in the model: nothing is said of units or a friction that is off;
 - refused: a model without the friction or the gravity that moves the machine: the diagnosis begins;
 - late: a current loop with a lag of some samples: the diagnosis ends, and names it;
-- deaf: slow turns forth and back in closed loop: the diagnosis ends, and names the friction and the cogging.
+- deaf: slow turns forth and back in closed loop: the diagnosis ends, and names the friction and the cogging;
+- zeros: two logs of a drive with cogging that count from other zeros: the second is turned to the zero of the first by less
+  than a hundredth of a period from the truth, and the diagnosis names the cogging.
 Needs numba (the extra `bench`); an hour of one core.
 """
 
@@ -157,12 +159,35 @@ def try_deaf(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
     return _answer(machine, paths[:1], paths[1])
 
 
+def try_zeros(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
+    from jaxbl.config import read_model
+    from jaxbl.identification.logs import read_with_holdout
+
+    period = 2e-3
+    waves = float(rng.choice([3, 5, 6, 7, 12, 14, 18, 24, 36]))
+    machine = draw_machine(rng, period, amplitude=_between(rng, 0.3, 1.0))
+    machine = machine._replace(lacking=("motor.coulomb_friction", "motor.cogging"))
+    shift, phase = float(rng.uniform(-3.0, 3.0)), float(rng.uniform(-3.0, 3.0))
+    paths = []
+    # a zero elsewhere is another phase
+    for i, (name, added) in enumerate((("log", 0.0), ("holdout", waves * shift))):
+        axis = Axis(**(vars(machine.axis) | {"waves": waves, "phase": phase + added}))
+        rates = wave(_between(rng, 4.0, 12.0), 20.0, float(rng.uniform(0.1, 0.3)), period)
+        paths.append(write_log(machine._replace(axis=axis), rates, folder / f"{name}.csv", i))
+    found = read_with_holdout(read_model(machine.model)[0], *paths)[1].corrections.get("zero", 0.0)
+    # shifts by a period are one
+    error = math.remainder((found - shift) * waves, 2.0 * math.pi) / (2.0 * math.pi)
+    right, text = _answer(machine, paths[:1], paths[1])
+    return right and abs(error) < 0.01, f"{waves:.0f} waves, zero off by {100.0 * error:.2f} % of a period; {text}"
+
+
 KINDS: dict[str, Callable[[np.random.Generator, Path], tuple[bool, str]]] = {
     "contradiction": try_contradiction,
     "wrong_units": try_wrong_units,
     "refused": try_refused,
     "late": try_late,
     "deaf": try_deaf,
+    "zeros": try_zeros,
 }
 
 

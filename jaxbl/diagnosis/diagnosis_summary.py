@@ -218,7 +218,9 @@ def tied(summary: JsonObject) -> tuple[str, str] | None:
 def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Model) -> JsonObject:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.numbers, free_values(own, rival.theta), record).to_dict()
-    return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
+    return {"effect": rival.names[-1]} | {
+        key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data
+    }
 
 
 def trace_of(

@@ -184,8 +184,8 @@ def next_experiment(
         torque: largest that is allowed, N m; left out: that of the log.
         travel: of the motor that is allowed, rad (the load may move as far over the gear); left out: those of the log.
     """
-    rival = summary["rival"]
-    data = model.to_dict() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
+    data = model.to_dict() | summary["rival"]
+    del data["effect"]
     with jax.enable_x64(True):
         models = [on_record(each, record) for each in (model, read_config(data))]
         return _parting(models, record, torque, travel)

@@ -88,14 +88,18 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
 
 def _exchange_acceleration(rows: "_MovingRows") -> "_MovingRows":
     """Exchange torque and acceleration: under a constant torque the acceleration shows what repeats with the turn."""
-    return rows._replace(torque=rows.columns[:, 0], columns=np.hstack([rows.torque[:, None], rows.columns[:, 1:]]))
+    return rows._replace(torque=rows.columns[:, 0], columns=np.column_stack([rows.torque, rows.columns[:, 1:]]))
 
 
 def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int) -> ZeroShift | None:
     """Find the shift of the second rows by the waves of the first, which are of `lowest_wave` periods a turn and more."""
-    # a column that does not vary is a constant
-    varies = np.ptp(first_rows.columns, axis=0) > 1e-6 * column_rms(first_rows.columns)
-    motion = np.hstack([first_rows.columns[:, varies], np.ones((len(first_rows.torque), 1))])
+    # a column that does not vary is a constant, and a torque that does not vary shows no waves
+    columns = np.column_stack([first_rows.torque, first_rows.columns])
+    varies = np.ptp(columns, axis=0) > 1e-6 * column_rms(columns)
+    if not varies[0]:
+        return None
+    varies = varies[1:]
+    motion = np.column_stack([first_rows.columns[:, varies], np.ones(len(first_rows.torque))])
     waves, values = _find_waves(first_rows, motion, lowest_wave - 1)
     if not waves:
         return None
@@ -106,8 +110,8 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     turns = np.exp(1j * harmonics[:, None] * shifts) * size[:, None]
     # what the motion takes is known by the first log, but for constants
     torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1] - 1]
-    signals = np.hstack([torque[:, None], rows.cosine[:, waves] @ turns.real - rows.sine[:, waves] @ turns.imag])
-    constants = np.hstack([rows.columns[:, ~varies], np.ones((len(signals), 1))])
+    signals = np.column_stack([torque, rows.cosine[:, waves] @ turns.real - rows.sine[:, waves] @ turns.imag])
+    constants = np.column_stack([rows.columns[:, ~varies], np.ones(len(signals))])
     residuals = signals - constants @ np.linalg.lstsq(constants, signals, rcond=1e-10)[0]
     blocks = np.array_split(np.arange(len(signals)), BLOCKS)
     squares_without_waves = np.array([np.sum(residuals[block, 0] ** 2) for block in blocks])
@@ -149,9 +153,9 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
         basis = np.linalg.qr(columns)[0]
         parts = (rows.torque[:, None], rows.cosine[:, lowest:], rows.sine[:, lowest:])
         torque, cosine, sine = (part - basis @ (basis.T @ part) for part in parts)
-        pairs = [np.linalg.qr(np.stack(pair, axis=1))[0] for pair in zip(cosine.T, sine.T, strict=True)]
+        pairs = [np.linalg.qr(np.column_stack(pair))[0] for pair in zip(cosine.T, sine.T, strict=True)]
         wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
-        columns = np.hstack([columns, rows.cosine[:, [wave]], rows.sine[:, [wave]]])
+        columns = np.column_stack([columns, rows.cosine[:, wave], rows.sine[:, wave]])
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_WAVE_ERRORS:
             break
@@ -179,7 +183,7 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
         )
         held = log.torque[s]
         torque = low_pass(0.5 * (np.append(held[:1], held[:-1]) + held), cutoff, log.period)[rows]
-        parts.append((torque, np.stack(columns, axis=1)[rows], cosine, sine))
+        parts.append((torque, np.column_stack(columns)[rows], cosine, sine))
     if not parts:
         return None
     rows_in_segments = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))

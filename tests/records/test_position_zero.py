@@ -90,3 +90,8 @@ def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
 def test_a_log_that_stands_still_is_not_turned():
     still = simulate_turning_log(2, 0.4)._replace(motor=np.full(8000, 0.4))
     assert find_zero_shift(simulate_turning_log(1, 0.0), still) is None
+
+
+def test_a_machine_without_a_drive_shows_no_torques_over_the_turn():
+    first, second = (simulate_turning_log(seed, zero)._replace(torque=np.zeros(8000)) for seed, zero in ((1, 0.0), (2, 0.4)))
+    assert find_zero_shift(first, second) is None
