@@ -8,7 +8,7 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 import equinox as eqx
@@ -97,6 +97,23 @@ def are_possible(effects: EffectNumbers, period: float) -> bool:
         EFFECTS[name].possible(numbers) and not EFFECTS[name].find_fault(numbers, period)
         for name, numbers in effects.items()
     )
+
+
+def replaces(by: str, name: str) -> bool:
+    """Tell whether an effect gives way to another one: its special case, or of the same word at one place."""
+    return contains(by, name) or exclusive(by, [name])
+
+
+def exclusive(name: str, others: Iterable[str]) -> bool:
+    """Whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
+    word, place = EFFECTS[name].exclusive, name.partition(".")[0]
+    return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
+
+
+def contains(general: str, name: str) -> bool:
+    """Whether an effect has another one at the same place as its special case."""
+    place, _, kind = name.partition(".")
+    return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
 
 
 SHARE = 0.3

@@ -22,7 +22,7 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
 from .blocks import standard_errors_better
-from .choice import Choice, Chosen, explain
+from .choice import Choice, Chosen
 from .confidence import explained_share
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import (
@@ -37,7 +37,6 @@ from .diagnosis_summary import (
 )
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .fitted_model import free_values
-from .history import Step
 from .judgement import judge
 from .localise import SIGNIFICANT, Localised, localise
 from .motor_alone import diagnose_alone
@@ -106,8 +105,8 @@ def diagnose(log: Logs, model: ConfigSource, *, holdout: Logs | None = None) -> 
     return run_diagnosis(read_diagnosis_task(log, model, holdout=holdout))
 
 
-_STAGES, _STAGES_ALONE = 6, 3
-"""Set-up, search, choice, proof, observers, summary; from the motor alone fit, effects, proof."""
+_STAGES, _STAGES_ALONE = 5, 3
+"""Set-up, search, proof, observers, summary; from the motor alone fit, effects, proof."""
 
 
 def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diagnosis:
@@ -134,14 +133,11 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         setup = set_up(task)
         done()
         announce("comparing effects")
-        history: list[Step] = []
-        search, found = explain(setup, history)
-        if found.verdict == "no_discrepancy":
-            _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())
+        choice = Choice(setup)
+        chosen = choice.choose()
+        if chosen.verdict == "no_discrepancy":
+            _check_shown(setup, choice.search.fits.given.shown())
         done()
-        announce("choosing by blocks of the log")
-        choice = Choice(setup, history)
-        chosen = choice.choose(search, found)
         fitted, lacking_after = chosen.fitted, residual_torques(chosen.fitted.experiment, setup.fitted.segments)
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
@@ -154,7 +150,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         announce("testing on held-out data")
         proof = prove(setup, chosen)
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
-        apart = contradictions(task, fitted, setup.fitted, chosen.found.model.linear.drive)
+        apart = contradictions(task, fitted, setup.fitted, chosen.driving)
         judgement = judge(chosen, proof, setup.prior, share, bool(apart))
         done()
         announce("running the observers")
@@ -164,7 +160,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = _observed(setup, proof, observing)
         trace = trace_of(setup, proof, missing, observed)
         done()
-        summary = summary_of(setup, chosen, history) | {"verdict": judgement.verdict, "explained_share": share}
+        summary = summary_of(setup, chosen, choice.history) | {"verdict": judgement.verdict, "explained_share": share}
         about, notes = observers_say(observing, observed[0], setup)
         for side, witness in about.items():
             summary["where"][side]["observed"] = witness
@@ -180,8 +176,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             with_tables = proof.log.compare(tables.experiment)
             better = standard_errors_better(proof.log, proof.after, with_tables)
             summary["torque_tables"] = tables.summarise(with_tables.errors, better)
-        if chosen.found.wrong is not None:
-            summary["rival"] = rival_tables(task.config, task.record, setup.own, chosen.found.wrong)
+        if chosen.rival is not None:
+            summary["rival"] = rival_tables(task.config, task.record, setup.own, chosen.rival)
         done()
     pairs = {
         side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]
@@ -202,7 +198,7 @@ def _missing(
     fitted = chosen.fitted
     others = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
     if chosen.rival is not None:
-        others[f"missing_with.{chosen.rival.effect}"] = chosen.rival.experiment
+        others[f"missing_with.{chosen.rival.effect}"] = chosen.rival.fitted.experiment
     after = lacking_after, proof.after.torques
     found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
     for name, experiment in others.items():

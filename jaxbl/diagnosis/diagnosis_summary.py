@@ -21,9 +21,9 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .candidates import EffectNumbers, are_possible
-from .choice import Chosen
+from .choice import Chosen, Rival
+from .confidence import Finding
 from .diagnosis_task import input_rms
-from .effect_search import Finding, Model
 from .fitted_model import FittedModel, free_values
 from .history import Step
 from .judgement import Judgement
@@ -46,19 +46,15 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
-    notes += [
-        f"{name} was found, and withdrawn: by blocks of the log the model is not surely better with it."
-        for name in chosen.withdrawn
-    ]
     if chosen.by_torque > 0.0:
         notes.append(
             "The model is not complete: its numbers are those of least missing torque. By blocks of the log they are better "
             f"than those of least prediction errors by {chosen.by_torque:.1f} standard errors."
         )
-    for one in found.findings:
+    for one in chosen.findings:
         if task.separate and EFFECTS[one.effect].in_time:
             notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
-    if found.verdict == "no_discrepancy":
+    if chosen.verdict == "no_discrepancy":
         for side, one in located.items():
             least, unit = (
                 SIGNIFICANT * one.coordinates["all"].regions[0].mean_error,
@@ -79,15 +75,15 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
         "findings": sorted(
             (
                 describe_finding(record, one, values, errors, where)
-                | {"share": fitted.share(one.effect), "z": chosen.gains.get(one.effect)}
-                for one in found.findings
+                | {"share": fitted.share(one.effect), "z": found.gains[one.effect].standard_errors}
+                for one in chosen.findings
             ),
             key=lambda one: -one["share"],
         ),
         "parameters": describe_parameters(record, setup.own, values, errors),
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
-        "withdrawn": list(chosen.withdrawn),
+        "withdrawn": [],
         "history": [step._asdict() for step in history],
         "notes": notes,
     }
@@ -215,10 +211,10 @@ def tied(summary: JsonObject) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Model) -> JsonObject:
+def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Rival) -> JsonObject:
     """The best model with another effect, as tables of a study."""
-    data = extended_study(config, rival.numbers, free_values(own, rival.theta), record).to_dict()
-    return {"effect": rival.names[-1]} | {
+    data = extended_study(config, rival.fitted.numbers, free_values(own, rival.fitted.theta), record).to_dict()
+    return {"effect": rival.effect, "instead_of": rival.instead_of} | {
         key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data
     }
 

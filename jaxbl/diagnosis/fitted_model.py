@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves, units_of
+from jaxbl.fused import Arrays
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.identification.logs import arrays
 from jaxbl.simulate import Experiment
@@ -15,6 +16,20 @@ from .linearised_model import Linear
 
 _LEAST_LEFT = 0.05
 """Share of a positive number that is left of it at least where it is moved."""
+
+
+class FitEnd(NamedTuple):
+    """Where a fit of prediction errors ended.
+
+    Attributes:
+        own: theta of the model's own numbers.
+        start: initial positions and velocities of each segment.
+        cost: minus twice the log-likelihood, with the prior.
+    """
+
+    own: np.ndarray
+    start: Arrays
+    cost: float
 
 
 class FittedModel(NamedTuple):
@@ -29,7 +44,12 @@ class FittedModel(NamedTuple):
         white: the same if prediction errors are white, as those of a complete model.
         linear: the model along the log; of the model as given, with its own numbers fitted.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
-        log_likelihood: nats, with the numbers' prior; only differences count.
+        log_likelihood: nats; only differences count.
+        log_prior: nats that the effects cost before the log is seen: their odds, and the widths of their numbers.
+        log_evidence: nats, by Laplace's method (D. MacKay, Neural Computation 4, 1992); only differences count.
+        foretold: prediction errors, each quarter by numbers fitted without it, rad, shape (samples, sides).
+        coloured: what the logarithm of the likelihood is more if the errors may have any spectrum, nats.
+        end: where the fit ended: another one begins there.
     """
 
     names: tuple[str, ...]
@@ -41,10 +61,15 @@ class FittedModel(NamedTuple):
     linear: Linear
     left_out: np.ndarray | None = None
     log_likelihood: float = np.nan
+    log_prior: float = 0.0
+    log_evidence: float = -np.inf
+    foretold: np.ndarray | None = None
+    coloured: float = 0.0
+    end: "FitEnd | None" = None
 
     def share(self, name: str) -> float:
         """Torque of an effect along the log, rms over the driving torque's."""
-        return self.linear.share(name)
+        return self.linear.torque_share(get_leaf(self.experiment, f"effects.{name}"))
 
     @property
     def numbers(self) -> dict[str, Numbers]:

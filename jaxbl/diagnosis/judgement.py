@@ -47,9 +47,9 @@ def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, 
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
     tested = [name for name in fitted.names if name not in untested]
     chance = bool(tested) and any(control.kind == "permuted" and control.z < SURE for control in proof.controls)
-    little, remainder = bool(tested) and is_little(share), chosen.found.verdict == "unknown_effect"
+    little, remainder = bool(tested) and is_little(share), chosen.verdict == "unknown_effect"
     against = proof.failed or far or chance or proof.worse or little or contradicting or remainder
-    verdict = "unknown_effect" if against else "not_tested" if untested or not proof.has_power else chosen.found.verdict
+    verdict = "unknown_effect" if against else "not_tested" if untested or not proof.has_power else chosen.verdict
     torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
     reasons = {"chance": chance, "remainder": remainder, "worse": proof.worse, "little": little}
     tested_by = {"level": LEVEL, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}

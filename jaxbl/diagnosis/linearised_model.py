@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbl.drive.effects import EFFECTS, Scales
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Arrays, Leaves
@@ -208,6 +208,10 @@ _FREQUENCIES, _COARSE = 8, 16
 """Peaks of the spectrum that are tried; frequencies at which the response to a torque is computed, smooth in between."""
 _LEAST_PERIODS = 3.0
 """Of a periodic torque in a log: with fewer it is a constant or a drift."""
+_LEAST_WAVES = 1.5
+"""Periods of a torque over the position that a log has to cover: over less it does not repeat."""
+_MOST_WAVES, _PLACES = 400, 8192
+"""Periods a turn that are tried at most: more than poles times slots of most motors. Places of a turn, told apart."""
 _HIGHEST = 50.0
 """Hz: a torque of a higher frequency hardly moves a drive."""
 _NO_INPUT = 1e-3
@@ -339,14 +343,19 @@ class Linear:
     def scales(self, name: str) -> Scales:
         """How large things are on the record, as an effect sees them; frequencies are sought anew each time."""
         place = self.experiment.drive.resolve_place(name.partition(".")[0])
-        if place not in self._scales:
-            self._scales[place] = self._scales_at(place)
-        found = self._scales[place]
-        if any(role.kind == "frequency" for role in EFFECTS[name].roles().values()):
+        found, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
+        if "frequency" in kinds:
             found = found._replace(frequencies=tuple(self.frequencies(place)))
+        if "harmonic" in kinds and place in self.sides:
+            found = found._replace(waves=tuple(self.waves(place)))
         return found
 
     def _scales_at(self, place: str) -> Scales:
+        if place not in self._scales:
+            self._scales[place] = self._measure_scales(place)
+        return self._scales[place]
+
+    def _measure_scales(self, place: str) -> Scales:
         def joined(of) -> np.ndarray:
             return np.concatenate([np.asarray(of(one.part))[one.real] for one in self.signals])
 
@@ -366,6 +375,7 @@ class Linear:
             travel=float(np.ptp(position)),
             ratio=ratio,
             harmonics=self._harmonics(side),
+            wave_count=self._wave_count(side),
         )
 
     def _harmonics(self, side: str) -> tuple[float, ...]:
@@ -385,7 +395,7 @@ class Linear:
             if role.kind == "frequency":
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
-                log = self.scales(name)
+                log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
                 count *= max(len(role.trials(log)) if role.trial_count is None else role.trial_count(log), 1)
         return float(np.log(count))
 
@@ -448,40 +458,53 @@ class Linear:
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
     def frequencies(self, place: str) -> list[float]:
-        """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
+        """Frequencies (Hz) at which a disturbance of a side explains most, of the longest part."""
+        i = int(np.argmax([one.samples for one in self.signals]))
+        span, top = self.signals[i].samples * self.period, self._highest
+        few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
+        slope, power = self._answer(i, place, few, 2.0 * np.pi * np.asarray(self.parts[i].time))
+        size = 4 * 2 ** int(np.ceil(np.log2(len(slope))))
+        frequency = np.fft.rfftfreq(size, self.period)
+        inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
+        return _peaks(frequency, np.abs(np.fft.rfft(slope, size)) ** 2, few, power, inside, 1.0 / span)
 
-        Of the longest part, under what the last call of :meth:`choose` chose, and at what it left over.
-        """
+    def waves(self, place: str) -> list[float]:
+        """Periods a turn at which a torque over the position of a side explains most."""
+        count = self._wave_count(place)
+        few = np.unique(np.round(np.geomspace(1.0, max(count, 2), _COARSE)))
+        by_place, power = np.zeros(_PLACES), np.zeros(len(few))
+        for i, signals in enumerate(self.signals):
+            position = np.asarray(signals.part.position[place])
+            slope, more = self._answer(i, place, few, position)
+            where = np.mod(position[: len(slope)] / (2.0 * np.pi), 1.0) * _PLACES
+            by_place += np.bincount(np.minimum(where.astype(int), _PLACES - 1), slope, _PLACES)
+            power += more
+        number = np.arange(_PLACES // 2 + 1.0)
+        inside = (number * self._scales[place].travel >= _LEAST_WAVES * 2.0 * np.pi) & (number <= count)
+        return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 0.0)
+
+    def _wave_count(self, place: str) -> int:
+        """Number of waves a turn that samples still tell apart where the side moves as fast as in a quarter of the log."""
+        speed = np.concatenate([np.abs(np.asarray(one.part.velocity[place]))[one.real] for one in self.signals])
+        return int(np.clip(0.5 * np.pi / max(float(np.quantile(speed, 0.25)) * self.period, 1e-9), 1, _MOST_WAVES))
+
+    def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What a torque on a side does to the prediction errors of a part, under what the last call of :meth:`choose`
+        chose, at what it left over: their derivative by the torque at each sample, shape (samples,); and the power of the
+        response to waves of `few` periods along a `phase`, shape (waves,)."""
         assert self._last is not None
-        i = int(np.argmax([one.real.sum() for one in self.signals]))
         part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), predictor.deviation
         if not np.isfinite(deviation).all():
             # no predictor follows this model
-            return []
+            return np.zeros(self.signals[i].samples), np.ones(len(few))
         left = _errors(part, gain, forces[i]) @ predictor.coefficients[i]
-        time, real = np.asarray(part.time), int(self.signals[i].real.sum())
-        span, top = real * self.period, self._highest
-        few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
-        phase = 2.0 * np.pi * few[:, None] * time[None, :]
-        waves = Forces([{side: np.concatenate([np.sin(phase), np.cos(phase)])}])
+        along = few[:, None] * phase[None, :]
+        waves = Forces([{side: np.concatenate([np.sin(along), np.cos(along)])}])
         responses = _errors(part, gain, waves)[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
-        slope = _gradient(part, gain, left / deviation[None, :] ** 2)[:real, side]
-        size = 4 * 2 ** int(np.ceil(np.log2(real)))
-        frequency = np.fft.rfftfreq(size, self.period)
-        inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
-        expected = np.exp(np.interp(np.log(np.maximum(frequency, 1e-9)), np.log(few), np.log(power)))
-        score = np.where(inside, np.abs(np.fft.rfft(slope, size)) ** 2 / expected, 0.0)
-        peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
-        found: list[float] = []
-        for k in peaks[np.argsort(-score[peaks])]:
-            if all(abs(frequency[k] - known) > 1.0 / span for known in found):
-                found.append(float(frequency[k]))
-            if len(found) == _FREQUENCIES:
-                break
-        return found
+        return _gradient(part, gain, left / deviation[None, :] ** 2)[: self.signals[i].samples, side], power
 
     def left(self, smoothness: Sequence[float]) -> Arrays:
         """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
@@ -560,19 +583,10 @@ class Linear:
         products = self.columns([all_of_the_input()], predictor.smoothness, predictor.deviation).products
         return float(np.sqrt(products[-1, -1]))
 
-    def share(self, name: str) -> float:
-        """Torque of an effect that the model has, rms over the driving torque's."""
-        effect = get_leaf(self.experiment, f"effects.{name}")
+    def torque_share(self, effect: AbstractEffect) -> float:
+        """Torque of an effect along the log, rms over the driving torque's."""
         power = sum(self._power(Forces(signals.of([effect])), signals)[0] for signals in self.signals)
         return float(np.sqrt(power / self.count)) / self.drive
-
-    def size(self, name: str) -> float:
-        """Prior relative standard deviation of the amplitudes of an effect that the model has."""
-        size, nominal = SHARE / max(self.share(name), 1e-150), self.nominal(name)
-        if nominal is None:
-            return size
-        value = abs(float(getattr(get_leaf(self.experiment, f"effects.{name}"), EFFECTS[name].sizes()[0])))
-        return min(size, OFF * nominal / max(value, 1e-300))
 
     def same(self, name: str) -> int | None:
         """Index of the model's own number that an effect is the error of."""
@@ -584,6 +598,22 @@ class Linear:
         path = corrected(name)
         value = 0.0 if path is None else float(get_leaf(self.experiment, path))
         return value if value > 0.0 else None
+
+
+def _peaks(
+    at: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, apart: float
+) -> list[float]:
+    """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks."""
+    expected = np.exp(np.interp(np.log(np.maximum(at, 1e-9)), np.log(few), np.log(np.maximum(power, 1e-300))))
+    score = np.concatenate([[0.0], np.where(inside, score / expected, 0.0), [0.0]])
+    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]))
+    found: list[float] = []
+    for k in peaks[np.argsort(-score[1:-1][peaks])]:
+        if all(abs(at[k] - known) > apart for known in found):
+            found.append(float(at[k]))
+        if len(found) == _FREQUENCIES:
+            break
+    return found
 
 
 def _groups(variants: Sequence[Candidate]) -> list[list[Candidate]]:

@@ -29,9 +29,10 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
 
+from .confidence import Finding
 from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
-from .effect_search import FAR, Finding
+from .effect_search import FAR
 from .expected_errors import LEVEL
 from .history import Step
 from .neutral_effects import candidates, with_added

@@ -93,7 +93,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     fitted, nominal = chosen.fitted, setup.nominal
     record, log = open_held_out(setup)
     before, after = log.compare(nominal), log.compare(fitted.experiment)
-    expected = expected_errors(log, fitted, after, setup.input_noise, chosen.found.model.linear.drive)
+    expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
     sizes = _sizes(log, fitted.experiment, input_rms(record))
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
@@ -150,7 +150,7 @@ def _controls(setup: Setup, chosen: Chosen, log: ReferenceLog, before: Compariso
         return []
     found = []
     if chosen.rival is not None:
-        other = log.compare(chosen.rival.experiment)
+        other = log.compare(chosen.rival.fitted.experiment)
         found.append(Control("wrong", other.errors, standard_errors_better(log, other, after), chosen.rival.effect))
     added = {
         side: [first.torque - left.torque for first, left in zip(pieces, after.torques[side], strict=True)]

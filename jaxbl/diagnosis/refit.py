@@ -1,39 +1,51 @@
-"""Numbers of a model to the last digit: least prediction errors of the simulated predictor itself.
+"""Numbers of a model to the last digit: least prediction errors of the simulated predictor itself, and their evidence.
 
-What explains a record is sought with the model linearised about the smoothed motion, whose errors cancel to first order
-only. Here the predictor runs over the record with the model as it is, and the model is linearised about the predictor's own
-path: prediction errors, and their derivatives by all numbers and by the initial state, are then exact: plain
-Gauss-Newton with step control. Windows, or a free run that may diverge, are not needed.
-Reference: L. Ljung, System Identification (1999), 7.2, 10.2.
+The predictor runs over the log with the model as it is, and the model is linearised about the predictor's own path:
+prediction errors, and their derivatives by all numbers and by the initial states, are then exact: plain Gauss-Newton with
+step control. Windows, or a free run that may diverge, are not needed. Amplitudes of effects have a prior about zero, as wide
+as a good part of the driving torque, and are fitted as they are, through zero; other numbers by their logarithm.
+References: L. Ljung, System Identification (1999), 7.2, 10.2; R. Kass, A. Raftery, Bayes factors, J. American Statistical
+Association 90 (1995).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.drive.effects import EFFECTS, make_effect
+from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
-from jaxbl.identification.free_parameters import FreeParameter, set_free_parameters
+from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters, set_free_parameters
 from jaxbl.identification.intervals import spread_of
+from jaxbl.identification.logs import arrays
 from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
 from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
-from .fitted_model import FittedModel
-from .linearised_model import Linear, Predictor
-from .neutral_effects import lean
+from .candidates import SHARE, EffectNumbers
+from .fitted_model import FitEnd, FittedModel
+from .linearised_model import OFF, Linear, Predictor
+from .neutral_effects import complete, lean
+from .whittle import spectrum_of
 
 _STEPS = 25
-"""Of Gauss-Newton at most in a round, rejected ones among them."""
+"""Of Gauss-Newton at most under one predictor, rejected ones among them."""
 _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
-_ROUNDS = 2
-"""Choices of the predictor, each followed by a fit."""
+_ROUNDS = 4
+"""Choices of the predictor at most, each followed by a fit."""
+_STARTS = (1.0, 0.1)
+"""Shares of what a candidate was proposed with from which fits begin: of dry friction the way there may lead over a hill."""
+ODDS = -2.0
+"""Log prior odds of each effect to be missing: a probability of 0.12."""
+RARER = -3.0
+"""The same of an effect over its special case: odds of one to twenty."""
 
 
 class _Point(NamedTuple):
@@ -46,19 +58,107 @@ class _Point(NamedTuple):
     cost: float
 
 
-class _Refiner:
-    """Gauss-Newton with step control."""
+class ModelFits:
+    """Fits of models with effects to a log.
+
+    Attributes:
+        nominal: the model as given, with every effect at neutral numbers.
+        free, prior: its own numbers that are not exactly known, and the standard deviation of each theta.
+        segments: of the log.
+        given: the model as given along the log.
+    """
 
     def __init__(
-        self, experiment: Experiment, free: Sequence[FreeParameter], width: np.ndarray, segments: Sequence[Segment]
+        self, experiment: Experiment, free: Sequence[FreeParameter], prior: np.ndarray, segments: Sequence[Segment]
     ):
-        self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
+        self.nominal, self.free, self.prior, self.segments = complete(experiment), tuple(free), prior, segments
+        self.given = self.linearise({}, np.zeros(len(prior)))
+        self._units: dict[tuple[str, str], float] = {}
 
-    def start(self) -> Arrays:
-        """Positions and velocities at the first sample of each segment, as they were smoothed."""
-        sides = self.experiment.sides
-        first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
-        return [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
+    def linearise(self, numbers: EffectNumbers, own: np.ndarray) -> Linear:
+        """Linearise a model with some effects about the motion of the log."""
+        added = make_free_parameters(with_numbers(self.nominal, numbers), paths_of(numbers), self._torque)
+        widths = [EFFECTS[name].roles()[leaf].width for name in numbers for leaf in fitted_numbers(name)]
+        at, prior = np.concatenate([own, np.zeros(len(added))]), np.concatenate([self.prior, widths])
+        return Linear(with_numbers(self.nominal, numbers), (*self.free, *added), at, prior, self.segments)
+
+    @property
+    def _torque(self) -> float:
+        """Size of the input, N m."""
+        return float(np.std(np.concatenate([one.torque for one in self.segments])))
+
+    def fit(
+        self,
+        numbers: EffectNumbers,
+        own: np.ndarray,
+        begin: FittedModel | None = None,
+        new: Mapping[str, float] | Sequence[str] = (),
+        promise: float = np.inf,
+    ) -> FittedModel:
+        """Fit a model with some effects.
+
+        Args:
+            numbers: of the effects, to begin with.
+            own: theta of the model's own numbers, to begin with.
+            begin: a model nearby, whose initial states are begun with.
+            new: effects that it has not.
+            promise: nats that these may gain: where a fit gains less than half, another one begins nearer to none of them.
+        """
+        best, fit = None, None
+        for share in _STARTS:
+            scaled = {name: self._scale(name, one, share if name in new else 1.0) for name, one in numbers.items()}
+            tried = _Fit(self, scaled)
+            before = own if begin is None or begin.end is None else begin.end.own
+            point = tried.run(before + share * (own - before), None if begin is None else begin.end)
+            if best is None or point.cost < best.cost:
+                best, fit = point, tried
+            if begin is None or begin.end is None or not new or begin.end.cost - best.cost >= promise:
+                break
+        assert best is not None and fit is not None
+        return fit.finish(best)
+
+    def _scale(self, name: str, numbers: Mapping[str, float], share: float) -> dict[str, float]:
+        sizes = EFFECTS[name].sizes()
+        return {leaf: value * share if leaf in sizes else value for leaf, value in numbers.items()}
+
+    def unit(self, name: str, leaf: str, numbers: Mapping[str, float]) -> float:
+        """Value of a size of an effect at which its torque is as large as effects are."""
+        if (name, leaf) not in self._units:
+            alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in numbers.items()} | {leaf: 1.0}
+            found = SHARE / max(self.given.torque_share(make_effect(name, **alone)), 1e-12)
+            nominal = self.given.nominal(name)
+            self._units[name, leaf] = found if nominal is None else min(found, OFF * nominal)
+        return self._units[name, leaf]
+
+
+class _Fit:
+    """Gauss-Newton with step control for one set of effects."""
+
+    def __init__(self, fits: ModelFits, numbers: EffectNumbers):
+        self.fits, self.numbers, self.segments = fits, numbers, fits.segments
+        # the error of a number that is free anyway: the number alone is fitted, and less is known of it
+        self.released = {name: i for name in numbers if (i := fits.given.same(name)) is not None}
+        added = {name: one for name, one in numbers.items() if name not in self.released}
+        self.experiment = with_numbers(fits.nominal, added)
+        prior = fits.prior.copy()
+        prior[list(self.released.values())] = np.hypot(prior[list(self.released.values())], OFF)
+        free, theta, width = [], [], []
+        for one in make_free_parameters(self.experiment, paths_of(added), 1.0):
+            name, leaf = owner_of(one)
+            if one.role == "size":
+                unit = fits.unit(name, leaf, numbers[name])
+                free.append(one._replace(nominal=0.0, scale=unit, positive=False))
+                theta.append(numbers[name][leaf] / unit)
+                width.append(1.0)
+            else:
+                free.append(one)
+                theta.append(0.0)
+                width.append(EFFECTS[name].roles()[leaf].width)
+        self.free, self.added = (*fits.free, *free), np.array(theta)
+        self.width = np.concatenate([prior, width])
+        choices = sum(fits.given.choices(name) for name in numbers)
+        general = sum(bool(EFFECTS[name].special_cases) for name in numbers)
+        self.log_prior = ODDS * len(numbers) + RARER * general - choices - float(np.sum(np.log(self.width)))
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
         """Prediction errors along the path of the predictor."""
@@ -67,6 +167,59 @@ class _Refiner:
         predictor = linear.predictor(smoothness)
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
+
+    def run(self, own: np.ndarray, begin: FitEnd | None) -> _Point:
+        """Fit from the model's own numbers; the predictor is chosen anew until that gains nothing."""
+        own = own.copy()
+        for name, i in self.released.items():
+            one = self.fits.free[i]
+            own[i] = one.theta(max(one.nominal + next(iter(self.numbers[name].values())), 0.05 * one.nominal))
+        theta = np.concatenate([own, self.added])
+        if begin is None:
+            sides = self.experiment.sides
+            first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
+            start = [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
+        else:
+            start = begin.start
+        best = self._descend(self.at(theta, start, self._choose(theta)))
+        for _ in range(_ROUNDS):
+            if not np.isfinite(best.cost):
+                break
+            # along the smoothed motion what is chosen does not hang on what was chosen before
+            options = [self._choose(best.theta), best.linear.choose(()).smoothness]
+            others = [
+                self._descend(self.at(best.theta, best.start, one))
+                for i, one in enumerate(options)
+                if one != best.predictor.smoothness and one not in options[:i]
+            ]
+            other = min(others, key=lambda one: one.cost, default=best)
+            if not other.cost < best.cost - _SETTLED:
+                break
+            best = other
+        return best
+
+    def _choose(self, theta: np.ndarray) -> Sequence[float]:
+        """Choose the predictor along the smoothed motion."""
+        return Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
+
+    def _descend(self, best: _Point) -> _Point:
+        share = 1.0
+        for _ in range(_STEPS):
+            if best.cost - best.predictor.cost(best.theta, self.width) < _SETTLED or share < 1e-3:
+                break
+            by = best.predictor.coefficients
+            change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)
+            start = [one + share * at[-best.linear.states :][: len(one)] for one, at in zip(best.start, by, strict=True)]
+            tried = self.at(best.theta + change, start, best.predictor.smoothness)
+            if not tried.cost < best.cost:
+                share *= 0.25
+                continue
+            gained = best.cost - tried.cost
+            best, share = tried, min(1.0, 3.0 * share)
+            # where errors are not linear in the numbers a step may promise more than there is
+            if gained < _SETTLED:
+                break
+        return best
 
     def _path(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> list[Segment]:
         """The segments with the filtered motion of a model in place of the smoothed one."""
@@ -94,55 +247,69 @@ class _Refiner:
             found.append(dataclasses.replace(segment, smoothed=filtered))
         return found
 
-    def run(self, theta: np.ndarray) -> _Point:
-        smoothness = Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
-        best = self.at(theta, self.start(), smoothness)
-        for i in range(_ROUNDS):
-            if i:
-                smoothness = best.linear.choose(()).smoothness
-                best = self.at(best.theta, best.start, smoothness)
-            share = 1.0
-            for _ in range(_STEPS):
-                if best.cost - best.predictor.cost(best.theta, self.width) < _SETTLED or share < 1e-3:
-                    break
-                by = best.predictor.coefficients
-                change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)
-                start = [one + share * at[-best.linear.states :][: len(one)] for one, at in zip(best.start, by, strict=True)]
-                tried = self.at(best.theta + change, start, smoothness)
-                if not tried.cost < best.cost:
-                    share *= 0.25
-                    continue
-                gained = best.cost - tried.cost
-                best, share = tried, min(1.0, 3.0 * share)
-                # where errors are not linear in the numbers a step may promise more than there is
-                if gained < _SETTLED:
-                    break
-        return best
-
-    def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Covariance of theta: of the errors, which may be correlated, and the prior together; and if they are not. And how
-        theta changes where one quarter of the log after the other is left out."""
-        linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
-        if not own:
-            return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((QUARTERS, 0))
-        residual, jacobian = [], []
-        for errors in linear.errors(point.predictor.smoothness):
-            flat = (errors / np.sqrt(point.predictor.given / linear.count)[None, :, None]).reshape(-1, errors.shape[2])
+    def finish(self, point: _Point) -> FittedModel:
+        """The model, its covariance, and its errors; each quarter's by numbers fitted without it."""
+        experiment = set_free_parameters(self.experiment, self.free, point.theta)
+        end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.cost)
+        own, sides = len(self.free), len(self.experiment.sides)
+        none = np.full((own, own), np.inf)
+        found = FittedModel(
+            tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, own)),
+            0.5 * float(np.sum((point.theta / self.width) ** 2) - point.cost), self.log_prior, end=end,
+        )  # fmt: skip
+        if not np.isfinite(point.cost):
+            return found
+        linear, pieces = point.linear, []
+        size = np.sqrt(point.predictor.given / linear.count)
+        for errors, signals in zip(linear.errors(point.predictor.smoothness), linear.signals, strict=True):
+            flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
             states = flat[:, -linear.states :]
-            size = np.sqrt(np.sum(states**2, axis=0))
-            basis = np.linalg.qr(states[:, size > 1e-20 * np.max(size)] / size[size > 1e-20 * np.max(size)])[0]
+            norm = np.sqrt(np.sum(states**2, axis=0))
+            basis = np.linalg.qr(states[:, norm > 1e-20 * np.max(norm)] / norm[norm > 1e-20 * np.max(norm)])[0]
             rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
-            residual.append(rest[:, 0].reshape(-1, sides))
-            jacobian.append(rest[:, 1:].reshape(-1, sides, own))
-        errors, slopes = np.concatenate(residual), np.concatenate(jacobian)
-        found = spread_of(errors[None], slopes[None], 2 * sides)
-        # samples that only fill up
-        real = linear.count / len(errors)
-        information, sandwich = real * found.information, found.covariance
-        prior = np.diag(self.width**-2.0)
-        inverse = np.linalg.inv(information + prior)
-        changes = leave_quarters_out(errors, slopes, prior)
-        return inverse @ (information @ sandwich @ information + prior) @ inverse, inverse, changes
+            pieces.append(rest.reshape(-1, sides, 1 + own)[signals.real])
+        errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
+        spectrum = spectrum_of([size * piece[:, :, 0] for piece in pieces])
+        foretold = errors[:, :, 0].copy()
+        changes = np.zeros((QUARTERS, own))
+        covariance = inverse = np.zeros((0, 0))
+        if own:
+            prior = np.diag(self.width**-2.0)
+            spread = spread_of(errors[None, :, :, 0], slopes[None], 2 * sides)
+            inverse = np.linalg.inv(spread.information + prior)
+            middle = spread.information @ spread.covariance @ spread.information + prior
+            covariance, changes = inverse @ middle @ inverse, leave_quarters_out(errors[:, :, 0], slopes, prior)
+            for rows, change in zip(np.array_split(np.arange(len(errors)), QUARTERS), changes, strict=True):
+                foretold[rows] += slopes[rows] @ change
+        return self._release(
+            found._replace(
+                covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold, coloured=spectrum.gain,
+                log_evidence=found.log_prior - 0.5 * point.cost + 0.5 * float(np.linalg.slogdet(inverse)[1]),
+            )
+        )  # fmt: skip
+
+    def _release(self, found: FittedModel) -> FittedModel:
+        """The model in which effects have what is wrong with numbers that are free; the log tells their sums alone."""
+        for name, i in self.released.items():
+            number, (path,) = self.fits.free[i], paths_of([name])
+            value, slope = (float(of(found.theta[i])) for of in (number.value, number.slope))
+            numbers = {path: value - number.nominal, number.path: number.nominal}
+            experiment = set_leaves(complete(found.experiment, [name]), arrays(numbers))
+            (added,) = make_free_parameters(experiment, [path], 1.0)
+            added = added._replace(nominal=0.0, scale=number.slope(0.0), positive=False)
+            known, factor = self.fits.prior[i] ** 2, slope / float(added.scale)
+            rows = np.eye(len(found.theta) + 1)[:, :-1]
+            rows[-1, i], rows[i, i] = factor, 0.0
+            spread = np.zeros(len(rows))
+            spread[i], spread[-1] = 1.0, -1.0
+            shared = known * np.outer(spread, spread)
+            theta = rows @ found.theta
+            theta[-1] = (value - number.nominal) / float(added.scale)
+            found = found._replace(
+                experiment=experiment, free=(*found.free, added), theta=theta, left_out=found.left_out @ rows.T,
+                covariance=rows @ found.covariance @ rows.T + shared, white=rows @ found.white @ rows.T + shared,
+            )  # fmt: skip
+        return found
 
 
 def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -164,12 +331,29 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     )
 
 
-def refined(
-    experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
-) -> FittedModel:
-    """Refine the numbers of a model from theta; arguments as of :class:`.linearised_model.Linear` (`width`: its `prior`)."""
-    refiner = _Refiner(experiment, free, width, segments)
-    best = refiner.run(np.asarray(theta))
-    model = set_free_parameters(experiment, free, best.theta)
-    covariance, white, left_out = refiner.covariance(best)
-    return FittedModel((), model, tuple(free), best.theta, covariance, white, best.linear, left_out, -0.5 * best.cost)
+def fitted_numbers(name: str) -> list[str]:
+    """The numbers of an effect that are fitted: a harmonic is a whole number, and some are held."""
+    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind not in ("harmonic", "held")]
+
+
+def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
+    """Dotted paths of the free numbers of effects."""
+    return [f"effects.{name}.{leaf}" for name in names for leaf in fitted_numbers(name)]
+
+
+def owner_of(one: FreeParameter) -> tuple[str, str]:
+    """The effect that a number is of, and its name there."""
+    name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+    return name, leaf
+
+
+def with_numbers(experiment: Experiment, values: EffectNumbers) -> Experiment:
+    """A model with all effects (:func:`.neutral_effects.complete`), some of them with these numbers."""
+    return set_leaves(
+        complete(experiment, values),
+        {
+            f"effects.{name}.{leaf}": np.asarray(value, float)
+            for name, numbers in values.items()
+            for leaf, value in numbers.items()
+        },
+    )

@@ -14,10 +14,9 @@ from jaxbl.identification.free_parameters import set_free_parameters
 from jaxbl.identification.intervals import long_run
 
 from .candidates import are_possible
-from .effect_search import EffectSearch
 from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
-from .refit import leave_quarters_out
+from .refit import ModelFits, leave_quarters_out
 
 _STEP = 1e-4
 """Of theta, for differences: numbers are in units of themselves."""
@@ -25,13 +24,13 @@ _EVALUATIONS = 10
 """Of the fit, which begins near its end."""
 
 
-def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) -> FittedModel | None:
+def fit_to_torque(fits: ModelFits, fitted: FittedModel, log: ReferenceLog) -> FittedModel | None:
     """A model with the numbers of least missing torque, each side's over what it is at first; None if they are not possible.
 
     Torques are referred to the input: none becomes smaller because all do. Standard errors allow for correlation.
     """
-    own, sides = len(search.free), fitted.experiment.sides
-    prior = np.concatenate([search.prior**-2.0, np.zeros(len(fitted.free) - own)])
+    own, sides = len(fits.free), fitted.experiment.sides
+    prior = np.concatenate([fits.prior**-2.0, np.zeros(len(fitted.free) - own)])
     # behind the low-pass there is one independent error in half a period
     apart = {side: max(0.5 / (log.bandwidth[side] * log.period), 1.0) for side in sides}
     first = log.missing(fitted.experiment)
@@ -69,4 +68,4 @@ def fit_to_torque(search: EffectSearch, fitted: FittedModel, log: ReferenceLog) 
     numbers = model.numbers
     if not are_possible(numbers, log.period):
         return None
-    return model._replace(linear=search.linear(numbers, found.x[:own]))
+    return model._replace(linear=fits.linearise(numbers, found.x[:own]))

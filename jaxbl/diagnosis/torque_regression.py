@@ -1,231 +1,158 @@
-"""Effects that the missing torque itself shows, where prediction errors do not.
+"""Effects that the missing torque itself shows: where an engineer begins.
 
-A one-step predictor corrects itself at every reading, and what is left of a slow torque in its errors may be less than what
-is unknown beside it. Here candidates are columns of a regression on the torque that a model still lacks, low-passed as that
-is, and judged by cross-validation on blocks of the log, which takes errors for as correlated as they are. The best are put
-into the model, all numbers are fitted, and the models are compared on the log block by block.
+Candidates are columns of a regression on the torque that a model still lacks, along the measured motion and behind one
+low-pass, and are judged by cross-validation on blocks of the log, which takes errors for as correlated as they are. The best
+ones are proposed one by one; and, added one after the other, all together, since two that are missing may hide each other.
 Reference: S. Arlot, A. Celisse, A survey of cross-validation procedures, Statistics Surveys 4 (2010), section 8.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
+from jaxbl.drive.effects import Numbers
 from jaxbl.drive.parameters import get_leaf
-from jaxbl.identification.segments import Segment
 from jaxbl.records.least_squares import BlockRegression
 
-from .blocks import SEEN, standard_errors_better
-from .candidates import Candidate, Forces, Numbers, are_possible, columns_of, variants_of
-from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
-from .fitted_model import FittedModel
-from .history import Step, describe_change
-from .reference_log import Comparison, ReferenceLog
-from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
+from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
+from .linearised_model import Linear
+from .reference_log import ReferenceLog
+from .residuals import SideResiduals, as_smoothed, low_passed, narrowed
 
 _BLOCKS = 10
 """Of consecutive samples, each left out once: more than the eight of which a standard error is any use."""
-_GAIN = 0.03
-"""Share of the rms that a candidate has to take away by cross-validation, and by which models have to differ."""
-_TRIED = 3
-"""Candidates of a regression that are put into the model."""
-_NAMED = 0.9
-"""Confidence from which on an effect is named: below it the missing torque is not that of one effect."""
-_ADDED = 3
-"""Effects that are added at most."""
+SHOWN = 0.02
+"""Share of the missing torque's rms that each of effects proposed together has to take away, and a general effect more than
+its special case."""
+_MOST = 6
+"""Effects that are proposed together at most."""
 
 
-class _Proposal(NamedTuple):
-    """A candidate, its numbers, and the share of the missing torque's rms that it takes away by cross-validation."""
+class TorqueProposal(NamedTuple):
+    """A candidate, its numbers, the share of the missing torque's rms that it takes away by cross-validation, and by how
+    many standard errors."""
 
     name: str
     numbers: Numbers
-    gain: float
+    share: float
+    standard_errors: float
 
 
-class _Tried(NamedTuple):
-    """A model with an effect more (or one in place of its special case), and how it compares on the log."""
-
-    name: str
-    fitted: FittedModel
-    compared: Comparison
-    z: float
-
-
-def extend_explanation(
-    search: EffectSearch, found: Explanation, fitted: FittedModel, log: ReferenceLog, history: list[Step]
-) -> Explanation:
-    """An explanation with what a regression on the missing torque adds; the same one if it adds nothing.
-
-    Args:
-        search: that found it.
-        found: the explanation.
-        fitted: the model with it.
-        log: the log that was searched, whose low-pass missing torques are looked at behind.
-        history: gets what is tried.
-    """
-    for _ in range(_ADDED):
-        more = _with_one_more(search, found, fitted, log, history)
-        if more is None:
-            break
-        found, fitted = more
-    return found
-
-
-def _with_one_more(
-    search: EffectSearch, found: Explanation, now: FittedModel, log: ReferenceLog, history: list[Step]
-) -> tuple[Explanation, FittedModel] | None:
-    model = found.model
-    compared = log.compare(now.experiment)
-    every: list[_Tried] = []
-    # what the search preferred a simpler effect to, with the numbers that it had there
-    general = {name: one for name, one in found.general.items() if any(contains(name, other) for other in model.names)}
-    proposed = [_Proposal(name, numbers, 0.0) for name, numbers in general.items()]
-    proposed += [one for one in _proposals(search, model, compared.torques, log) if one.name not in general][:_TRIED]
-    for one in proposed:
-        kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
-        fitted = search.fit(kept | {one.name: one.numbers}, now.theta[: len(search.free)])
-        if not are_possible(fitted.numbers, search.period):
-            continue
-        after = log.compare(fitted.experiment)
-        z = standard_errors_better(log, compared, after)
-        every.append(_Tried(one.name, fitted, after, z))
-    tried = [one for one in every if one.z > SEEN and _less(one.compared, compared)]
-
-    def note(kept: str, why: str) -> None:
-        asked = f"{SEEN:g} standard error and {_GAIN:.0%} of the missing torque are asked"
-        for trial in every:
-            nats = trial.fitted.log_likelihood - now.log_likelihood
-            reason = why if trial in tried else asked
-            history.append(
-                Step(describe_change(now.numbers, trial.fitted.numbers), nats, trial.z, trial.name == kept, reason)
-            )
-
-    if not tried:
-        note("", "")
-        return None
-
-    def lead(one: _Tried) -> float:
-        """Standard errors by which one beats the nearest of the others."""
-        others = [standard_errors_better(log, other.compared, one.compared) for other in tried if other is not one]
-        return min(others, default=one.z)
-
-    best = max(tried, key=lead)
-    findings = [one for one in found.findings if not _replaced(one.effect, best.name)]
-    rivals = {one.name: standard_errors_better(log, one.compared, best.compared) for one in tried if one is not best}
-    for name in model.names:
-        if _replaced(name, best.name):
-            rivals[name] = best.z
-    chances = {name: float(ndtr(-z)) for name, z in rivals.items()}
-    alternatives = tuple((name, one) for name, one in chances.items() if one > LEAST_CHANCE)
-    confidence = 1.0 - sum(chances.values())
-    if confidence < _NAMED:
-        note("", f"the missing torque shows it, but not it alone: confidence {confidence:.2f} of {_NAMED:g}")
-        return None
-    note(best.name, f"the missing torque shows {best.name} best")
-    findings.append(Finding(best.name, confidence, best.fitted.numbers[best.name], alternatives))
-    adopted = search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
-    return adopted, best.fitted
-
-
-def _less(after: Comparison, before: Comparison) -> bool:
-    """Tell whether some missing torque has become smaller by a share that matters."""
-    return any(after.errors[name] < (1.0 - _GAIN) * value for name, value in before.errors.items() if "torque" in name)
-
-
-def _replaced(name: str, by: str) -> bool:
-    """Tell whether an effect gives way to another one: its special case, or of the same word at one place."""
-    return contains(by, name) or exclusive(by, [name])
-
-
-def _proposals(search: EffectSearch, model: Model, lacking: SideResiduals, log: ReferenceLog) -> list[_Proposal]:
-    """Candidates that take away a part of the missing torque by cross-validation, the best one of each name, best first."""
-    linear = model.linear
-    # frequencies are sought in what this leaves
-    linear.choose(())
-    # errors of numbers that may change are no finding of this regression: they take part in it
-    own = [name for name in search.lacking if linear.same(name) is not None and linear.nominal(name) is not None]
-    sought = [name for name in search.lacking if not any(one == name or contains(one, name) for one in model.names)]
-    base = variants_of(search.nominal, [name for name in own if name not in model.names], linear.scales)
-    variants = variants_of(search.nominal, [name for name in sought if name not in own], linear.scales)
-    regression = _Regression(model, lacking, log, base, variants)
-    found: dict[str, _Proposal] = {}
-    for one in variants:
-        proposal = regression.propose(one)
-        if proposal is not None and proposal.gain > (found[one.name].gain if one.name in found else _GAIN):
-            found[one.name] = proposal
-    return sorted(found.values(), key=lambda one: -one.gain)
-
-
-class _Regression:
+class TorqueRegression:
     """Missing torques of all sides, and columns of effects, behind one low-pass; as products, block by block."""
 
     def __init__(
         self,
-        model: Model,
+        linear: Linear,
+        names: Sequence[str],
         lacking: SideResiduals,
         log: ReferenceLog,
         base: Sequence[Candidate],
         variants: Sequence[Candidate],
     ):
-        self.names, self.sides = model.names, tuple(lacking)
-        forces = []
-        for signals in model.linear.signals:
-            there = signals.of([get_leaf(model.linear.experiment, f"effects.{name}") for name in model.names])
-            forces.append(Forces([*there, *columns_of([*base, *variants], signals)]))
-        self.places: dict[Candidate, tuple[np.ndarray, int]] = {}
-        at = len(model.names)
-        for one in (*base, *variants):
-            self.places[one] = np.arange(at, at + one.width), (at + one.width if one.offset else -1)
-            at += one.width + one.offset
-        self.base = np.concatenate([np.arange(0), *(self.places[one][0] for one in base)]).astype(int)
-        self.regressions = []
-        for i, side in enumerate(self.sides):
-            pieces = zip(forces, log.segments, lacking[side], strict=True)
-            rows = [
-                _with_target(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
-                for force, segment, residual in pieces
-            ]
+        """Prepare the regression.
+
+        Args:
+            linear: the model along the log.
+            names: of its effects, whose sizes are fitted along.
+            lacking: torques that it lacks, by side, segment by segment.
+            log: that models are compared on.
+            base: candidates that take part in every fit: errors of numbers that may change.
+            variants: candidates to be tried.
+        """
+        self.variants, forces = variants, []
+        for one in linear.signals:
+            # the model's own acceleration, where torque is missing, is not that of the log
+            measured = MotionTorques(linear.experiment, replace(one.part, modelled=one.part.acceleration), one.shared)
+            there = measured.of([get_leaf(linear.experiment, f"effects.{name}") for name in names])
+            gone = [{place: -torque for place, torque in one.items()} for one in there]
+            forces.append(Forces([*there, *gone, *columns_of([*base, *variants], measured)]))
+        self.places: dict[Candidate, tuple[np.ndarray, list[int]]] = {}
+        self.names, at = tuple(names), 2 * len(names)
+        for candidate in (*base, *variants):
+            end = at + candidate.width
+            self.places[candidate] = np.arange(at, end), [end] if candidate.offset else []
+            at = end + candidate.offset
+        self.base = np.concatenate([np.zeros(0), *(self.places[one][0] for one in base)]).astype(int)
+        self.sides = []
+        for i, side in enumerate(lacking):
+            rows = []
+            for force, segment, residual in zip(forces, log.segments, lacking[side], strict=True):
+                # what acts on the input acts on the motor, which is the first side
+                columns = force.on(i, len(segment)) + (force.on(-1, len(segment)) if i == 0 else 0.0)
+                columns = as_smoothed(columns, segment.smoothed[side], segment.period)
+                seen = low_passed(columns, residual, log.bandwidth[side])
+                rows.append(np.vstack([seen, narrowed(residual, log.bandwidth[side])[0].torque]))
             *columns, target = np.concatenate(rows, axis=1)
             # each side over its own missing torque
             size = np.sqrt(np.sum(target**2))
-            self.regressions.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
-        self.without = self._cross_validate(np.array([*range(len(model.names)), *self.base]), -1)[0]
+            self.sides.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
 
-    def propose(self, candidate: Candidate) -> _Proposal | None:
-        """Try a candidate beside the model's effects; None where it is not allowed or not surely better."""
-        columns, offset = self.places[candidate]
-        kept = [i for i, name in enumerate(self.names) if not _replaced(name, candidate.name)]
-        at = np.array([*columns, *kept, *self.base])
-        squares, values = self._cross_validate(at, offset)
-        gains = np.sum(
-            [one / np.mean(one) - new / np.mean(one) for one, new in zip(self.without, squares, strict=True)], axis=0
-        )
-        if not np.mean(gains) > np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
+    def propose(self) -> list[TorqueProposal]:
+        """The best variant of each effect that surely takes something away, the best effect first."""
+        before, _ = self._cross_validate([])
+        best: dict[str, TorqueProposal] = {}
+        for one in self.variants:
+            found = self._try([], one, before)
+            if found is not None and found[0].share > (best[one.name].share if one.name in best else 0.0):
+                best[one.name] = found[0]
+        return sorted(best.values(), key=lambda one: -one.share)
+
+    def propose_together(self) -> dict[str, Numbers]:
+        """Effects that take most away one after the other, and their numbers together."""
+        chosen: list[Candidate] = []
+        squares, _ = self._cross_validate([])
+        linear = [one for one in self.variants if not one.offset]
+        while len(chosen) < _MOST:
+            tried = []
+            for one in linear:
+                if not any(replaces(one.name, other.name) or replaces(other.name, one.name) for other in chosen):
+                    found = self._try(chosen, one, squares)
+                    if found is not None and found[0].share > SHOWN:
+                        tried.append((found[0].share, one, found[1]))
+            if not tried:
+                break
+            most = max(tried, key=lambda each: each[0])
+            plain = [each for each in tried if contains(most[1].name, each[1].name) and each[0] > most[0] - SHOWN]
+            _, best, squares = max(plain or [most], key=lambda each: each[0])
+            chosen.append(best)
+        _, values = self._cross_validate(chosen)
+        numbers, at = {}, 0
+        for one in chosen:
+            of = one.numbers(values[at : at + one.width].tolist())
+            at += one.width
+            if of is not None:
+                numbers[one.name] = of
+        return numbers
+
+    def _try(
+        self, beside: Sequence[Candidate], one: Candidate, before: Sequence[np.ndarray]
+    ) -> tuple[TorqueProposal, list[np.ndarray]] | None:
+        """Try a candidate beside others; None where it takes nothing away, or its numbers are not allowed."""
+        after, values = self._cross_validate([*beside, one])
+        gains = np.sum([(old - new) / np.mean(old) for old, new in zip(before, after, strict=True)], axis=0)
+        z = float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
+        ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
+        at = sum(other.width for other in beside)
+        numbers = one.numbers(values[at : at + one.width].tolist())
+        if numbers is None or not z > 1.0:
             return None
-        ratio = np.prod([np.mean(new) / np.mean(one) for one, new in zip(self.without, squares, strict=True)])
-        numbers = candidate.numbers(values[: len(columns)].tolist())
-        return None if numbers is None else _Proposal(candidate.name, numbers, 1.0 - float(np.sqrt(ratio)))
+        return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio)), z), after
 
-    def _cross_validate(self, at: np.ndarray, offset: int) -> tuple[list[np.ndarray], np.ndarray]:
-        """Mean squared errors of each block left out, by side, and the coefficients by all blocks.
+    def _cross_validate(self, chosen: Sequence[Candidate]) -> tuple[list[np.ndarray], np.ndarray]:
+        """Mean squared errors of each block left out, by side, and the coefficients by all blocks, those of the candidates
+        first.
 
-        Columns act on all sides with one coefficient, each side over its own missing torque.
+        An effect that is replaced is taken out of the model. Columns act on all sides with one coefficient, each side over
+        its own missing torque.
         """
-        sides = [side.select(at, [offset] if offset >= 0 else []) for side in self.regressions]
+        gone = [i for i, name in enumerate(self.names) if any(replaces(one.name, name) for one in chosen)]
+        kept = [i for i in range(len(self.names)) if i not in gone]
+        columns = np.concatenate([*(self.places[one][0] for one in chosen), kept, self.base]).astype(int)
+        fixed = [place for one in chosen for place in self.places[one][1]] + [len(self.names) + i for i in gone]
+        sides = [side.select(columns, fixed) for side in self.sides]
         joined = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
         fits = joined.fit_without_each()
         return [side.held_out(fits) for side in sides], joined.fit()
-
-
-def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
-    """Torques on a side, shape (columns, samples); those on the input act on the motor, which is the first."""
-    return forces.on(i, samples) + (forces.on(-1, samples) if i == 0 else 0.0)
-
-
-def _with_target(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
-    """Torques as the missing torque of a side is seen, and that torque; shape (columns + 1, rows)."""
-    seen = low_passed(as_smoothed(columns, segment.smoothed[side], segment.period), residual, cutoff)
-    return np.concatenate([seen, narrowed(residual, cutoff)[0].torque[None]])

@@ -7,10 +7,8 @@ from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 from scipy.optimize import minimize
 
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.effect_search import paths_of, with_numbers
 from jaxbl.diagnosis.linearised_model import Linear
-from jaxbl.diagnosis.neutral_effects import complete
-from jaxbl.diagnosis.refit import _Refiner, leave_quarters_out, refined
+from jaxbl.diagnosis.refit import ModelFits, _Fit, leave_quarters_out
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
@@ -22,78 +20,88 @@ from jaxbl.simulate import plant_trajectory, with_effects
 NAME = "motor.coulomb_friction"
 
 
-@pytest.fixture(scope="module")
-def refit_inputs(tmp_path_factory):
-    log = tmp_path_factory.mktemp("log") / "axis.csv"
-    simulate_multisine_log().write(log)
+def prepare_fits(log):
     task = read_diagnosis_task(log, nominal_study())
     bare = on_record(task.config, task.record)
-    experiment = with_numbers(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
-    torque = float(np.std(task.record.torque))
-    free_parameters = make_free_parameters(bare, default_paths(task.config, bare), torque)
-    free = (*free_parameters, *make_free_parameters(experiment, paths_of([NAME]), torque))
-    width = np.array([*[task.config.uncertainty.relative] * len(free_parameters), 3.0])
-    return experiment, free, width, segments_of(task.record, bare.sides)
+    free = make_free_parameters(bare, default_paths(task.config, bare), float(np.std(task.record.torque)))
+    prior = np.full(len(free), task.config.uncertainty.relative)
+    return ModelFits(bare, free, prior, segments_of(task.record, bare.sides))
 
 
-def test_prediction_errors_are_least(refit_inputs):
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory):
+    log = tmp_path_factory.mktemp("log") / "axis.csv"
+    simulate_multisine_log().write(log)
+    return prepare_fits(log)
+
+
+def test_prediction_errors_are_least(fits):
     """A search without derivatives that begins elsewhere finds none smaller of the same predictor."""
-    experiment, free, width, segments = refit_inputs
-    (segment,) = segments
+    (segment,) = fits.segments
+    fit = _Fit(fits, {NAME: {"torque": 1.1 * FRICTION["torque"]}})
+    found = fit.run(np.zeros(len(fits.free)), None)
     # without the effects that do nothing
-    plain = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.name == NAME))
-    fit = _Refiner(experiment, free, width, segments).run(np.zeros(len(free)))
-    gain = {"motor": Linear.gain_of(fit.predictor.smoothness, segment.period)[0]}
+    plain = with_effects(fit.experiment, tuple(effect for effect in fit.experiment.effects if effect.name == NAME))
+    gain = {"motor": Linear.gain_of(found.predictor.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
     def predict(inputs):
-        candidate = set_free_parameters(plain, free, inputs[2:] * 0.01)
+        candidate = set_free_parameters(plain, fit.free, inputs[2:] * 0.01)
         start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(candidate, torque[0]))
         return plant_trajectory(candidate, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(inputs):
         errors = np.asarray(reading - predict(jnp.asarray(inputs)))
-        return len(errors) * np.log(np.sum(errors**2)) + np.sum((inputs[2:] * 0.01 / width) ** 2)
+        return len(errors) * np.log(np.sum(errors**2)) + np.sum((inputs[2:] * 0.01 / fit.width) ** 2)
 
-    optimum = np.concatenate([fit.start[0], 100.0 * fit.theta])
+    optimum = np.concatenate([found.start[0], 100.0 * found.theta])
     options = {"xatol": 1e-5, "fatol": 1e-4, "maxfev": 2000, "adaptive": True}
     best = minimize(cost, optimum + np.array([1e-6, 1e-4, 0.3, -0.3, 0.3]), method="Nelder-Mead", options=options)
     # twice the logarithm of the likelihood: far less than what the noise leaves open
     assert cost(optimum) - best.fun < 0.1
-    assert cost(optimum) < cost(optimum + np.array([0.0, 0.0, 0.1, -0.1, 0.1])) - 1.0
+    assert cost(optimum) < cost(optimum + np.array([0.0, 0.0, 0.1, -0.1, 0.3])) - 1.0
 
 
 def test_deviations_are_those_of_repetitions(tmp_path):
     """The friction's error over many noise realisations, against what is said of each."""
-    values, deviations = [], []
+    errors = []
     for seed in range(12):
         log = tmp_path / f"{seed}.csv"
         simulate_multisine_log(seed=seed).write(log)
-        task = read_diagnosis_task(log, nominal_study())
-        bare = on_record(task.config, task.record)
-        experiment = with_numbers(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
-        torque = float(np.std(task.record.torque))
-        free_parameters = make_free_parameters(bare, default_paths(task.config, bare), torque)
-        free = (*free_parameters, *make_free_parameters(experiment, paths_of([NAME]), torque))
-        width = np.array([*[task.config.uncertainty.relative] * len(free_parameters), 3.0])
-        fit = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
-        values.append(fit.theta[-1])
-        deviations.append(fit.deviation[-1])
-    errors = np.array(values) / np.array(deviations)
-    assert 0.6 < np.sqrt(np.mean(errors**2)) < 1.5
+        fits = prepare_fits(log)
+        fitted = fits.fit({NAME: {"torque": FRICTION["torque"]}}, np.zeros(len(fits.free)))
+        error = fitted.numbers[NAME]["torque"] - FRICTION["torque"]
+        errors.append(error / fitted.errors()[f"effects.{NAME}.torque"])
+    # less their mean, which is an error of time stepping
+    assert 0.6 < np.std(errors, ddof=1) < 1.5
     assert np.max(np.abs(errors)) < 3.5
 
 
-def test_numbers_under_which_the_predictor_diverges_are_not_taken(refit_inputs):
+def test_numbers_under_which_the_predictor_diverges_are_not_taken(fits):
     """Errors that are not finite have no likelihood, and nothing is said of them."""
-    experiment, free, width, segments = refit_inputs
-    diverging = with_numbers(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
-    refiner = _Refiner(diverging, free, width, segments)
-    theta = np.zeros(len(free))
-    (path,) = refiner._path(theta, refiner.start(), [1e-11])
+    fit = _Fit(fits, {"motor.quadratic_drag": {"drag": -5.0}})
+    theta = np.concatenate([np.zeros(len(fits.free)), fit.added])
+    start = [np.array([float(segment.smoothed["motor"].state[0][i]) for i in (0, 1)]) for segment in fits.segments]
+    (path,) = fit._path(theta, start, [1e-11])
     assert not np.isfinite(path.smoothed["motor"].state[:, :2]).all()
-    assert refiner.at(theta, refiner.start(), [1e-11]).cost == np.inf
+    assert fit.at(theta, start, [1e-11]).cost == np.inf
+
+
+def test_the_error_of_a_number_is_what_the_number_is_off_by(fits):
+    """The log tells their sum; what is known of the number, and how far it may be off, tells the two apart."""
+    name = "motor.inertia"
+    both = fits.fit({NAME: {"torque": FRICTION["torque"]}, name: {"inertia": 0.0}}, np.zeros(len(fits.free)))
+    one = fits.fit({NAME: {"torque": FRICTION["torque"]}}, np.zeros(len(fits.free)))
+    i = next(i for i, number in enumerate(fits.free) if number.path == "drive.motor_inertia")
+    number, off = fits.free[i], both.numbers[name]["inertia"]
+    assert both.theta[i] == 0.0 and number.nominal + off == pytest.approx(number.value(one.theta[i]), rel=1e-3)
+    # the sum is known as well as the number alone is
+    slope = both.free[-1].slope(0.0)
+    variance = [both.covariance[i, i] * number.scale**2, both.covariance[-1, -1] * slope**2]
+    together = sum(variance) + 2.0 * both.covariance[i, -1] * number.scale * slope
+    assert together == pytest.approx((number.slope(one.theta[i]) * one.deviation[i]) ** 2, rel=0.1)
+    assert np.sqrt(variance[0]) == pytest.approx(fits.prior[i] * number.scale)
 
 
 def test_numbers_without_a_quarter_are_those_of_a_fit_to_the_rest():

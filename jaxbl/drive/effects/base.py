@@ -60,6 +60,8 @@ class Scales(NamedTuple):
         ratio: motor turns for one load turn; 1 on a rigid drive.
         harmonics: periods a turn of the waves over position that the model already has on the side.
         frequencies: of torques on the side that would explain most of the residual torque, Hz.
+        waves: periods a turn of torques over the side's position that would explain most of it.
+        wave_count: number of waves among which these were found.
     """
 
     torque: float
@@ -73,6 +75,8 @@ class Scales(NamedTuple):
     ratio: float = 1.0
     harmonics: tuple[float, ...] = ()
     frequencies: tuple[float, ...] = ()
+    waves: tuple[float, ...] = ()
+    wave_count: int = 0
 
 
 def multiples(scale: str, factors: Sequence[float]) -> Callable[[Scales], list[float]]:

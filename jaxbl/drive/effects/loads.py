@@ -10,13 +10,11 @@ import numpy as np
 from ..parameters import Scalar
 from .base import EFFECTS, Numbers, Scales, SideEffect, angle, frequency, harmonic, shape, size
 
-_COGGING_HARMONICS = range(1, 41)
-"""Trial values of cogging, periods a turn: common numbers of slots and magnets are at most about 36."""
 _POLE_PAIRS, _RIPPLE_HARMONICS = (1, 2, 3, 4, 5, 7), (1, 2, 6)
 """Pole pairs of common servo motors, and periods of ripple a pole pair: 1 from the offset of a current sensor, 2 from
 unequal gains of two sensors, 6 from commutation or windings that are not sinusoidal."""
-_TRIAL_ARC = 0.5 * np.pi
-"""Part of a wave that the motion must cover for its harmonic to be tried, rad."""
+_TRIAL_ARC = 3.0 * np.pi
+"""Part of a wave that the motion must cover for its harmonic to be tried, rad: over less it does not repeat."""
 MAX_DAMPING_RATIO = 0.95
 """Damping ratio above which an inertia behind a spring hardly swings, so that its frequency has no meaning."""
 
@@ -24,10 +22,6 @@ MAX_DAMPING_RATIO = 0.95
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
     """The harmonics of which the motion covers enough, in increasing order."""
     return [float(n) for n in sorted(harmonics) if n * log.travel > _TRIAL_ARC]
-
-
-def _cogging_harmonics(log: Scales) -> list[float]:
-    return _select_covered(_COGGING_HARMONICS, log)
 
 
 def _ripple_harmonics(log: Scales) -> list[float]:
@@ -104,7 +98,7 @@ class Cogging(SideEffect):
     kind = "cogging"
     places = ("motor",)
     amplitude: Scalar = size("N m", "amplitude A")
-    harmonic: Scalar = harmonic("periods n a turn", _cogging_harmonics)
+    harmonic: Scalar = harmonic("periods n a turn", lambda log: log.waves, trial_count=lambda log: log.wave_count)
     phase: Scalar = angle("phase at theta = 0")
 
     def resist(self, state, motion):
@@ -126,7 +120,7 @@ class CoggingHarmonics(SideEffect):
     places = ("motor",)
     special_cases: ClassVar = {"cogging": _largest_wave}
     # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
-    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=lambda log: len(_cogging_harmonics(log)))
+    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=lambda log: log.wave_count)
     sine: Scalar = size("N m", "s_1", default=0.0)
     cosine: Scalar = size("N m", "c_1", default=0.0)
     sine_2: Scalar = size("N m", "s_2", default=0.0)
