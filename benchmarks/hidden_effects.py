@@ -85,7 +85,7 @@ def oracle(case: Case) -> Mapping[str, float]:
     import jax
     import numpy as np
 
-    from jaxbl.diagnosis.choice import new_search
+    from jaxbl.diagnosis.choice import Choice
     from jaxbl.diagnosis.diagnose import read_diagnosis_task
     from jaxbl.diagnosis.proof import open_held_out
     from jaxbl.diagnosis.setup import set_up
@@ -95,7 +95,7 @@ def oracle(case: Case) -> Mapping[str, float]:
         task = read_diagnosis_task(paths[0], case.model, holdout=other)
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = new_search(setup).fit(case.truth["effects"], np.zeros(len(setup.own)))
+        fitted = Choice(setup).search.fits.fit(case.truth["effects"], np.zeros(len(setup.own)))
         return open_held_out(setup)[1].compare(fitted.experiment).errors
 
 

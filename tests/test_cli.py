@@ -802,7 +802,6 @@ DIAGNOSIS = {
     ],
     "where": {"motor": {"sentence": "motor side, somewhere"}},
     "rest": {},
-    "withdrawn": [],
     "contradictions": [],
     "warnings": [],
     "notes": [],

@@ -83,7 +83,6 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
         "parameters": describe_parameters(record, setup.own, values, errors),
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
-        "withdrawn": [],
         "history": [step._asdict() for step in history],
         "notes": notes,
     }

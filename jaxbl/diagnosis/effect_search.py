@@ -225,8 +225,10 @@ class EffectSearch:
             single = [trial for trial in trials if len(trial.added) == 1]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             for trial in trials:
-                why = "most likely" if trial is best else "less likely" if trial in accepted else _ASKED
-                self._note(describe_change(ahead.numbers, trial.fitted.numbers), trial.gain, trial is best, why)
+                followed = "most likely" if accepted else "followed, as none is accepted"
+                why = followed if trial is best else "less likely" if trial in accepted else _ASKED
+                kept = trial is best and bool(accepted)
+                self._note(describe_change(ahead.numbers, trial.fitted.numbers), trial.gain, kept, why)
             if best is None or not best.worth > 0.0:
                 break
             if accepted:

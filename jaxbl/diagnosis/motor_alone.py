@@ -273,7 +273,6 @@ def _summary(
         "parameters": describe_parameters(record, search.own, values, errors),
         "where": {"motor": {"sentence": sentence}},
         "rest": {},
-        "withdrawn": [],
         "contradictions": [],
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing

@@ -9,16 +9,16 @@ from browser import check_figures, needs_chromium, open_pages
 from hidden_log import FRICTION, nominal_study, select_samples, simulate_direct_drive, simulate_multisine_log
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
-import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
 from jaxbl.diagnosis.blocks import is_better
-from jaxbl.diagnosis.choice import new_search
+from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
 from jaxbl.diagnosis.diagnosis_summary import tied
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
 from jaxbl.diagnosis.next_experiment import next_experiment, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
 from jaxbl.diagnosis.proof import open_held_out
+from jaxbl.diagnosis.refit import ModelFits
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import get_leaf, set_leaves
@@ -198,7 +198,7 @@ def test_what_is_known_exactly_is_no_candidate(logs):
     uncertainty = {"relative": 0.02, "exact": ["drive.motor_inertia", "actuator.gain_error"]}
     task = read_diagnosis_task(logs / "axis.csv", nominal_study(uncertainty=uncertainty))
     with jax.enable_x64(True):
-        lacking = new_search(set_up(task)).lacking
+        lacking = Choice(set_up(task)).search.lacking
     assert not {"motor.inertia", "actuator.gain_error"} & set(lacking)
     assert {"motor.viscous_friction", "motor.coulomb_friction"} <= set(lacking)
 
@@ -227,25 +227,25 @@ def test_new_numbers_are_better_all_in_all():
     )
 
 
-def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
+def test_an_effect_that_predicts_worse_is_not_named(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
-    refine = explain.refined
+    right = ModelFits.fit
 
-    def spoil_sizes(experiment, free, *inputs):
-        fit = refine(experiment, free, *inputs)
-        sizes = [number.path for number in free if number.path.startswith("effects.") and number.role == "size"]
+    def spoil_sizes(*inputs):
+        fit = right(*inputs)
+        sizes = [number.path for number in fit.free if number.path.startswith("effects.") and number.role == "size"]
         spoilt_experiment = set_leaves(fit.experiment, {path: 4.0 * get_leaf(fit.experiment, path) for path in sizes})
         return fit._replace(experiment=spoilt_experiment, left_out=None)
 
-    monkeypatch.setattr(explain, "refined", spoil_sizes)
+    monkeypatch.setattr(ModelFits, "fit", spoil_sizes)
     task = read_diagnosis_task(logs / "first.csv", nominal_study(), holdout=logs / "last.csv")
     stages = []
     diagnosis = run_diagnosis(task, lambda *counts: stages.append(counts))
-    assert stages == [(i, 6) for i in range(1, 7)]
+    assert stages == [(i, 5) for i in range(1, 6)]
     summary = diagnosis.summary
-    assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
-    assert summary["verdict"] == "unknown_effect"
-    assert any("was found, and withdrawn" in note for note in summary["notes"])
+    assert summary["findings"] == [] and summary["verdict"] == "unknown_effect"
+    tried = [step for step in summary["history"] if step["tried"] == "add motor.coulomb_friction"]
+    assert tried and not any(step["kept"] for step in tried)
     gap = summary["gap"]
     assert gap["holdout"]["separate"] is True
     for name in ("theta_e", "torque_motor"):

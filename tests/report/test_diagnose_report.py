@@ -43,7 +43,6 @@ SUMMARY = {
     "explained_share": 0.83,
     "contradictions": [],
     "parameters": {"drive.motor_inertia": {"value": 0.01, "nominal": 0.02}},
-    "withdrawn": [],
     "warnings": [],
     "notes": ["A note."],
     "gap": {
