@@ -105,13 +105,13 @@ def replaces(by: str, name: str) -> bool:
 
 
 def exclusive(name: str, others: Iterable[str]) -> bool:
-    """Whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
+    """Tell whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
     word, place = EFFECTS[name].exclusive, name.partition(".")[0]
     return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
 
 
 def contains(general: str, name: str) -> bool:
-    """Whether an effect has another one at the same place as its special case."""
+    """Tell whether an effect has another one at the same place as its special case."""
     place, _, kind = name.partition(".")
     return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
 

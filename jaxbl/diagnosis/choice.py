@@ -28,12 +28,10 @@ class Rival(NamedTuple):
 
     Attributes:
         effect: the other one.
-        instead_of: the one that was found.
         fitted: the model with it.
     """
 
     effect: str
-    instead_of: str
     fitted: FittedModel
 
 
@@ -101,7 +99,7 @@ class Choice:
         return self._fit_to_torque(chosen) if self._leaves_more(chosen, or_little=True) else chosen
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
-        """Tables of what no known effect explains, where something is left; `lacking`: the torque that is."""
+        """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
         if not self._is_plausible(chosen.fitted) or not self._leaves_more(chosen):
             return None
         tables = tabulate(self.log, chosen.fitted.experiment, chosen.compared, lacking, self.setup.sliding)
@@ -119,7 +117,7 @@ class Choice:
         return or_little and is_little(explained_share(setup.nominal, self.before.errors, whole.errors, expected))
 
     def _fit_to_torque(self, chosen: Chosen) -> Chosen:
-        """The model with the numbers of least missing torque, if they are better by blocks."""
+        """Take the numbers of least missing torque, if they are better by blocks."""
         fitted = fit_to_torque(self.search.fits, chosen.fitted, self.log) if chosen.fitted.names else None
         if fitted is None:
             return chosen
@@ -133,7 +131,7 @@ class Choice:
         return chosen._replace(fitted=fitted, compared=compared, by_torque=z) if kept else chosen
 
     def _as_given(self, fitted: FittedModel) -> FittedModel:
-        """The model with the numbers that it came with."""
+        """Return the model with the numbers that it came with."""
         own, known = self.setup.own, np.diag(self.setup.prior**2)
         # if nothing is missing, its numbers are off by as much as the fit says
         off = fitted.white + np.outer(fitted.theta, fitted.theta)
@@ -147,9 +145,7 @@ class Choice:
 
 
 def _closest(found: Explanation) -> Rival | None:
-    """The rival over which the effect in whose place it stands gains least."""
-    every = [(trial, name) for name, trials in found.rivals.items() for trial in trials if np.isfinite(trial.gain.nats)]
-    if not every:
-        return None
-    trial, name = min(every, key=lambda pair: pair[0].gain.nats)
-    return Rival(trial.added[0], name, trial.fitted)
+    """Find the rival over which the effect in whose place it stands gains least."""
+    every = [trial for trials in found.rivals.values() for trial in trials if np.isfinite(trial.gain.nats)]
+    best = min(every, key=lambda trial: trial.gain.nats, default=None)
+    return None if best is None else Rival(best.added[0], best.fitted)

@@ -39,7 +39,7 @@ class Finding(NamedTuple):
 
 
 def weigh(found: Explanation) -> tuple[Finding, ...]:
-    """Findings in the order in which they were found."""
+    """Weigh the effects that were found."""
     return tuple(_weigh(found, name) for name in found.fitted.names)
 
 
@@ -58,7 +58,7 @@ def _weigh(found: Explanation, name: str) -> Finding:
 
 
 def _certainty(fitted: FittedModel, name: str) -> float:
-    """Probability that some size of an effect is not zero; of an effect without sizes, some other number."""
+    """Return the probability that some size of an effect is not zero; of an effect without sizes, some other number."""
     cls, errors = EFFECTS[name], fitted.errors()
     paths = [f"effects.{name}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
@@ -66,7 +66,7 @@ def _certainty(fitted: FittedModel, name: str) -> float:
 
 
 def _agreed_nats(gain: Gain) -> float:
-    """Evidence over a rival, as far as the blocks agree: where they contradict it, they count as a normal deviate."""
+    """Return the evidence over a rival as far as the blocks agree; where they contradict it, they are a normal deviate."""
     z = gain.standard_errors
     agreed = gain.nats * float(np.clip((z if gain.nats > 0.0 else -z) / SURE, 0.0, 1.0))
     return float(np.clip(agreed + (0.5 * z * abs(z) if z * gain.nats < 0.0 else 0.0), -700.0, 700.0))

@@ -105,8 +105,8 @@ def diagnose(log: Logs, model: ConfigSource, *, holdout: Logs | None = None) -> 
     return run_diagnosis(read_diagnosis_task(log, model, holdout=holdout))
 
 
-_STAGES, _STAGES_ALONE = 5, 3
-"""Set-up, search, proof, observers, summary; from the motor alone fit, effects, proof."""
+_STAGES, _STAGES_ALONE = 6, 3
+"""Set-up, search, model, proof, observers, summary; from the motor alone fit, effects, proof."""
 
 
 def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diagnosis:

@@ -203,19 +203,17 @@ def extended_study(
 
 
 def tied(summary: JsonObject) -> tuple[str, str] | None:
-    """The last finding that has an alternative, and that; None where nothing is tied."""
-    findings = summary["findings"]
-    if not findings or "rival" not in summary or not findings[-1]["alternatives"]:
-        return None
-    return findings[-1]["effect"], summary["rival"]["effect"]
+    """The finding that the rival stands for, and the rival; None where nothing is tied."""
+    other = summary.get("rival", {}).get("effect")
+    found = (one["effect"] for one in summary["findings"] if other in [each["effect"] for each in one["alternatives"]])
+    name = next(found, None)
+    return None if name is None else (name, other)
 
 
 def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Rival) -> JsonObject:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.fitted.numbers, free_values(own, rival.fitted.theta), record).to_dict()
-    return {"effect": rival.effect, "instead_of": rival.instead_of} | {
-        key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data
-    }
+    return {"effect": rival.effect} | {key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data}
 
 
 def trace_of(

@@ -151,7 +151,7 @@ class EffectSearch:
     # ---- models beside one another ----
 
     def compare(self, fitted: FittedModel) -> Comparison:
-        """Errors of a model on the log, each quarter by numbers that were fitted without it."""
+        """Compare a model with the log, each quarter by numbers that were fitted without it."""
         key = fitted.names, fitted.theta.tobytes()
         if key not in self._compared:
             whole = self.log.compare(fitted.experiment)
@@ -160,7 +160,7 @@ class EffectSearch:
         return self._compared[key]
 
     def gain(self, before: FittedModel, after: FittedModel) -> Gain:
-        """What one model gains over another; infinite where one of them cannot be."""
+        """Tell what one model gains over another; infinite where one of them cannot be."""
         if not self._is_possible(after):
             return Gain(-np.inf, -np.inf)
         if not self._is_possible(before):
@@ -179,7 +179,7 @@ class EffectSearch:
         return Gain(nats, (most if least > _CONTRADICTED else least) + beyond)
 
     def accepts(self, gain: Gain, names: Iterable[str]) -> bool:
-        """The rule: whether a gain is enough for some effects.
+        """Apply the rule: tell whether a gain is enough for some effects.
 
         What depends on the time alone imitates whatever is slow or random; but then it does not go on in another part.
         """
@@ -187,7 +187,7 @@ class EffectSearch:
         return gain.nats > 0.0 and gain.standard_errors > asked
 
     def _is_possible(self, fitted: FittedModel) -> bool:
-        """Whether a model can be simulated, and each of its effects has a torque that counts."""
+        """Tell whether a model can be simulated, and each of its effects has a torque that counts."""
         return (
             fitted.foretold is not None
             and are_possible(fitted.numbers, self.log.period)
@@ -213,7 +213,7 @@ class EffectSearch:
         return found
 
     def _next(self, current: FittedModel) -> FittedModel | None:
-        """The best model with more effects that is accepted.
+        """Find the best model with more effects that is accepted.
 
         Where none is, the most likely one is followed for some steps: of two effects that hide each other neither gains
         alone.
@@ -240,7 +240,7 @@ class EffectSearch:
         return None
 
     def _try_all(self, current: FittedModel) -> list[Trial]:
-        """Models with more effects, of those that are proposed; without those that promise far less than others gained."""
+        """Try what is proposed, but for what promises far less than others gained."""
         trials: list[Trial] = []
         for proposal in self._propose(current) if len(current.names) < _MOST else ():
             if not any(proposal.nats < _PROMISING * trial.worth for trial in trials):
@@ -248,7 +248,7 @@ class EffectSearch:
         return trials
 
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
-        """A model with more effects, in place of those that cannot stand beside them."""
+        """Put more effects into a model, in place of those that cannot stand beside them."""
         new = proposal.numbers
         numbers = {name: one for name, one in current.numbers.items() if not any(replaces(by, name) for by in new)}
         announce(f"trying {' + '.join([*numbers, *new])}")
@@ -263,8 +263,11 @@ class EffectSearch:
         return Trial(tuple(new), fitted, self.gain(current, fitted), worth if self._is_possible(fitted) else -np.inf)
 
     def _reduce(self, current: FittedModel, *, thorough: bool = False) -> tuple[FittedModel, dict[str, Gain]]:
-        """A model without effects that gain nothing beside the others, and with special cases in place of those that gain
-        nothing over these; and what each effect gains. Unless `thorough`, well-known ones are not asked for."""
+        """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
+
+        Returns:
+            The model, and what each effect gains; unless `thorough`, well-known ones are not asked for.
+        """
         while True:
             gains: dict[str, Gain] = {}
             for name in current.names:
@@ -283,7 +286,7 @@ class EffectSearch:
                 return current, gains
 
     def _simplify(self, current: FittedModel, name: str) -> FittedModel | None:
-        """The model with a special case of an effect in its place, if the effect gains nothing over that."""
+        """Put a special case of an effect in its place, if the effect gains nothing over that."""
         place = name.partition(".")[0]
         for kind, reduced in EFFECTS[name].special_cases.items():
             plain = f"{place}.{kind}"
@@ -302,13 +305,13 @@ class EffectSearch:
         return None
 
     def _is_open(self, fitted: FittedModel, name: str) -> bool:
-        """Whether the torque of an effect is not known well."""
+        """Tell whether the torque of an effect is not known well."""
         sizes = [i for i, one in enumerate(fitted.free) if one.path.startswith(f"effects.{name}.") and one.role == "size"]
         known = [abs(fitted.theta[i]) > _KNOWN * fitted.deviation[i] for i in sizes]
         return not any(known)
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
-        """The best models with another effect in place of one, of those that were accepted in its round."""
+        """Fit models with another effect in place of one, of the best that were accepted in its round."""
         own, found = current.theta[: len(self.fits.prior)], []
         for trial in sorted(self._tried.get(name, []), key=lambda one: -one.gain.nats)[:2]:
             (other, *more) = trial.added
@@ -330,7 +333,7 @@ class EffectSearch:
     # ---- proposals ----
 
     def _propose(self, current: FittedModel) -> list[_Proposal]:
-        """Effects that may be missing, most promising first."""
+        """Propose effects that may be missing, most promising first."""
         own = current.theta[: len(self.fits.prior)]
         linear = self.fits.linearise(current.numbers, own)
         predictor = linear.choose(())
@@ -364,7 +367,7 @@ class EffectSearch:
         return found
 
     def _regress(self, linear: Linear, current: FittedModel, variants: Sequence[Candidate]) -> TorqueRegression:
-        """The regression on what a model lacks; errors of numbers that may change are no finding of it, and take part."""
+        """Prepare the regression on what a model lacks; errors of numbers that may change take part, and are no finding."""
         free = {name for name in self.lacking if linear.same(name) is not None and linear.nominal(name) is not None}
         base = [one for one in variants if one.name in free]
         # the recorded input is what is explained
@@ -374,7 +377,7 @@ class EffectSearch:
     def _rank(
         self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor
     ) -> list["_Promise"]:
-        """The best variant of each effect by the linearised model, best first, of those that promise anything."""
+        """Rank the best variants of effects by the linearised model, of those that promise anything."""
         if not np.isfinite(predictor.deviation).all():
             # no predictor follows this model
             return []
@@ -392,14 +395,14 @@ class EffectSearch:
         return sorted(best.values(), key=lambda one: -one.nats)
 
     def _nats(self, linear: Linear, base: Evidence, found: Evidence) -> float:
-        """Gain in evidence where the size of the errors is not known, less what structure in the noise may bring."""
+        """Tell the gain in evidence where the size of errors is not known, less what structure in the noise may bring."""
         errors = linear.count * len(linear.sides)
         explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(found.misfit, 1e-300)))
         price = found.log_evidence - base.log_evidence + 0.5 * (found.misfit - base.misfit)
         return price + explained - min(max(explained, 0.0), self.floor)
 
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
-        """Gain in evidence of free functions beside a model (nats), and their size over the driving torque, by name."""
+        """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
         linear = fitted.linear
         predictor, functions = linear.choose(()), functions_of(linear.signals)
         columns = linear.columns(functions, predictor.smoothness, predictor.deviation)
@@ -418,7 +421,7 @@ class EffectSearch:
 
 
 def _without(columns: Products, linear: Linear, names: Collection[str]) -> Products:
-    """Products for a model without the torque of some of its effects."""
+    """Change products to those of a model without the torque of some of its effects."""
     gone = [1 + i for i, one in enumerate(linear.free) if owner_of(one)[0] in names]
     change = np.eye(len(columns.scale))
     for k in gone:

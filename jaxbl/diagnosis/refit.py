@@ -122,7 +122,7 @@ class ModelFits:
         return {leaf: value * share if leaf in sizes else value for leaf, value in numbers.items()}
 
     def unit(self, name: str, leaf: str, numbers: Mapping[str, float]) -> float:
-        """Value of a size of an effect at which its torque is as large as effects are."""
+        """Find the value of a size of an effect at which its torque is as large as effects are."""
         if (name, leaf) not in self._units:
             alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in numbers.items()} | {leaf: 1.0}
             found = SHARE / max(self.given.torque_share(make_effect(name, **alone)), 1e-12)
@@ -161,7 +161,7 @@ class _Fit:
         self.log_prior = ODDS * len(numbers) + RARER * general - choices - float(np.sum(np.log(self.width)))
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
-        """Prediction errors along the path of the predictor."""
+        """Find the prediction errors along the path of the predictor."""
         path = self._path(theta, start, smoothness)
         linear = Linear(self.experiment, self.free, theta, self.width, path)
         predictor = linear.predictor(smoothness)
@@ -186,7 +186,8 @@ class _Fit:
             if not np.isfinite(best.cost):
                 break
             # along the smoothed motion what is chosen does not hang on what was chosen before
-            options = [self._choose(best.theta), best.linear.choose(()).smoothness]
+            near = best.linear.choose((), best.predictor.smoothness).smoothness
+            options = [self._choose(best.theta), best.linear.choose(()).smoothness, near]
             others = [
                 self._descend(self.at(best.theta, best.start, one))
                 for i, one in enumerate(options)
@@ -248,7 +249,7 @@ class _Fit:
         return found
 
     def finish(self, point: _Point) -> FittedModel:
-        """The model, its covariance, and its errors; each quarter's by numbers fitted without it."""
+        """Make the model, its covariance, and its errors; each quarter's by numbers fitted without it."""
         experiment = set_free_parameters(self.experiment, self.free, point.theta)
         end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.cost)
         own, sides = len(self.free), len(self.experiment.sides)
@@ -289,7 +290,7 @@ class _Fit:
         )  # fmt: skip
 
     def _release(self, found: FittedModel) -> FittedModel:
-        """The model in which effects have what is wrong with numbers that are free; the log tells their sums alone."""
+        """Give effects what is wrong with numbers that are free; the log tells their sums alone."""
         for name, i in self.released.items():
             number, (path,) = self.fits.free[i], paths_of([name])
             value, slope = (float(of(found.theta[i])) for of in (number.value, number.slope))
@@ -332,17 +333,17 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
 
 
 def fitted_numbers(name: str) -> list[str]:
-    """The numbers of an effect that are fitted: a harmonic is a whole number, and some are held."""
+    """List the numbers of an effect that are fitted: a harmonic is a whole number, and some are held."""
     return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind not in ("harmonic", "held")]
 
 
 def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
-    """Dotted paths of the free numbers of effects."""
+    """Return the dotted paths of the free numbers of effects."""
     return [f"effects.{name}.{leaf}" for name in names for leaf in fitted_numbers(name)]
 
 
 def owner_of(one: FreeParameter) -> tuple[str, str]:
-    """The effect that a number is of, and its name there."""
+    """Return the effect that a number is of, and its name there."""
     name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
     return name, leaf
 

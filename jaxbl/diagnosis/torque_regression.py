@@ -62,7 +62,7 @@ class TorqueRegression:
             base: candidates that take part in every fit: errors of numbers that may change.
             variants: candidates to be tried.
         """
-        self.variants, forces = variants, []
+        self.variants, forces = list(variants), []
         for one in linear.signals:
             # the model's own acceleration, where torque is missing, is not that of the log
             measured = MotionTorques(linear.experiment, replace(one.part, modelled=one.part.acceleration), one.shared)
@@ -88,11 +88,14 @@ class TorqueRegression:
             *columns, target = np.concatenate(rows, axis=1)
             # each side over its own missing torque
             size = np.sqrt(np.sum(target**2))
+            if len(target) < 2 * _BLOCKS:
+                # blocks of a row say nothing
+                self.variants = []
             self.sides.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
 
     def propose(self) -> list[TorqueProposal]:
-        """The best variant of each effect that surely takes something away, the best effect first."""
-        before, _ = self._cross_validate([])
+        """Propose the best variant of each effect that surely takes something away, the best effect first."""
+        before = self._cross_validate([])[0] if self.variants else []
         best: dict[str, TorqueProposal] = {}
         for one in self.variants:
             found = self._try([], one, before)
@@ -101,9 +104,9 @@ class TorqueRegression:
         return sorted(best.values(), key=lambda one: -one.share)
 
     def propose_together(self) -> dict[str, Numbers]:
-        """Effects that take most away one after the other, and their numbers together."""
+        """Propose effects that take most away one after the other, with their numbers together."""
         chosen: list[Candidate] = []
-        squares, _ = self._cross_validate([])
+        squares = self._cross_validate([])[0] if self.variants else []
         linear = [one for one in self.variants if not one.offset]
         while len(chosen) < _MOST:
             tried = []
@@ -118,7 +121,7 @@ class TorqueRegression:
             plain = [each for each in tried if contains(most[1].name, each[1].name) and each[0] > most[0] - SHOWN]
             _, best, squares = max(plain or [most], key=lambda each: each[0])
             chosen.append(best)
-        _, values = self._cross_validate(chosen)
+        values = self._cross_validate(chosen)[1] if chosen else np.zeros(0)
         numbers, at = {}, 0
         for one in chosen:
             of = one.numbers(values[at : at + one.width].tolist())
@@ -142,8 +145,9 @@ class TorqueRegression:
         return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio)), z), after
 
     def _cross_validate(self, chosen: Sequence[Candidate]) -> tuple[list[np.ndarray], np.ndarray]:
-        """Mean squared errors of each block left out, by side, and the coefficients by all blocks, those of the candidates
-        first.
+        """Find the mean squared errors of each block left out, by side, and the coefficients by all blocks.
+
+        The coefficients of candidates come first.
 
         An effect that is replaced is taken out of the model. Columns act on all sides with one coefficient, each side over
         its own missing torque.

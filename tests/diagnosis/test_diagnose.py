@@ -241,7 +241,7 @@ def test_an_effect_that_predicts_worse_is_not_named(logs, monkeypatch):
     task = read_diagnosis_task(logs / "first.csv", nominal_study(), holdout=logs / "last.csv")
     stages = []
     diagnosis = run_diagnosis(task, lambda *counts: stages.append(counts))
-    assert stages == [(i, 5) for i in range(1, 6)]
+    assert stages == [(i, 6) for i in range(1, 7)]
     summary = diagnosis.summary
     assert summary["findings"] == [] and summary["verdict"] == "unknown_effect"
     tried = [step for step in summary["history"] if step["tried"] == "add motor.coulomb_friction"]

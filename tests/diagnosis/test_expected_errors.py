@@ -8,7 +8,7 @@ import pytest
 from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 from scipy import stats
 
-from jaxbl.diagnosis.choice import new_search
+from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.expected_errors import LEVEL, _quantile, expected_errors, failed
 from jaxbl.diagnosis.proof import open_held_out
@@ -22,7 +22,7 @@ def compare_with_expected(folder, log, effects, noise=None):
     task = read_diagnosis_task(folder / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = new_search(setup).fit(effects, np.zeros(len(setup.own)))
+        fitted = Choice(setup).search.fits.fit(effects, np.zeros(len(setup.own)))
         _, holdout = open_held_out(setup)
         if noise is not None:
             segments = []

@@ -85,7 +85,7 @@ def test_own_columns_are_derivatives(sides):
     assert rms(columns.sum(axis=1) - expected) < 1e-3 * rms(expected)
 
 
-LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,), waves=(8.0,), wave_count=40)
+LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,), waves=tuple(range(1, 41)), wave_count=40)
 SMALL_NUMBERS = {
     "motor.coulomb_friction": {"torque": 1e-3},
     "motor.viscous_friction": {"viscous": 1e-4},

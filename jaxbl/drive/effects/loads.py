@@ -21,7 +21,11 @@ MAX_DAMPING_RATIO = 0.95
 
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
     """The harmonics of which the motion covers enough, in increasing order."""
-    return [float(n) for n in sorted(harmonics) if n * log.travel > _TRIAL_ARC]
+    return sorted(float(n) for n in harmonics if n * log.travel > _TRIAL_ARC)
+
+
+def _count_waves(log: Scales) -> int:
+    return log.wave_count
 
 
 def _ripple_harmonics(log: Scales) -> list[float]:
@@ -98,7 +102,7 @@ class Cogging(SideEffect):
     kind = "cogging"
     places = ("motor",)
     amplitude: Scalar = size("N m", "amplitude A")
-    harmonic: Scalar = harmonic("periods n a turn", lambda log: log.waves, trial_count=lambda log: log.wave_count)
+    harmonic: Scalar = harmonic("periods n a turn", lambda log: log.waves, trial_count=_count_waves)
     phase: Scalar = angle("phase at theta = 0")
 
     def resist(self, state, motion):
@@ -120,7 +124,7 @@ class CoggingHarmonics(SideEffect):
     places = ("motor",)
     special_cases: ClassVar = {"cogging": _largest_wave}
     # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
-    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=lambda log: log.wave_count)
+    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=_count_waves)
     sine: Scalar = size("N m", "s_1", default=0.0)
     cosine: Scalar = size("N m", "c_1", default=0.0)
     sine_2: Scalar = size("N m", "s_2", default=0.0)
