@@ -200,11 +200,13 @@ class EffectSearch:
         """Find what is missing."""
         nominal = current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
         visited: set[frozenset[str]] = set()
-        gains: dict[str, Gain] = {}
-        while frozenset(current.names) not in visited:
+        while True:
+            # effects that make each other needless would come and go without end
+            better = None if frozenset(current.names) in visited else self._next(current)
             visited.add(frozenset(current.names))
-            better = self._next(current)
             current, gains = self._reduce(better or current, thorough=better is None)
+            if better is None and frozenset(current.names) in visited:
+                break
         rivals = {name: self._rivals(current, name) for name in current.names}
         rest = self.remainder(current)
         found = Explanation(current, nominal, gains, rivals, rest)

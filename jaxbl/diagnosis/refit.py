@@ -304,6 +304,7 @@ class _Fit:
             spread = np.zeros(len(rows))
             spread[i], spread[-1] = 1.0, -1.0
             shared = known * np.outer(spread, spread)
+            assert found.left_out is not None
             theta = rows @ found.theta
             theta[-1] = (value - number.nominal) / float(added.scale)
             found = found._replace(
