@@ -92,7 +92,7 @@ class ModelFits:
         numbers: EffectNumbers,
         own: np.ndarray,
         begin: FittedModel | None = None,
-        new: Mapping[str, float] | Sequence[str] = (),
+        new: Sequence[str] = (),
         promise: float = np.inf,
     ) -> FittedModel:
         """Fit a model with some effects.

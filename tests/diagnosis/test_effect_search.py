@@ -105,3 +105,18 @@ def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
     assert explanation.left < CLEAR and explanation.fitted.names == (name,)
     for key, value in HIDDEN[name].items():
         assert explanation.fitted.numbers[name][key] == pytest.approx(value, rel=0.02)
+
+
+def test_waves_a_turn_are_found_wherever_they_are_and_beside_friction(tmp_path):
+    """72 waves: poles times slots; a spectrum over the position proposes them."""
+    hidden = [
+        {"kind": "motor.coulomb_friction", "torque": 0.06},
+        {"kind": "motor.cogging", "amplitude": 0.05, "harmonic": 72.0, "phase": 0.7},
+    ]
+    simulate_direct_drive(simulate_multisine_log().u[:1000], hidden, 3e-5, 1).write(tmp_path / "log.csv")
+    numbers = prepare_search(tmp_path / "log.csv", nominal_study()).run().fitted.numbers
+    assert set(numbers) == {effect["kind"] for effect in hidden}
+    assert numbers["motor.cogging"]["harmonic"] == 72.0
+    for effect in hidden:
+        for key in {"torque", "amplitude", "phase"} & set(effect):
+            assert numbers[effect["kind"]][key] == pytest.approx(effect[key], rel=0.03)
