@@ -10,12 +10,12 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (396256, 2.18, 2.64, 3.15),
+    "all": (396349, 2.18, 2.64, 3.15),
     "report": (61018, 0.25, 1.19, 0.67),
-    "diagnosis": (60915, 9.51, 9.26, 10.79),
+    "diagnosis": (60997, 9.49, 9.22, 10.73),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
-    "identification": (34417, 7.39, 13.84, 16.02),
+    "identification": (34428, 7.39, 13.84, 16.02),
     "sweeps": (28678, 0.07, 0.0, 0.0),
     "exports": (22808, 0.02, 0.0, 0.0),
     "fused": (24474, 0.0, 0.0, 0.0),

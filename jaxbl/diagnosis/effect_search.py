@@ -165,9 +165,9 @@ class EffectSearch:
             return Gain(-np.inf, -np.inf)
         if not self._is_possible(before):
             return Gain(np.inf, np.inf)
-        white = after.log_evidence - before.log_evidence
-        explained = max(after.log_likelihood - before.log_likelihood, 0.0)
-        nats = min(white - min(explained, self.floor), white + after.coloured - before.coloured)
+        nats = min(
+            self._white_gain(before, after), after.log_evidence + after.coloured - before.log_evidence - before.coloured
+        )
         assert before.foretold is not None and after.foretold is not None
         size = np.sqrt(np.mean(after.foretold**2, axis=0))
         foretold = standard_errors_between(*(mean_squares(each.foretold, size) for each in (before, after)))  # type: ignore
@@ -177,6 +177,11 @@ class EffectSearch:
         known = [float(np.sum((each.theta[: len(self.fits.prior)] / self.fits.prior) ** 2)) for each in (before, after)]
         beyond = float(np.sqrt(max(known[0] - known[1] - SURE**2, 0.0)))
         return Gain(nats, (most if least > _CONTRADICTED else least) + beyond)
+
+    def _white_gain(self, before: FittedModel, after: FittedModel) -> float:
+        """Tell the gain in evidence with white errors, less what structure in the noise may bring, nats."""
+        explained = max(after.log_likelihood - before.log_likelihood, 0.0)
+        return after.log_evidence - before.log_evidence - min(explained, self.floor)
 
     def accepts(self, gain: Gain, names: Iterable[str]) -> bool:
         """Apply the rule: tell whether a gain is enough for some effects.
@@ -223,15 +228,16 @@ class EffectSearch:
         ahead = current
         for _ in range(_AHEAD):
             trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
-            accepted = [trial for trial in trials if self.accepts(self.gain(current, trial.fitted), trial.fitted.names)]
-            single = [trial for trial in trials if len(trial.added) == 1]
+            likely = [trial for trial in trials if trial.worth > 0.0]
+            accepted = [trial for trial in likely if self.accepts(self.gain(current, trial.fitted), trial.fitted.names)]
+            single = [trial for trial in likely if len(trial.added) == 1]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             for trial in trials:
                 followed = "most likely" if accepted else "followed, as none is accepted"
                 why = followed if trial is best else "less likely" if trial in accepted else _ASKED
                 kept = trial is best and bool(accepted)
                 self._note(describe_change(ahead.numbers, trial.fitted.numbers), trial.gain, kept, why)
-            if best is None or not best.worth > 0.0:
+            if best is None:
                 break
             if accepted:
                 others = [trial for trial in accepted if trial is not best]
@@ -255,13 +261,14 @@ class EffectSearch:
         numbers = {name: one for name, one in current.numbers.items() if not any(replaces(by, name) for by in new)}
         announce(f"trying {' + '.join([*numbers, *new])}")
         own = current.theta[: len(self.fits.prior)]
-        fitted = self.fits.fit({**numbers, **new}, own + proposal.change, current, tuple(new), proposal.nats)
+        promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
+        fitted = self.fits.fit({**numbers, **new}, own + proposal.change, current, tuple(new), promise)
         felt = {name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LEAST}
         if 1 < len(felt) < len(new):
             # together with others, one may turn out to be nothing
             return self._try(current, proposal._replace(numbers=felt))
         # several at once have to be worth more than one of them
-        worth = (fitted.log_evidence - current.log_evidence) * (1.0 if len(new) == 1 else _PROMISING)
+        worth = self._white_gain(current, fitted) * (1.0 if len(new) == 1 else _PROMISING)
         return Trial(tuple(new), fitted, self.gain(current, fitted), worth if self._is_possible(fitted) else -np.inf)
 
     def _reduce(self, current: FittedModel, *, thorough: bool = False) -> tuple[FittedModel, dict[str, Gain]]:

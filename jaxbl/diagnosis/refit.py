@@ -93,7 +93,7 @@ class ModelFits:
         own: np.ndarray,
         begin: FittedModel | None = None,
         new: Sequence[str] = (),
-        promise: float = np.inf,
+        promise: float = 0.0,
     ) -> FittedModel:
         """Fit a model with some effects.
 
@@ -189,11 +189,15 @@ class _Fit:
             near = best.linear.choose((), best.predictor.smoothness).smoothness
             options = [self._choose(best.theta), best.linear.choose(()).smoothness, near]
             others = [
-                self._descend(self.at(best.theta, best.start, one))
+                self.at(best.theta, best.start, one)
                 for i, one in enumerate(options)
                 if one != best.predictor.smoothness and one not in options[:i]
             ]
-            other = min(others, key=lambda one: one.cost, default=best)
+            # the one that promises most is followed
+            other = min(others, key=self._promise, default=best)
+            if not self._promise(other) < best.cost - _SETTLED:
+                break
+            other = self._descend(other)
             if not other.cost < best.cost - _SETTLED:
                 break
             best = other
@@ -203,10 +207,14 @@ class _Fit:
         """Choose the predictor along the smoothed motion."""
         return Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
 
+    def _promise(self, point: _Point) -> float:
+        """Tell the cost that a linear step from a point promises."""
+        return point.predictor.cost(point.theta, self.width)
+
     def _descend(self, best: _Point) -> _Point:
         share = 1.0
         for _ in range(_STEPS):
-            if best.cost - best.predictor.cost(best.theta, self.width) < _SETTLED or share < 1e-3:
+            if best.cost - self._promise(best) < _SETTLED or share < 1e-3:
                 break
             by = best.predictor.coefficients
             change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)

@@ -49,7 +49,7 @@ class FreeParameter(NamedTuple):
         """The number at a theta, an array or a float."""
         value = self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
         if not isinstance(value, jax.Array):
-            return np.clip(value, self.minimum, self.maximum)
+            return np.clip(value, -np.inf if self.minimum is None else self.minimum, self.maximum)
         return value if self.maximum is None else jnp.minimum(value, self.maximum)
 
     def theta(self, value: float) -> float:
