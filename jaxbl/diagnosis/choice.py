@@ -79,6 +79,8 @@ class Choice:
         exact = setup.task.config.uncertainty.exact
         self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, exact)
         self.before = self.log.compare(setup.nominal)
+        # asked for twice of one model, and made of many draws
+        self._tested: tuple[FittedModel, bool, bool] | None = None
 
     @property
     def history(self) -> list[Step]:
@@ -110,11 +112,13 @@ class Choice:
     def _leaves_more(self, chosen: Chosen, *, or_little: bool = False) -> bool:
         """Tell whether a model leaves more on the log than a complete one would; or less than half explained."""
         setup, fitted = self.setup, chosen.fitted
-        whole = self.log.compare(fitted.experiment)
-        expected = expected_errors(self.log, fitted, whole, setup.input_noise, chosen.driving)
-        if failed(self.log.with_slow(whole), expected):
-            return True
-        return or_little and is_little(explained_share(setup.nominal, self.before.errors, whole.errors, expected))
+        if self._tested is None or self._tested[0] is not fitted:
+            whole = self.log.compare(fitted.experiment)
+            expected = expected_errors(self.log, fitted, whole, setup.input_noise, chosen.driving)
+            share = explained_share(setup.nominal, self.before.errors, whole.errors, expected)
+            self._tested = fitted, bool(failed(self.log.with_slow(whole), expected)), is_little(share)
+        _, fails, little = self._tested
+        return fails or (or_little and little)
 
     def _fit_to_torque(self, chosen: Chosen) -> Chosen:
         """Take the numbers of least missing torque, if they are better by blocks."""

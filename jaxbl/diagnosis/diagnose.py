@@ -194,7 +194,7 @@ def _missing(
     setup: Setup, proof: Proof, chosen: Chosen, lacking_after: SideResiduals
 ) -> dict[str, tuple[SideResiduals, SideResiduals]]:
     """Torques that models lack on the log and on what was held out, by names of columns: the model as given, the one with
-    the effects, that without each of them, and the one with another effect in place of the last."""
+    the effects, that without each of them, and the one with another effect in place of one."""
     fitted = chosen.fitted
     others = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
     if chosen.rival is not None:

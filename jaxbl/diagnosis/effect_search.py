@@ -37,7 +37,8 @@ _PROPOSED, _BY_TORQUE, _LEADERS = 5, 4, 3
 """Effects of each kind of proposal that are put into the model in a round at most, and those that get a predictor of their
 own before."""
 _PROMISING = 0.5
-"""A candidate is tried where it promises this share of the most nats that another one gained; promises are linear."""
+"""A candidate is tried where it promises this share of the most nats that another one gained (promises are linear), or takes
+away this share of the torque that the best one does; several together count by this share of their nats."""
 _KNOWN = 6.0
 """Standard errors of an effect's torque from which on it is not asked for again in the next round."""
 _AHEAD = 3
@@ -103,7 +104,6 @@ class Explanation:
 
     Attributes:
         fitted: the model with the effects that were found.
-        nominal: the model as given, its own numbers fitted.
         gains: over the model without an effect, by effect.
         rivals: models with another effect in place of one of these, and what the found one gains over each, by effect.
         rest: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size among
@@ -111,7 +111,6 @@ class Explanation:
     """
 
     fitted: FittedModel
-    nominal: FittedModel
     gains: dict[str, Gain]
     rivals: dict[str, list[Trial]]
     rest: dict[str, tuple[float, float]]
@@ -203,7 +202,7 @@ class EffectSearch:
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        nominal = current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
+        current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
         visited: set[frozenset[str]] = set()
         while True:
             # effects that make each other needless would come and go without end
@@ -213,8 +212,7 @@ class EffectSearch:
             if better is None and frozenset(current.names) in visited:
                 break
         rivals = {name: self._rivals(current, name) for name in current.names}
-        rest = self.remainder(current)
-        found = Explanation(current, nominal, gains, rivals, rest)
+        found = Explanation(current, gains, rivals, self.remainder(current))
         unknown = f"a free function still gains {found.left:.3g} nats; {CLEAR:g} show something unknown"
         self._note("fit free functions to what remains", Gain(found.left, np.nan), found.left > CLEAR, unknown)
         return found
@@ -331,8 +329,11 @@ class EffectSearch:
                 continue
             fitted = self.fits.fit({**numbers, other: trial.fitted.numbers[other]}, own, current, (other,))
             gain = self.gain(fitted, current)
-            self._note(f"replace {name} by {other}", gain, False, f"{name} is better", loss=True)
-            found.append(Trial((other,), fitted, gain, -gain.nats))
+            why = (
+                f"{name} is better by the same rule" if self.accepts(gain, [name]) else "neither is better by the same rule"
+            )
+            self._note(f"replace {name} by {other}", gain, False, why, loss=True)
+            found.append(trial._replace(fitted=fitted, gain=gain))
         return found
 
     def _note(self, tried: str, gain: Gain, kept: bool, why: str, *, loss: bool = False) -> None:

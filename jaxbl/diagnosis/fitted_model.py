@@ -14,7 +14,7 @@ from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear
 
-_LEAST_LEFT = 0.05
+LEAST_LEFT = 0.05
 """Share of a positive number that is left of it at least where it is moved."""
 
 
@@ -94,7 +94,7 @@ class FittedModel(NamedTuple):
         values = {}
         for number, at, by in zip(self.free, self.theta, change, strict=True):
             value, slope = float(number.value(at)), float(number.slope(at))
-            values[number.path] = max(value + slope * by, _LEAST_LEFT * value) if number.positive else value + slope * by
+            values[number.path] = max(value + slope * by, LEAST_LEFT * value) if number.positive else value + slope * by
         return set_leaves(self.experiment, arrays(values))
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
+from jaxbl.drive.effects.loads import TRIAL_ARC
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Arrays, Leaves
@@ -40,7 +41,6 @@ from jaxbl.workers import map_in_threads
 from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
 from .evidence import Products
 from .neutral_effects import bucket, corrected, lean, with_torques
-from .whittle import Spectrum, weighted_products
 
 _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
@@ -208,8 +208,6 @@ _FREQUENCIES, _COARSE = 8, 16
 """Peaks of the spectrum that are tried; frequencies at which the response to a torque is computed, smooth in between."""
 _LEAST_PERIODS = 3.0
 """Of a periodic torque in a log: with fewer it is a constant or a drift."""
-_LEAST_WAVES = 1.5
-"""Periods of a torque over the position that a log has to cover: over less it does not repeat."""
 _MOST_WAVES, _PLACES = 400, 8192
 """Periods a turn that are tried at most: more than poles times slots of most motors. Places of a turn, told apart."""
 _HIGHEST = 50.0
@@ -480,7 +478,7 @@ class Linear:
             by_place += np.bincount(np.minimum(where.astype(int), _PLACES - 1), slope, _PLACES)
             power += more
         number = np.arange(_PLACES // 2 + 1.0)
-        inside = (number * self._scales[place].travel >= _LEAST_WAVES * 2.0 * np.pi) & (number <= count)
+        inside = (number * self._scales[place].travel > TRIAL_ARC) & (number <= count)
         return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 0.0)
 
     def _wave_count(self, place: str) -> int:
@@ -513,9 +511,9 @@ class Linear:
         left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
         return [one[signals.real] for one, signals in zip(left, self.signals, strict=True)]
 
-    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Products:
+    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> Products:
         """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
-        eliminated; `noise`: rms of the errors by side, rad, where they are white, or their spectrum. Products of different
+        eliminated; `noise`: rms of the errors by side, rad. Products of different
         candidates are there for some only."""
         gain, own, groups = self.gain(smoothness), len(self.free), _groups(variants)
         places, offsets, at = [], [], 1 + own
@@ -526,10 +524,7 @@ class Linear:
             at += one.offset
 
         def products(signals: MotionTorques, forces: Forces) -> tuple[np.ndarray, np.ndarray]:
-            if isinstance(noise, Spectrum):
-                gram = weighted_products(_errors(signals.part, gain, forces)[signals.real], noise)
-            else:
-                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
+            gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
             return _eliminated(gram, self.states), self._power(forces, signals)
 
         jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]

@@ -28,7 +28,7 @@ class Control(NamedTuple):
     """What must not do as well on the proof as the model with effects.
 
     Attributes:
-        kind: `wrong`, the best model with another effect in place of the last, or `permuted`, the torque that the effects
+        kind: `wrong`, the best model with another effect in place of one of them, or `permuted`, the torque that the effects
             add, shuffled in time.
         errors: rms, by channel.
         z: standard errors by which the errors of the model with effects are smaller.

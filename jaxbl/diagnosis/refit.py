@@ -29,7 +29,7 @@ from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
 from .candidates import SHARE, EffectNumbers
-from .fitted_model import FitEnd, FittedModel
+from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import OFF, Linear, Predictor
 from .neutral_effects import complete, lean
 from .whittle import spectrum_of
@@ -173,7 +173,7 @@ class _Fit:
         own = own.copy()
         for name, i in self.released.items():
             one = self.fits.free[i]
-            own[i] = one.theta(max(one.nominal + next(iter(self.numbers[name].values())), 0.05 * one.nominal))
+            own[i] = one.theta(max(one.nominal + next(iter(self.numbers[name].values())), LEAST_LEFT * one.nominal))
         theta = np.concatenate([own, self.added])
         if begin is None:
             sides = self.experiment.sides

@@ -16,6 +16,7 @@ from jaxbl.drive.effects import Numbers
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.records.least_squares import BlockRegression
 
+from .blocks import SEEN
 from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
 from .linearised_model import Linear
 from .reference_log import ReferenceLog
@@ -31,13 +32,11 @@ _MOST = 6
 
 
 class TorqueProposal(NamedTuple):
-    """A candidate, its numbers, the share of the missing torque's rms that it takes away by cross-validation, and by how
-    many standard errors."""
+    """A candidate, its numbers, and the share of the missing torque's rms that it takes away by cross-validation."""
 
     name: str
     numbers: Numbers
     share: float
-    standard_errors: float
 
 
 class TorqueRegression:
@@ -70,7 +69,7 @@ class TorqueRegression:
             gone = [{place: -torque for place, torque in one.items()} for one in there]
             forces.append(Forces([*there, *gone, *columns_of([*base, *variants], measured)]))
         self.places: dict[Candidate, tuple[np.ndarray, list[int]]] = {}
-        self.names, at = tuple(names), 2 * len(names)
+        self.names, at = names, 2 * len(names)
         for candidate in (*base, *variants):
             end = at + candidate.width
             self.places[candidate] = np.arange(at, end), [end] if candidate.offset else []
@@ -140,9 +139,9 @@ class TorqueRegression:
         ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
         at = sum(other.width for other in beside)
         numbers = one.numbers(values[at : at + one.width].tolist())
-        if numbers is None or not z > 1.0:
+        if numbers is None or not z > SEEN:
             return None
-        return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio)), z), after
+        return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio))), after
 
     def _cross_validate(self, chosen: Sequence[Candidate]) -> tuple[list[np.ndarray], np.ndarray]:
         """Find the mean squared errors of each block left out, by side, and the coefficients by all blocks.

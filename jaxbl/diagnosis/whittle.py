@@ -35,11 +35,6 @@ class Spectrum(NamedTuple):
         known = np.log(self.frequency)
         return np.exp(np.stack([np.interp(where, known, np.log(one)) for one in self.power.T], axis=1))
 
-    @property
-    def coloured(self) -> bool:
-        """Whether the errors are clearly not white: by chance a spectrum is worth half of a nat a band."""
-        return self.gain > self.power.size
-
 
 def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
     """Spectrum of errors, part by part, each of shape (samples, sides)."""

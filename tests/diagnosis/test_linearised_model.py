@@ -14,7 +14,6 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
 from jaxbl.diagnosis.candidates import Forces, MotionTorques, columns_of, forces_of, variants_of
 from jaxbl.diagnosis.linearised_model import Linear
-from jaxbl.diagnosis.whittle import spectrum_of, weighted_products
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.free_parameters import make_free_parameters
@@ -165,20 +164,16 @@ def test_products_are_those_of_the_errors(sides):
     assert products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(products))
 
 
-@pytest.mark.parametrize("coloured", [False, True])
-def test_products_of_candidates_are_those_of_their_errors(geared_model, coloured):
+def test_products_of_candidates_are_those_of_their_errors(geared_model):
     """Candidates are taken some at a time: those beside one another are the same as all at once."""
     model = geared_model
     variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
-    noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
+    noise = np.array([2e-5, 3e-5])
     columns = model.columns(variants, smoothness, noise)
     assert len(columns.products) > model_columns + 2 * module._TOGETHER
     predicted = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
-    if coloured:
-        gram = weighted_products(predicted[model.signals[0].real], noise)
-    else:
-        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
+    gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
     expected = module._eliminated(gram, model.states)
     size = np.sqrt(np.diag(expected))
     for places, offset in zip(columns.places, columns.offsets, strict=True):

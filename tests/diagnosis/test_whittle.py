@@ -10,6 +10,11 @@ from jaxbl.diagnosis.whittle import Spectrum, spectrum_of, weighted_products
 POLE = 0.8
 
 
+def is_coloured(spectrum):
+    """By chance a spectrum is worth half of a nat a band."""
+    return spectrum.gain > spectrum.power.size
+
+
 def correlated_noise(samples, seed):
     """First-order noise in its steady state, of one side."""
     noise = np.random.default_rng(seed).standard_normal(samples + 500)
@@ -18,13 +23,13 @@ def correlated_noise(samples, seed):
 
 @pytest.mark.parametrize("samples", [99, 1000, 4001])
 def test_white_noise_has_no_colour(samples):
-    coloured = [spectrum_of([np.random.default_rng(i).standard_normal((samples, 2))]).coloured for i in range(20)]
+    coloured = [is_coloured(spectrum_of([np.random.default_rng(i).standard_normal((samples, 2))])) for i in range(20)]
     assert not any(coloured)
 
 
 def test_the_spectrum_of_first_order_noise():
     actual = spectrum_of([correlated_noise(20000, 1), correlated_noise(7001, 2)])
-    assert actual.coloured
+    assert is_coloured(actual)
     index = actual.at(1000)[:, 0]
     frequency = np.fft.rfftfreq(1000)
     expected = 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency)) ** 2
@@ -56,4 +61,4 @@ def test_products_are_those_of_generalised_least_squares():
 def test_a_log_in_many_short_parts():
     result = spectrum_of([np.random.default_rng(i).standard_normal((100, 1)) for i in range(30)])
     assert np.isfinite(result.at(100)).all()
-    assert not result.coloured
+    assert not is_coloured(result)

@@ -13,7 +13,7 @@ from .base import EFFECTS, Numbers, Scales, SideEffect, angle, frequency, harmon
 _POLE_PAIRS, _RIPPLE_HARMONICS = (1, 2, 3, 4, 5, 7), (1, 2, 6)
 """Pole pairs of common servo motors, and periods of ripple a pole pair: 1 from the offset of a current sensor, 2 from
 unequal gains of two sensors, 6 from commutation or windings that are not sinusoidal."""
-_TRIAL_ARC = 3.0 * np.pi
+TRIAL_ARC = 3.0 * np.pi
 """Part of a wave that the motion must cover for its harmonic to be tried, rad: over less it does not repeat."""
 MAX_DAMPING_RATIO = 0.95
 """Damping ratio above which an inertia behind a spring hardly swings, so that its frequency has no meaning."""
@@ -21,7 +21,7 @@ MAX_DAMPING_RATIO = 0.95
 
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
     """The harmonics of which the motion covers enough, in increasing order."""
-    return sorted(float(n) for n in harmonics if n * log.travel > _TRIAL_ARC)
+    return sorted(float(n) for n in harmonics if n * log.travel > TRIAL_ARC)
 
 
 def _count_waves(log: Scales) -> int:
