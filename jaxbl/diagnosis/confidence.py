@@ -10,7 +10,6 @@ from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.simulate import Experiment
 
-from .blocks import SURE
 from .effect_search import Explanation, Gain
 from .expected_errors import Expected
 from .fitted_model import FittedModel, special_case
@@ -66,10 +65,10 @@ def _certainty(fitted: FittedModel, name: str) -> float:
 
 
 def _agreed_nats(gain: Gain) -> float:
-    """Return the evidence over a rival as far as the blocks agree; where they contradict it, they are a normal deviate."""
-    z = gain.standard_errors
-    agreed = gain.nats * float(np.clip((z if gain.nats > 0.0 else -z) / SURE, 0.0, 1.0))
-    return float(np.clip(agreed + (0.5 * z * abs(z) if z * gain.nats < 0.0 else 0.0), -700.0, 700.0))
+    """Return the evidence over a rival as far as the blocks agree, whose z standard errors are z²/2 nats."""
+    by_blocks = 0.5 * gain.standard_errors * abs(gain.standard_errors)
+    agreed = min(gain.nats, by_blocks, key=abs) if gain.nats * by_blocks > 0.0 else by_blocks
+    return float(np.clip(agreed, -700.0, 700.0))
 
 
 def is_little(share: float | None) -> bool:

@@ -9,7 +9,7 @@ something else is missing.
 """
 
 import dataclasses
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
-from .blocks import FLOOR, SEEN, SURE, mean_squares, standard_errors_better, standard_errors_between, take_folds
+from .blocks import FLOOR, SURE, mean_squares, standard_errors_better, standard_errors_between, take_folds
 from .candidates import SHARE, Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
@@ -43,7 +43,6 @@ _KNOWN = 6.0
 """Standard errors of an effect's torque from which on it is not asked for again in the next round."""
 _AHEAD = 3
 """Steps that are followed where none is accepted."""
-_ASKED = f"nats above 0 and {SEEN:g} standard error are asked"
 _CONTRADICTED = -2.0
 """Standard errors: what predicts worse than this in one way has to be wrong, whatever the others say."""
 FAR = 5.0
@@ -63,14 +62,25 @@ class Gain(NamedTuple):
     """What one model has over another.
 
     Attributes:
-        nats: of log-evidence on the log, less what structure in the noise may bring (:data:`.blocks.FLOOR`), or as if the
-            prediction errors might have any spectrum, whichever is less.
+        nats: of log-evidence on the log.
         standard_errors: by which it predicts blocks of the log better, by numbers fitted without them: in prediction errors,
             or in windows and torques, unless the other ones surely contradict.
+        asked: standard errors that make up for its odds before the log is seen: z standard errors are z²/2 nats.
     """
 
     nats: float
     standard_errors: float
+    asked: float = 0.0
+
+    @property
+    def accepted(self) -> bool:
+        """The rule: whether the log and its blocks are for the one model, each by more than its odds are against it."""
+        return self.nats > 0.0 and self.standard_errors > self.asked
+
+    @property
+    def rule(self) -> str:
+        """What is asked of it."""
+        return f"nats above 0 and {self.asked:.2g} standard errors are asked"
 
 
 class Trial(NamedTuple):
@@ -160,13 +170,11 @@ class EffectSearch:
 
     def gain(self, before: FittedModel, after: FittedModel) -> Gain:
         """Tell what one model gains over another; infinite where one of them cannot be."""
+        asked = float(np.sqrt(2.0 * max(before.log_odds - after.log_odds, 0.0)))
         if not self._is_possible(after):
-            return Gain(-np.inf, -np.inf)
+            return Gain(-np.inf, -np.inf, asked)
         if not self._is_possible(before):
-            return Gain(np.inf, np.inf)
-        nats = min(
-            self._white_gain(before, after), after.log_evidence + after.coloured - before.log_evidence - before.coloured
-        )
+            return Gain(np.inf, np.inf, asked)
         assert before.foretold is not None and after.foretold is not None
         size = np.sqrt(np.mean(after.foretold**2, axis=0))
         foretold = standard_errors_between(*(mean_squares(each.foretold, size) for each in (before, after)))  # type: ignore
@@ -175,20 +183,8 @@ class EffectSearch:
         # what is known of the model's own numbers counts, but for what two standard deviations explain
         known = [float(np.sum((each.theta[: len(self.fits.prior)] / self.fits.prior) ** 2)) for each in (before, after)]
         beyond = float(np.sqrt(max(known[0] - known[1] - SURE**2, 0.0)))
-        return Gain(nats, (most if least > _CONTRADICTED else least) + beyond)
-
-    def _white_gain(self, before: FittedModel, after: FittedModel) -> float:
-        """Tell the gain in evidence with white errors, less what structure in the noise may bring, nats."""
-        explained = max(after.log_likelihood - before.log_likelihood, 0.0)
-        return after.log_evidence - before.log_evidence - min(explained, self.floor)
-
-    def accepts(self, gain: Gain, names: Iterable[str]) -> bool:
-        """Apply the rule: tell whether a gain is enough for some effects.
-
-        What depends on the time alone imitates whatever is slow or random; but then it does not go on in another part.
-        """
-        asked = SURE if any(EFFECTS[name].in_time for name in names) else SEEN
-        return gain.nats > 0.0 and gain.standard_errors > asked
+        shown = (most if least > _CONTRADICTED else least) + beyond
+        return Gain(after.log_evidence - before.log_evidence, shown, asked)
 
     def _is_possible(self, fitted: FittedModel) -> bool:
         """Tell whether a model can be simulated, and each of its effects has a torque that counts."""
@@ -226,13 +222,13 @@ class EffectSearch:
         ahead = current
         for _ in range(_AHEAD):
             trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
-            likely = [trial for trial in trials if trial.worth > 0.0]
-            accepted = [trial for trial in likely if self.accepts(self.gain(current, trial.fitted), trial.fitted.names)]
-            single = [trial for trial in likely if len(trial.added) == 1]
+            accepted = [trial for trial in trials if self.gain(current, trial.fitted).accepted]
+            # structure in the noise is not followed
+            single = [trial for trial in trials if len(trial.added) == 1 and trial.worth > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             for trial in trials:
                 followed = "most likely" if accepted else "followed, as none is accepted"
-                why = followed if trial is best else "less likely" if trial in accepted else _ASKED
+                why = followed if trial is best else "less likely" if trial in accepted else trial.gain.rule
                 kept = trial is best and bool(accepted)
                 self._note(describe_change(ahead.numbers, trial.fitted.numbers), trial.gain, kept, why)
             if best is None:
@@ -266,8 +262,8 @@ class EffectSearch:
             # together with others, one may turn out to be nothing
             return self._try(current, proposal._replace(numbers=felt))
         # several at once have to be worth more than one of them
-        worth = self._white_gain(current, fitted) * (1.0 if len(new) == 1 else _PROMISING)
-        return Trial(tuple(new), fitted, self.gain(current, fitted), worth if self._is_possible(fitted) else -np.inf)
+        gain = self.gain(current, fitted)
+        return Trial(tuple(new), fitted, gain, gain.nats * (1.0 if len(new) == 1 else _PROMISING))
 
     def _reduce(self, current: FittedModel, *, thorough: bool = False) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
@@ -283,9 +279,8 @@ class EffectSearch:
                     numbers = {other: one for other, one in current.numbers.items() if other != name}
                     less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
                     gains[name] = self.gain(less, current)
-                    kept = self.accepts(gains[name], [name])
-                    self._note(f"remove {name}", gains[name], not kept, _ASKED, loss=True)
-                    fewer = None if kept else less
+                    self._note(f"remove {name}", gains[name], not gains[name].accepted, gains[name].rule, loss=True)
+                    fewer = None if gains[name].accepted else less
                 if fewer is not None:
                     current = fewer
                     break
@@ -305,9 +300,8 @@ class EffectSearch:
             }
             less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
             gain = self.gain(less, current)
-            kept = not self.accepts(gain, [name])
-            self._note(f"replace {name} by {plain}", gain, kept, _ASKED, loss=True)
-            if kept:
+            self._note(f"replace {name} by {plain}", gain, not gain.accepted, gain.rule, loss=True)
+            if not gain.accepted:
                 return less
         return None
 
@@ -329,15 +323,13 @@ class EffectSearch:
                 continue
             fitted = self.fits.fit({**numbers, other: trial.fitted.numbers[other]}, own, current, (other,))
             gain = self.gain(fitted, current)
-            why = (
-                f"{name} is better by the same rule" if self.accepts(gain, [name]) else "neither is better by the same rule"
-            )
+            why = f"{name if gain.accepted else 'neither'} is better by the same rule"
             self._note(f"replace {name} by {other}", gain, False, why, loss=True)
             found.append(trial._replace(fitted=fitted, gain=gain))
         return found
 
     def _note(self, tried: str, gain: Gain, kept: bool, why: str, *, loss: bool = False) -> None:
-        nats, z = (-one if loss else one for one in gain)
+        nats, z = (-one if loss else one for one in gain[:2])
         self.history.append(Step(tried, float(nats), None if np.isnan(z) else float(z), kept, why))
 
     # ---- proposals ----
@@ -405,11 +397,10 @@ class EffectSearch:
         return sorted(best.values(), key=lambda one: -one.nats)
 
     def _nats(self, linear: Linear, base: Evidence, found: Evidence) -> float:
-        """Tell the gain in evidence where the size of errors is not known, less what structure in the noise may bring."""
+        """Tell the gain in evidence where the size of errors is not known."""
         errors = linear.count * len(linear.sides)
         explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(found.misfit, 1e-300)))
-        price = found.log_evidence - base.log_evidence + 0.5 * (found.misfit - base.misfit)
-        return price + explained - min(max(explained, 0.0), self.floor)
+        return found.log_evidence - base.log_evidence + 0.5 * (found.misfit - base.misfit) + explained
 
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
         """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
@@ -425,7 +416,8 @@ class EffectSearch:
                 sized = dataclasses.replace(columns, scale=scale)
                 none, some = evidence_of(sized), evidence_of(sized, functions, i)
                 assert none is not None and some is not None
-                best = max(best, (self._nats(linear, none, some), size * SHARE))
+                nats = self._nats(linear, none, some)
+                best = max(best, (nats - min(max(nats, 0.0), self.floor), size * SHARE))
             gained[one.name] = best
         return gained
 

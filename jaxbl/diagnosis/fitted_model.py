@@ -45,10 +45,9 @@ class FittedModel(NamedTuple):
         linear: the model along the log; of the model as given, with its own numbers fitted.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
         log_likelihood: nats; only differences count.
-        log_prior: nats that the effects cost before the log is seen: their odds, and the widths of their numbers.
+        log_odds: of the effects before the log is seen, nats.
         log_evidence: nats, by Laplace's method (D. MacKay, Neural Computation 4, 1992); only differences count.
         foretold: prediction errors, each quarter by numbers fitted without it, rad, shape (samples, sides).
-        coloured: what the logarithm of the likelihood is more if the errors may have any spectrum, nats.
         end: where the fit ended: another one begins there.
     """
 
@@ -61,10 +60,9 @@ class FittedModel(NamedTuple):
     linear: Linear
     left_out: np.ndarray | None = None
     log_likelihood: float = np.nan
-    log_prior: float = 0.0
+    log_odds: float = 0.0
     log_evidence: float = -np.inf
     foretold: np.ndarray | None = None
-    coloured: float = 0.0
     end: "FitEnd | None" = None
 
     def share(self, name: str) -> float:

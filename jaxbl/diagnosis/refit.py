@@ -32,7 +32,6 @@ from .candidates import SHARE, EffectNumbers
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import OFF, Linear, Predictor
 from .neutral_effects import complete, lean
-from .whittle import spectrum_of
 
 _STEPS = 25
 """Of Gauss-Newton at most under one predictor, rejected ones among them."""
@@ -158,7 +157,7 @@ class _Fit:
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
         general = sum(bool(EFFECTS[name].special_cases) for name in numbers)
-        self.log_prior = ODDS * len(numbers) + RARER * general - choices - float(np.sum(np.log(self.width)))
+        self.log_odds = ODDS * len(numbers) + RARER * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
         """Find the prediction errors along the path of the predictor."""
@@ -264,7 +263,7 @@ class _Fit:
         none = np.full((own, own), np.inf)
         found = FittedModel(
             tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, own)),
-            0.5 * float(np.sum((point.theta / self.width) ** 2) - point.cost), self.log_prior, end=end,
+            0.5 * float(np.sum((point.theta / self.width) ** 2) - point.cost), self.log_odds, end=end,
         )  # fmt: skip
         if not np.isfinite(point.cost):
             return found
@@ -278,7 +277,6 @@ class _Fit:
             rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
             pieces.append(rest.reshape(-1, sides, 1 + own)[signals.real])
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
-        spectrum = spectrum_of([size * piece[:, :, 0] for piece in pieces])
         foretold = errors[:, :, 0].copy()
         changes = np.zeros((QUARTERS, own))
         covariance = inverse = np.zeros((0, 0))
@@ -292,8 +290,9 @@ class _Fit:
                 foretold[rows] += slopes[rows] @ change
         return self._release(
             found._replace(
-                covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold, coloured=spectrum.gain,
-                log_evidence=found.log_prior - 0.5 * point.cost + 0.5 * float(np.linalg.slogdet(inverse)[1]),
+                covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold,
+                log_evidence=found.log_odds - 0.5 * point.cost
+                + 0.5 * float(np.linalg.slogdet(inverse)[1]) - float(np.sum(np.log(self.width))),
             )
         )  # fmt: skip
 

@@ -22,12 +22,10 @@ class Spectrum(NamedTuple):
     Attributes:
         frequency: middle of each band, cycles a sample.
         power: variance of a sample, if it were so at all frequencies, by side; rad^2, shape (bands, sides).
-        gain: what it is worth beside a flat one, nats.
     """
 
     frequency: np.ndarray
     power: np.ndarray
-    gain: float
 
     def at(self, samples: int) -> np.ndarray:
         """Power at the frequencies of that many samples, shape (frequencies, sides)."""
@@ -48,14 +46,7 @@ def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
     # parts have a frequency 0 each
     middle = np.maximum([np.mean(frequency[band]) for band in bands], 1e-9)
     level = np.stack([np.average(power[band], axis=0, weights=weight[band]) for band in bands])
-    level = np.maximum(level, 1e-300)
-    flat = np.average(power, axis=0, weights=weight)
-    found = Spectrum(middle, level, 0.0)
-    gain = 0.0
-    for samples, one, factor in zip(map(len, errors), powers, weights, strict=True):
-        at = found.at(samples)
-        gain += 0.5 * float(np.sum(factor[:, None] * (np.log(flat / at) + one / flat - one / at)))
-    return found._replace(gain=gain)
+    return Spectrum(middle, np.maximum(level, 1e-300))
 
 
 def weighted_products(errors: np.ndarray, spectrum: Spectrum) -> np.ndarray:

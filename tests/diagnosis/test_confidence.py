@@ -46,7 +46,9 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(length,
 
 
 def test_what_the_fit_says_counts_only_if_blocks_agree():
-    assert weigh_effect((50.0, 2.0)).alternatives == ()
+    assert weigh_effect((50.0, 4.0)).alternatives == ()
+    # z standard errors are z²/2 nats
+    assert weigh_effect((50.0, 2.0)).confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.0)))
     finding = weigh_effect((50.0, 0.0))
     assert finding.confidence == pytest.approx(0.5) and finding.alternatives == ((RIVAL, pytest.approx(0.5)),)
     # and where they contradict it they count as a normal deviate

@@ -10,11 +10,6 @@ from jaxbl.diagnosis.whittle import Spectrum, spectrum_of, weighted_products
 POLE = 0.8
 
 
-def is_coloured(spectrum):
-    """By chance a spectrum is worth half of a nat a band."""
-    return spectrum.gain > spectrum.power.size
-
-
 def correlated_noise(samples, seed):
     """First-order noise in its steady state, of one side."""
     noise = np.random.default_rng(seed).standard_normal(samples + 500)
@@ -22,20 +17,17 @@ def correlated_noise(samples, seed):
 
 
 @pytest.mark.parametrize("samples", [99, 1000, 4001])
-def test_white_noise_has_no_colour(samples):
-    coloured = [is_coloured(spectrum_of([np.random.default_rng(i).standard_normal((samples, 2))])) for i in range(20)]
-    assert not any(coloured)
+def test_the_spectrum_of_white_noise_is_flat(samples):
+    found = [spectrum_of([np.random.default_rng(i).standard_normal((samples, 2))]).at(samples) for i in range(20)]
+    np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.25)
 
 
 def test_the_spectrum_of_first_order_noise():
     actual = spectrum_of([correlated_noise(20000, 1), correlated_noise(7001, 2)])
-    assert is_coloured(actual)
     index = actual.at(1000)[:, 0]
     frequency = np.fft.rfftfreq(1000)
     expected = 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency)) ** 2
     np.testing.assert_allclose(index[2:], expected[2:], rtol=0.25)
-    # worth what the innovations' variance is less than the noise's own
-    assert actual.gain == pytest.approx(-0.5 * 27001 * np.log(1.0 - POLE**2), rel=0.05)
 
 
 def test_a_flat_spectrum_gives_sums_of_products():
@@ -51,7 +43,7 @@ def test_products_are_those_of_generalised_least_squares():
     time = np.arange(samples)
     columns = np.stack([np.sin(0.01 * time), np.sign(np.sin(0.02 * time)), np.ones(samples)], axis=1)
     frequency = np.geomspace(1e-4, 0.5, 400)
-    spectrum = Spectrum(frequency, 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency))[:, None] ** 2, 0.0)
+    spectrum = Spectrum(frequency, 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency))[:, None] ** 2)
     covariance = POLE**time / (1.0 - POLE**2)
     expected = columns.T @ solve_toeplitz(covariance, columns)
     actual = weighted_products(columns[:, None], spectrum)
@@ -60,5 +52,4 @@ def test_products_are_those_of_generalised_least_squares():
 
 def test_a_log_in_many_short_parts():
     result = spectrum_of([np.random.default_rng(i).standard_normal((100, 1)) for i in range(30)])
-    assert np.isfinite(result.at(100)).all()
-    assert not is_coloured(result)
+    np.testing.assert_allclose(result.at(100), 1.0, atol=0.25)
