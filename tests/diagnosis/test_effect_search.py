@@ -7,7 +7,7 @@ from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
 from jaxbl.diagnosis.confidence import weigh
-from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch, Gain
+from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.identification.free_parameters import make_free_parameters
