@@ -27,7 +27,8 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     model that multiplies all of them, and the input, by one factor misses the same.
     """
     both = (control, model)
-    channels = [name for name in control.samples if not name.startswith("velocity")]
+    # of fewer samples than blocks nothing can be said
+    channels = [name for name, one in control.samples.items() if not name.startswith("velocity") and one.size >= BLOCKS]
     scales = [{name: each.gain if name.startswith("torque") else 1.0 for name in channels} for each in both]
     floors = [log.noise_floor(each.torques) for each in both]
     noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}

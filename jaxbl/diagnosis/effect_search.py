@@ -59,7 +59,7 @@ LEAST = 1e-3
 
 
 class Gain(NamedTuple):
-    """What one model has over another.
+    """States what one model has over another.
 
     Attributes:
         nats: of log-evidence on the log.
@@ -73,7 +73,7 @@ class Gain(NamedTuple):
     asked: float = 0.0
 
     @property
-    def accepted(self) -> bool:
+    def is_accepted(self) -> bool:
         """The rule: whether the log and its blocks are for the one model, each by more than its odds are against it."""
         return self.nats > 0.0 and self.standard_errors > self.asked
 
@@ -84,7 +84,7 @@ class Gain(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A model that was tried.
+    """Holds a model that was tried.
 
     Attributes:
         added: the effects that it has more.
@@ -132,7 +132,7 @@ class Explanation:
 
 
 class EffectSearch:
-    """The search for missing effects on a log."""
+    """Searches a log for effects that a model lacks."""
 
     def __init__(
         self,
@@ -222,7 +222,7 @@ class EffectSearch:
         ahead = current
         for _ in range(_AHEAD):
             trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
-            accepted = [trial for trial in trials if self.gain(current, trial.fitted).accepted]
+            accepted = [trial for trial in trials if self.gain(current, trial.fitted).is_accepted]
             # structure in the noise is not followed
             single = [trial for trial in trials if len(trial.added) == 1 and trial.worth > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
@@ -279,8 +279,8 @@ class EffectSearch:
                     numbers = {other: one for other, one in current.numbers.items() if other != name}
                     less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
                     gains[name] = self.gain(less, current)
-                    self._note(f"remove {name}", gains[name], not gains[name].accepted, gains[name].rule, loss=True)
-                    fewer = None if gains[name].accepted else less
+                    self._note(f"remove {name}", gains[name], not gains[name].is_accepted, gains[name].rule, loss=True)
+                    fewer = None if gains[name].is_accepted else less
                 if fewer is not None:
                     current = fewer
                     break
@@ -300,8 +300,8 @@ class EffectSearch:
             }
             less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
             gain = self.gain(less, current)
-            self._note(f"replace {name} by {plain}", gain, not gain.accepted, gain.rule, loss=True)
-            if not gain.accepted:
+            self._note(f"replace {name} by {plain}", gain, not gain.is_accepted, gain.rule, loss=True)
+            if not gain.is_accepted:
                 return less
         return None
 
@@ -323,7 +323,7 @@ class EffectSearch:
                 continue
             fitted = self.fits.fit({**numbers, other: trial.fitted.numbers[other]}, own, current, (other,))
             gain = self.gain(fitted, current)
-            why = f"{name if gain.accepted else 'neither'} is better by the same rule"
+            why = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
             self._note(f"replace {name} by {other}", gain, False, why, loss=True)
             found.append(trial._replace(fitted=fitted, gain=gain))
         return found
