@@ -6,6 +6,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 
 from jaxbl import config
+from jaxbl.diagnosis.thresholds import Thresholds
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import parameters
 from jaxbl.drive.transmission import TRANSMISSIONS
@@ -118,6 +119,13 @@ def page() -> str:
         "a model, has the figures.\n\n| law or effect | said | by what, or why not |\n|---|---|---|"
     )
     parts += mujoco_rows()
+    parts.append(
+        "\n## Thresholds of a diagnosis\n\nWhat decides which effects [`jaxbl diagnose`](diagnosis.md) names, and its "
+        "verdict. For research: `with jaxbl.diagnosis.thresholds.use_thresholds(sure=2.6): ...`.\n\n"
+        "| threshold | value | in | meaning |\n|---|---|---|---|"
+    )
+    for field, about in parameters(Thresholds):
+        parts.append(f"| `{field.name}` | {field.default:g} | {about.unit} | {about.doc} |")
     return "\n".join(parts) + "\n"
 
 

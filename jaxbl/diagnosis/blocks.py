@@ -5,18 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from .reference_log import Comparison, Errors, ReferenceLog
+from .thresholds import LIMITS
 
 BLOCKS = 16
 """Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
 logs."""
 QUARTERS = 4
 """Parts of a log that numbers are fitted without, one after the other: each as much as is held out."""
-SEEN = 1.0
-"""Standard errors by which a channel shows a difference, as a stepwise regression by blocks asks."""
-SURE = 2.0
-"""Standard errors that count as a difference between two models: 2 % by chance."""
-FLOOR = 0.006
-"""Nats a prediction error that structure in the noise (above all quantisation) may bring: 1.2 % of its variance."""
 
 
 def standard_errors_better(log: ReferenceLog, control: Comparison, model: Comparison) -> float:
@@ -38,7 +33,7 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     ]
     together = standard_errors_between(*costs)
     by_channel = [standard_errors_between(*channel) for channel in zip(*costs, strict=True)]
-    return max(together, *by_channel) if min(by_channel) > -SEEN and max(by_channel) > SEEN else together
+    return max(together, *by_channel) if min(by_channel) > -LIMITS.seen and max(by_channel) > LIMITS.seen else together
 
 
 def mean_squares(errors: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
@@ -57,7 +52,7 @@ def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
     if not (np.isfinite(control).all() and np.isfinite(model).all()):
         return -np.inf if np.isfinite(control).all() else np.inf
     gains = np.mean(np.atleast_2d(np.log1p(control) - np.log1p(model)), axis=0)
-    return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(BLOCKS), 2.0 * FLOOR))
+    return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(BLOCKS), 2.0 * LIMITS.noise_structure))
 
 
 def is_better(new: Errors, old: Errors) -> bool:
@@ -84,7 +79,7 @@ def is_worse(after: Comparison, before: Comparison, noise: Errors) -> bool:
         if not value <= _SURELY * most:
             return True
         other, own = (mean_squares(each.samples[name], noise[name]) for each in (before, after))
-        if not standard_errors_between(other, own) > -SURE:
+        if not standard_errors_between(other, own) > -LIMITS.sure:
             return True
     return False
 

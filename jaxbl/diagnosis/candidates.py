@@ -116,14 +116,14 @@ def contains(general: str, name: str) -> bool:
     return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
 
 
-SHARE = 0.3
-"""Prior size of an effect: share of the driving torque's rms."""
 _AT_ONCE = 6
 """Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02
 """Change of the logarithm of a number by which the slope at a trial value is found."""
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
+_REACH = 4.0 * SPACING
+"""Change of that logarithm from which on another trial value would be nearer."""
 
 
 def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Candidate]:
@@ -193,7 +193,7 @@ def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         (change,) = values
-        return known | {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
+        return known | {leaf: value * math.exp(change)} if abs(change) < _REACH else None
 
     return Candidate(name, 1, tried, columns, numbers_of, offset=True, from_rest=from_rest)
 

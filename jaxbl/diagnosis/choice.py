@@ -10,15 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .blocks import SEEN, is_better, is_worse, standard_errors_better
+from .blocks import is_better, is_worse, standard_errors_better
 from .confidence import Finding, explained_share, is_little, weigh
-from .effect_search import CLEAR, FAR, EffectSearch, Explanation, VerdictName
+from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, failed
 from .fitted_model import FittedModel
 from .history import Step
 from .reference_log import Comparison
 from .residuals import SideResiduals
 from .setup import Setup
+from .thresholds import LIMITS
 from .torque_fit import fit_to_torque
 from .torque_tables import Tabulation, tabulate
 
@@ -60,7 +61,7 @@ class Chosen(NamedTuple):
     @property
     def verdict(self) -> VerdictName:
         """What the log alone says."""
-        if self.found.left > CLEAR or self.by_torque > 0.0:
+        if self.found.left > LIMITS.unknown or self.by_torque > 0.0:
             return "unknown_effect"
         return "explained" if self.fitted.names else "no_discrepancy"
 
@@ -129,8 +130,12 @@ class Choice:
         z = standard_errors_better(self.log, chosen.compared, compared)
         noise = self.log.noise_floor(self.before.torques)
         possible = self._is_plausible(fitted) and not is_worse(compared, self.before, noise)
-        kept = z > SEEN and possible
-        why = f"{SEEN:g} standard error is asked" if possible else "its numbers cannot be, or the model as given is better"
+        kept = z > LIMITS.seen and possible
+        why = (
+            f"{LIMITS.seen:g} standard error is asked"
+            if possible
+            else "its numbers cannot be, or the model as given is better"
+        )
         self.history.append(Step("numbers of least missing torque", None, z, kept, why))
         return chosen._replace(fitted=fitted, compared=compared, by_torque=z) if kept else chosen
 
@@ -145,7 +150,7 @@ class Choice:
 
     def _is_plausible(self, fitted: FittedModel) -> bool:
         """Tell whether a model's own numbers are where they may be by what is known of them."""
-        return bool(np.all(np.abs(fitted.theta[: len(self.setup.prior)]) < FAR * self.setup.prior))
+        return bool(np.all(np.abs(fitted.theta[: len(self.setup.prior)]) < LIMITS.far * self.setup.prior))
 
 
 def _closest(found: Explanation) -> Rival | None:

@@ -14,11 +14,10 @@ from .effect_search import Explanation, Gain
 from .expected_errors import Expected
 from .fitted_model import FittedModel, special_case
 from .reference_log import Errors
+from .thresholds import LIMITS
 
 LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
-_LEAST_SHARE = 0.5
-"""Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
 
 
 class Finding(NamedTuple):
@@ -73,7 +72,7 @@ def _agreed_nats(gain: Gain) -> float:
 
 def is_little(share: float | None) -> bool:
     """Whether an explanation takes away less of the missing torque than it has to."""
-    return share is not None and share < _LEAST_SHARE
+    return share is not None and share < LIMITS.least_explained
 
 
 def explained_share(experiment: Experiment, before: Errors, after: Errors, expected: Mapping[str, Expected]) -> float | None:

@@ -17,6 +17,12 @@ EVERYWHERE = "all"
 """The coordinate that is the same all along a log."""
 
 
+_STILL, _STILL_SHARE = 3.0, 1e-3
+"""Standard deviations of a speed, and share of its rms, up to which a side stands still."""
+_IDLE = 0.02
+"""Share of the transmitted torque's rms up to which a gear is not loaded."""
+_MORE_THAN_A_TURN = 1.2 * 2.0 * np.pi
+"""Range of positions, rad, from which on turns are laid over one another."""
 _SLOWER = 3.0
 """Factor between the bandwidths of a residual and of the acceleration it is looked at along: power of the noise of an
 acceleration grows with the fifth power of the bandwidth."""
@@ -52,7 +58,7 @@ def coordinates_of(
     length, omega = ("m", "v") if side in sliding else ("rad", "ω")
     velocity = np.asarray(part.velocity[side])
     deviation = np.asarray(segment.smoothed[side].deviation(1))
-    still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * rms(velocity))
+    still = np.abs(velocity) <= np.maximum(_STILL * deviation, _STILL_SHARE * rms(velocity))
 
     def position_of(one: str) -> CoordinateValues:
         unit, symbol = ("m", "x") if one in sliding else ("rad", _ANGLES[one])
@@ -95,7 +101,7 @@ def coordinates_of(
 
 def within_turn(position: np.ndarray) -> np.ndarray | None:
     """Positions (rad) modulo a turn; None where they hardly exceed one."""
-    return np.mod(position, 2.0 * np.pi) if np.nanmax(position) - np.nanmin(position) > 1.2 * 2.0 * np.pi else None
+    return np.mod(position, 2.0 * np.pi) if np.nanmax(position) - np.nanmin(position) > _MORE_THAN_A_TURN else None
 
 
 def all_coordinates(
@@ -124,7 +130,7 @@ def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, Coordin
         twist = _twist(experiment, part.position)
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
         found["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
-    idle = np.abs(torque) < 0.02 * rms(torque)
+    idle = np.abs(torque) < _IDLE * rms(torque)
     loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
     found["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
     return found

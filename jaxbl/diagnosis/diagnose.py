@@ -38,7 +38,7 @@ from .diagnosis_summary import (
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .fitted_model import free_values
 from .judgement import judge
-from .localise import SIGNIFICANT, Localised, localise
+from .localise import Localised, localise
 from .motor_alone import diagnose_alone
 from .neutral_effects import without
 from .numbers_by_log import contradictions
@@ -46,9 +46,7 @@ from .observer_residual import Observed, observed_torques
 from .proof import Proof, prove
 from .residuals import Residual, SideResiduals, residual_torques
 from .setup import Setup, set_up
-
-_HIDDEN = 0.3
-"""Share of the input: where a torque of that size would not have been seen, noise hides everything."""
+from .thresholds import LIMITS
 
 
 @dataclass(frozen=True)
@@ -217,18 +215,18 @@ def _paired(before: SideResiduals, after: SideResiduals) -> dict[str, list[tuple
 def _check_shown(setup: Setup, shown: float) -> None:
     """Refuse to say that nothing is missing where noise hides everything; `shown`: standard deviations by which the log
     shows its input."""
-    if shown * _HIDDEN >= SIGNIFICANT:
+    if shown * LIMITS.effect_size >= LIMITS.significant:
         return
     record = setup.task.record
     noise = ", ".join(
         f"{value:.2g} {record.statistics.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
         for side, value in setup.fitted.noise.items()
     )
-    least = SIGNIFICANT / max(shown, 1e-12)
+    least = LIMITS.significant / max(shown, 1e-12)
     raise InputError(
         f"{record.path}: noise hides everything: with readings as noisy as {noise}, no torque of less than "
-        f"{100.0 * least:.0f} % of the input would be seen; noise {least / _HIDDEN:.2g} times smaller, or torques as many "
-        "times larger, are needed"
+        f"{100.0 * least:.0f} % of the input would be seen; noise {least / LIMITS.effect_size:.2g} times smaller, or "
+        "torques as many times larger, are needed"
     )
 
 

@@ -27,7 +27,7 @@ from .diagnosis_task import input_rms
 from .fitted_model import FittedModel, free_values
 from .history import Step
 from .judgement import Judgement
-from .localise import SIGNIFICANT, Localised
+from .localise import Localised
 from .neutral_effects import with_added
 from .numbers_by_log import Contradiction
 from .observer_residual import Observed, compared
@@ -35,6 +35,7 @@ from .proof import Proof
 from .residuals import SideResiduals
 from .sentences import sentence_of
 from .setup import Setup
+from .thresholds import LIMITS
 
 
 def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObject:
@@ -57,7 +58,7 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
     if chosen.verdict == "no_discrepancy":
         for side, one in located.items():
             least, unit = (
-                SIGNIFICANT * one.coordinates["all"].regions[0].mean_error,
+                LIMITS.significant * one.coordinates["all"].regions[0].mean_error,
                 record.unit_of(f"{side}.torque", "N m"),
             )
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")

@@ -16,6 +16,9 @@ HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
 _LEAST_SAMPLES = 100
 """Samples of a part of a log, and of what is held out: the smoother's ends, some ten samples each, are then a small part."""
+_SHOWN, _KNOWN = 0.1, 10.0
+"""Share of the torque, and standard errors, from which on an inertia is compared; that share of a residual, below which a
+gear is."""
 _ALIKE = 4.0
 """Factor between the inertias that two logs of one machine may show."""
 
@@ -112,7 +115,7 @@ def _check_machine(record: Record, other: Record) -> None:
     gears = record.statistics.gearing, other.statistics.gearing
     if gears[0] is not None and gears[1] is not None and not (gears[0].is_loose or gears[1].is_loose):
         ratios = gears[0].ratio, gears[1].ratio
-        clear = all(one.residual < 0.1 for one in gears if one is not None)
+        clear = all(one.residual < _SHOWN for one in gears if one is not None)
         if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
             raise InputError(
                 f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
@@ -120,7 +123,7 @@ def _check_machine(record: Record, other: Record) -> None:
             )
     inertias = []
     for one in (record.statistics.dynamics, other.statistics.dynamics):
-        if one is not None and one.shares[0] > 0.1 and 10.0 * one.errors[0] * one.inflation[0] < abs(one.values[0]):
+        if one is not None and one.shares[0] > _SHOWN and _KNOWN * one.errors[0] * one.inflation[0] < abs(one.values[0]):
             inertias.append(float(one.values[0]))
     if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:
         raise InputError(

@@ -19,8 +19,8 @@ from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
-from .blocks import FLOOR, SURE, mean_squares, standard_errors_better, standard_errors_between, take_folds
-from .candidates import SHARE, Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
+from .blocks import mean_squares, standard_errors_better, standard_errors_between, take_folds
+from .candidates import Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
 from .free_functions import functions_of
@@ -28,7 +28,8 @@ from .history import Step, describe_change
 from .linearised_model import Linear, Predictor
 from .neutral_effects import candidates, corrected
 from .reference_log import Comparison, ReferenceLog
-from .refit import RARER, ModelFits, owner_of
+from .refit import ModelFits, owner_of
+from .thresholds import LIMITS
 from .torque_regression import SHOWN, TorqueRegression
 
 VerdictName = Literal["explained", "no_discrepancy", "unknown_effect", "not_tested"]
@@ -45,17 +46,10 @@ _AHEAD = 3
 """Steps that are followed where none is accepted."""
 _CONTRADICTED = -2.0
 """Standard errors: what predicts worse than this in one way has to be wrong, whatever the others say."""
-FAR = 5.0
-"""Standard deviations of a number's prior beyond which it hardly lies (one in a million)."""
-CLEAR = 100.0
-"""Nats that a free function larger than :data:`LEAST` must gain to say that something else is missing: far beyond chance,
-since quantisation and time stepping leave structure, too (benchmarks/NOTES.md)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
-"""Prior sizes of a free function that are tried, over :data:`.candidates.SHARE`: down to the least that counts."""
+"""Prior sizes of a free function that are tried, over `effect_size`: down to the least that counts."""
 _MOST = 8
 """Effects that are sought."""
-LEAST = 1e-3
-"""Share of the driving torque that an effect must have to be named; the error of time stepping is a twentieth of it."""
 
 
 class Gain(NamedTuple):
@@ -128,7 +122,7 @@ class Explanation:
     @property
     def left(self) -> float:
         """Largest gain of the free functions that are large enough for an effect, nats."""
-        return max((gain for gain, share in self.rest.values() if share > LEAST), default=0.0)
+        return max((gain for gain, share in self.rest.values() if share > LIMITS.least_torque), default=0.0)
 
 
 class EffectSearch:
@@ -152,7 +146,7 @@ class EffectSearch:
         """
         self.log, self.fits = log, ModelFits(experiment, free, np.asarray(prior), log.segments)
         self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
-        self.floor = FLOOR * sum(map(len, log.segments)) * len(experiment.sides)
+        self.floor = LIMITS.noise_structure * sum(map(len, log.segments)) * len(experiment.sides)
         self.history: list[Step] = []
         self._compared: dict[tuple, Comparison] = {}
         self._tried: dict[str, list[Trial]] = {}
@@ -182,7 +176,7 @@ class EffectSearch:
         least, most = sorted((foretold, simulated))
         # what is known of the model's own numbers counts, but for what two standard deviations explain
         known = [float(np.sum((each.theta[: len(self.fits.prior)] / self.fits.prior) ** 2)) for each in (before, after)]
-        beyond = float(np.sqrt(max(known[0] - known[1] - SURE**2, 0.0)))
+        beyond = float(np.sqrt(max(known[0] - known[1] - LIMITS.sure**2, 0.0)))
         shown = (most if least > _CONTRADICTED else least) + beyond
         return Gain(after.log_evidence - before.log_evidence, shown, asked)
 
@@ -191,7 +185,7 @@ class EffectSearch:
         return (
             fitted.foretold is not None
             and are_possible(fitted.numbers, self.log.period)
-            and all(fitted.share(name) > LEAST for name in fitted.names)
+            and all(fitted.share(name) > LIMITS.least_torque for name in fitted.names)
         )
 
     # ---- the loop ----
@@ -209,8 +203,8 @@ class EffectSearch:
                 break
         rivals = {name: self._rivals(current, name) for name in current.names}
         found = Explanation(current, gains, rivals, self.remainder(current))
-        unknown = f"a free function still gains {found.left:.3g} nats; {CLEAR:g} show something unknown"
-        self._note("fit free functions to what remains", Gain(found.left, np.nan), found.left > CLEAR, unknown)
+        unknown = f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown"
+        self._note("fit free functions to what remains", Gain(found.left, np.nan), found.left > LIMITS.unknown, unknown)
         return found
 
     def _next(self, current: FittedModel) -> FittedModel | None:
@@ -257,7 +251,9 @@ class EffectSearch:
         own = current.theta[: len(self.fits.prior)]
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
         fitted = self.fits.fit({**numbers, **new}, own + proposal.change, current, tuple(new), promise)
-        felt = {name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LEAST}
+        felt = {
+            name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LIMITS.least_torque
+        }
         if 1 < len(felt) < len(new):
             # together with others, one may turn out to be nothing
             return self._try(current, proposal._replace(numbers=felt))
@@ -355,7 +351,7 @@ class EffectSearch:
         found = [
             _Proposal({name: one.numbers}, one.change, one.nats)
             for name, one in promised.items()
-            if not any(contains(name, other) and one.nats < by.nats - RARER for other, by in promised.items())
+            if not any(contains(name, other) and one.nats < by.nats - LIMITS.general_odds for other, by in promised.items())
         ]
         none = np.zeros(len(own))
         found += [
@@ -417,7 +413,7 @@ class EffectSearch:
                 none, some = evidence_of(sized), evidence_of(sized, functions, i)
                 assert none is not None and some is not None
                 nats = self._nats(linear, none, some)
-                best = max(best, (nats - min(max(nats, 0.0), self.floor), size * SHARE))
+                best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
             gained[one.name] = best
         return gained
 

@@ -30,7 +30,6 @@ class Products:
         offsets: column of each variant's offset, or -1.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
-        bound: standard deviations of its prior that each of the model's own numbers may be off at most; shape (own,).
         twins: columns that are a multiple of one of the model's own, which is always there: that one, and the factor. Only
             their priors part the two, so that these are joined: the data's precision may be too large for them to be seen.
     """
@@ -41,7 +40,6 @@ class Products:
     offsets: tuple[int, ...]
     scale: np.ndarray
     centre: np.ndarray
-    bound: np.ndarray
     twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
 
@@ -84,8 +82,7 @@ def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate:
         variance[of] += factor**2 * variance[k]
         middle[of] += factor * middle[k]
     chosen = np.array([k for k in alive if k not in joined], int)
-    bound = np.where(chosen <= c.own, np.append(c.bound, np.inf)[np.minimum(chosen - 1, c.own)], np.inf)
-    solved = _bounded(c.products, chosen, fixed, np.sqrt(variance[chosen]), middle[chosen], bound)
+    solved = _solve(c.products, chosen, fixed, np.sqrt(variance[chosen]), middle[chosen])
     if solved is None:
         return None
     values = np.zeros(len(c.scale))
@@ -100,42 +97,15 @@ def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate:
     return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own])
 
 
-def _bounded(
-    products: np.ndarray, chosen: np.ndarray, fixed: np.ndarray, spread: np.ndarray, centre: np.ndarray, bound: np.ndarray
+def _solve(
+    products: np.ndarray, chosen: np.ndarray, fixed: np.ndarray, spread: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
-    """Coefficients of chosen columns, none beyond its bound (in standard deviations of its prior), beside columns whose
-    coefficient is 1; log-evidence, and misfit."""
-    inner = products[np.ix_(chosen, chosen)]
-    towards, total = products[np.ix_(chosen, fixed)].sum(axis=1), products[np.ix_(fixed, fixed)].sum()
-    free, coefficients = np.ones(len(chosen), bool), np.zeros(len(chosen))
-    while True:
-        known = np.where(free, 0.0, coefficients)
-        rest = total + float(2.0 * towards @ known + known @ inner @ known)
-        solved = _solved(inner[np.ix_(free, free)], (towards + inner @ known)[free], rest, spread[free], centre[free])
-        if solved is None:
-            return None
-        coefficients = known
-        coefficients[free], cost, determinant = solved
-        away = (coefficients - centre) / spread
-        over = free & (np.abs(away) > bound)
-        if not over.any():
-            break
-        # what is beyond its bound stays at it
-        coefficients[over] = (centre + np.clip(away, -bound, bound) * spread)[over]
-        free &= ~over
-    held = float(np.sum(away[~free] ** 2))
-    evidence = -0.5 * (cost + held + determinant + 2.0 * float(np.sum(np.log(spread[free]))))
-    return coefficients, evidence, cost - float(np.sum(away[free] ** 2))
-
-
-def _solved(
-    inner: np.ndarray, towards: np.ndarray, total: float, spread: np.ndarray, centre: np.ndarray
-) -> tuple[np.ndarray, float, float] | None:
-    """Coefficients of least squares with a prior, the least cost, and the logarithm of the determinant of the precision."""
+    """Find the coefficients of chosen columns, with a prior, beside columns whose coefficient is 1; log-evidence, and
+    misfit."""
     precision = spread**-2.0
-    matrix = inner + np.diag(precision)
-    towards = towards - precision * centre
-    total = total + float(precision @ centre**2)
+    matrix = products[np.ix_(chosen, chosen)] + np.diag(precision)
+    towards = products[np.ix_(chosen, fixed)].sum(axis=1) - precision * centre
+    total = products[np.ix_(fixed, fixed)].sum() + float(precision @ centre**2)
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     with np.errstate(over="ignore"):
         root = _root(matrix / np.outer(size, size))
@@ -143,8 +113,9 @@ def _solved(
         return None
     inside = solve_triangular(root, towards / size, lower=True)
     coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
-    determinant = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
-    return coefficients, total - float(inside @ inside), determinant
+    determinant = 2.0 * float(np.sum(np.log(np.diag(root)) + np.log(size) + np.log(spread)))
+    cost = total - float(inside @ inside)
+    return coefficients, -0.5 * (cost + determinant), cost - float(np.sum(((coefficients - centre) / spread) ** 2))
 
 
 def _root(unit: np.ndarray) -> np.ndarray | None:

@@ -16,14 +16,12 @@ from scipy.special import gammaincinv
 
 from jaxbl.identification.segments import Segment
 
-from .effect_search import LEAST
 from .fitted_model import FittedModel
 from .input_noise import smoothed_input
 from .reference_log import Comparison, Errors, ReferenceLog
 from .setup import InputNoise
+from .thresholds import LIMITS
 
-LEVEL = 0.01
-"""Probability that a complete model fails the test, in any channel."""
 _DRAWS = 6
 """Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
 most logs."""
@@ -33,20 +31,15 @@ are coarse. That of torques goes with the bandwidth to the power 2.5, which is a
 of friction."""
 
 
-_SLOW_LEAST = 0.02
-"""Share of the driving torque that slow torques may leave: the smoother rounds jumps of friction on the other side of a
-spring, which leaves up to 0.016 behind a quarter of the bandwidth beside complete models of generated drives."""
-
-
 class Expected(NamedTuple):
     """Error of a complete model in a channel, in the channel's unit.
 
     Attributes:
         noise: rms by the readings' noise.
         open: rms by the numbers that the fit leaves open, and by noise of the input.
-        least: rms by a torque of :data:`LEAST` of the driving torque, which is too small to be named; of slow torques the
+        least: rms by a torque of `least_torque` of the driving torque, which is too small to be named; of slow torques the
             least that counts.
-        limit: rms that a complete model exceeds with probability :data:`LEVEL`, shared out among all channels.
+        limit: rms that a complete model exceeds with probability `failing`, shared out among all channels.
         rounding: rms by smoothing of the model's own motion; 0 where the rest is enough to account for the errors.
     """
 
@@ -84,18 +77,18 @@ def expected_errors(
         model = fitted.move_by(root @ random.standard_normal(len(root)))
         segments = [_disturbed(one, noise, random) for one in log.segments]
         drawn.append(apart(replace(log, segments=segments).compare(model)))
-    least = LEAST * driving
+    least = LIMITS.least_torque * driving
     segments = [replace(one, torque=one.torque + least) for one in log.segments]
     small = apart(replace(log, segments=segments).compare(fitted.experiment))
     for side in fitted.experiment.sides:
         ratio = float(fitted.experiment.drive.ratio(side))
         small[f"torque_{side}"] = (least * ratio) ** 2
-        small |= {name: (_SLOW_LEAST * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
+        small |= {name: (LIMITS.slow_torque * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
     found, names = {}, [name for name in floor if not name.startswith("velocity")]
     for name in names:
         squares = np.array([one[name] for one in drawn])
         unsure = _TORQUE_NOISE_ERROR if name.startswith("torque") else _NOISE_ERROR
-        drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LEVEL / len(names))
+        drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LIMITS.failing / len(names))
         limit = (1.0 + unsure) ** 2 * floor[name] ** 2 + drawn_most + small[name]
         found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
     if any(name.startswith("torque") for name in failed(log.with_slow(base), found)):

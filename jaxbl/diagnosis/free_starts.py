@@ -113,8 +113,7 @@ def best_runs(experiment: Experiment, windows: Windows, passes: int, rest: bool,
 def _within(model: _Model) -> np.ndarray:
     """Whether a window goes on where the one before it ends; shape (windows,)."""
     time, period = model.windows.time, float(model.experiment.run.sample_period)
-    length = model.windows.torque.shape[1] * period
-    return np.concatenate([[False], np.abs(np.diff(time) - length) < 0.5 * period])
+    return np.concatenate([[False], np.rint(np.diff(time) / period) == model.windows.torque.shape[1]])
 
 
 def _searched(model: _Model, passes: int, rest: bool) -> Run:

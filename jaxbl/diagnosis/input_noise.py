@@ -57,8 +57,9 @@ def input_jumps(torque: np.ndarray, noise: float) -> list[int]:
     change = np.diff(torque)
     beside = np.pad(change, 1, mode="edge")
     beyond = np.abs(change - 0.5 * (beside[:-2] + beside[2:]))
+    least = _JUMP * np.sqrt(5.0) * noise
     highest = (beyond >= np.append(beyond[1:], 0.0)) & (beyond > np.insert(beyond[:-1], 0, 0.0))
-    return (1 + np.flatnonzero(highest & (beyond > _JUMP * np.sqrt(5.0) * noise))).tolist()
+    return (1 + np.flatnonzero(highest & (beyond > least))).tolist()
 
 
 def _smooth_curve(values: np.ndarray) -> np.ndarray:

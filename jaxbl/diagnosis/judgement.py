@@ -6,12 +6,11 @@ import numpy as np
 
 from jaxbl.json_types import JsonObject
 
-from .blocks import SURE
 from .choice import Chosen
 from .confidence import is_little
-from .effect_search import FAR, VerdictName
-from .expected_errors import LEVEL
+from .effect_search import VerdictName
 from .proof import Proof
+from .thresholds import LIMITS
 
 
 class Judgement(NamedTuple):
@@ -43,14 +42,14 @@ def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, 
     """
     fitted = chosen.fitted
     away = fitted.theta[: len(prior)] / prior
-    far = {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
+    far = {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far}
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
     tested = [name for name in fitted.names if name not in untested]
-    chance = bool(tested) and any(control.kind == "permuted" and control.z < SURE for control in proof.controls)
+    chance = bool(tested) and any(control.kind == "permuted" and control.z < LIMITS.sure for control in proof.controls)
     little, remainder = bool(tested) and is_little(share), chosen.verdict == "unknown_effect"
     against = proof.failed or far or chance or proof.worse or little or contradicting or remainder
     verdict = "unknown_effect" if against else "not_tested" if untested or not proof.has_power else chosen.verdict
     torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
     reasons = {"chance": chance, "remainder": remainder, "worse": proof.worse, "little": little}
-    tested_by = {"level": LEVEL, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}
+    tested_by = {"level": LIMITS.failing, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}
     return Judgement(verdict, tested_by | reasons | {"contradicting": contradicting})

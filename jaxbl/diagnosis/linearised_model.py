@@ -38,9 +38,10 @@ from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 from jaxbl.workers import map_in_threads
 
-from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
+from .candidates import SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
 from .evidence import Products
 from .neutral_effects import bucket, corrected, lean, with_torques
+from .thresholds import LIMITS
 
 _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
@@ -202,8 +203,6 @@ _COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
 """Ratios of process to reading noise, tried for all sides at once: from a filter over thousands of samples to none."""
 _FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 """Factors on the best of them, side by side."""
-OFF = 0.5
-"""Prior size of the error of an inertia or a viscous friction, relative: nominal ones are right within a factor of two."""
 _FREQUENCIES, _COARSE = 8, 16
 """Peaks of the spectrum that are tried; frequencies at which the response to a torque is computed, smooth in between."""
 _LEAST_PERIODS = 3.0
@@ -216,9 +215,11 @@ _NO_INPUT = 1e-3
 """Input over the torque that the motion takes, rms, below which the drive moves freely."""
 DIVERGED = 1e30
 """Products of prediction errors, over their variance or in rad^2, from which on a model diverges: squares soon overflow."""
-_SILENT = 1e-20
+SILENT = 1e-20
 """Influence of an initial state over that of others, squared, below which it has none (the state of a neutral effect):
 rounding is 1e-16."""
+_ALIKE = 1e-12
+"""Influence of a combination of initial states over the largest, squared, below which two of them are one."""
 _LOST = 0.01
 """Nats that rounding may take (benchmarks/NOTES.md): under too low a gain the influence of an initial state grows."""
 _VALUES = 65536
@@ -253,7 +254,6 @@ class Predictor:
         weight = np.ones(sides)
         prior, centre = np.full(width, np.inf), np.zeros(width)
         prior[:own], centre[:own] = linear.prior, -linear.theta
-        bound = np.concatenate([linear.bound, np.full(width - own, np.inf)])
         for turn in range(2):
             weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
             each = [_response_and_loss(one, states) for one in weighted]
@@ -262,7 +262,7 @@ class Predictor:
             lost = sum(one for _, one in each) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 return
-            free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre, bound * prior)])
+            free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre)])
             coefficients = [np.concatenate([free, -by @ free]) for by, _ in each]
             left = [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(coefficients, grams, strict=True)]
             squares = np.sum(left, axis=0)
@@ -298,7 +298,6 @@ class Linear:
         theta: Float[np.ndarray, " numbers"],
         prior: np.ndarray,
         segments: Sequence[Segment],
-        bound: np.ndarray | None = None,
     ):
         """Linearise a model about the motion of a log.
 
@@ -307,9 +306,7 @@ class Linear:
             free, theta: numbers that may change, and where they are.
             prior: standard deviation of each theta about 0.
             segments: of the log.
-            bound: how many standard deviations each may be from 0 at most; left out: any number.
         """
-        self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = set_free_parameters(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
@@ -541,16 +538,16 @@ class Linear:
             first = last if last < at else 1 + own
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
-            size = SHARE * self.drive / np.sqrt(power[1 + own :] / self.count)
+            size = LIMITS.effect_size * self.drive / np.sqrt(power[1 + own :] / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
             if one.offset:
                 scale[list(place)] = SPACING
             elif (nominal := self.nominal(one.name)) is not None:
-                scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
+                scale[list(place)] = np.minimum(scale[list(place)], LIMITS.number_error * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = -self.theta
-        return Products(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
+        return Products(total, own, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
         """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
@@ -621,30 +618,19 @@ def _groups(variants: Sequence[Candidate]) -> list[list[Candidate]]:
     return found
 
 
-def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Coefficients of the columns behind the first with a prior; none is further from its centre than `reach`."""
-    fixed = np.zeros(len(centre), bool)
-    at = centre.copy()
-    while True:
-        matrix = total[1:, 1:] + np.diag(precision)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        towards = total[1:, 0] - precision * centre + matrix[:, fixed] @ at[fixed]
-        free = ~fixed
-        unit = (matrix / np.outer(size, size))[np.ix_(free, free)]
-        found = at.copy()
-        found[free] = -np.linalg.lstsq(unit, (towards / size)[free], rcond=1e-12)[0] / size[free]
-        over = free & (np.abs(found - centre) > reach)
-        if not over.any():
-            return found
-        at[over] = centre[over] + np.sign(found - centre)[over] * reach[over]
-        fixed |= over
+def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Find the coefficients of the columns behind the first, with a prior."""
+    matrix = total[1:, 1:] + np.diag(precision)
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    towards = total[1:, 0] - precision * centre
+    return -np.linalg.lstsq(matrix / np.outer(size, size), towards / size, rcond=1e-12)[0] / size
 
 
 def _influence(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Products of the last columns, the initial states, over their sizes; and these, infinite where a state does nothing."""
     inner = gram[-states:, -states:]
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    size = np.where(size > _SILENT * np.max(size), size, np.inf)
+    size = np.where(size > SILENT * np.max(size), size, np.inf)
     return inner / np.outer(size, size), size
 
 
@@ -668,7 +654,7 @@ def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float
     unit, size = _influence(gram, states)
     values, vectors = np.linalg.eigh(unit)
     largest = np.max(np.abs(values))
-    kept = np.abs(values) > 1e-12 * largest
+    kept = np.abs(values) > _ALIKE * largest
     inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)) @ vectors.T
     response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these

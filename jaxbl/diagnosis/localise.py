@@ -22,6 +22,7 @@ from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues
 from .residuals import Residual, SideResiduals, narrowed, noise_spectrum
+from .thresholds import LIMITS
 
 _BINS = 24
 """Of a coordinate: fine enough for a picture, each with a few per cent of the samples."""
@@ -33,16 +34,24 @@ _BLOCKS, _FOLDS = 40, 5
 """Blocks of time, and sets of them that a function is made from and tried on in turn."""
 _LEAST_BLOCKS = 4
 """Blocks of time that a mean must come from to have a scatter."""
+_BAND = 4.0
+"""Frequencies of a spectrum up to the first band."""
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
-SIGNIFICANT = 4.5
-"""Standard deviations beyond which a region counts: several hundred regions are looked at."""
 RESOLUTION = 5e-4
 """Share of the driving torque below which sampling alone may be what is missing."""
+_NARROWER = 1.15
+"""Factor by which the power behind a narrower low-pass must stand out more."""
+_SHORTEST, _IN_A_BIN = 20.0, 10.0
+"""Cycles at the low-pass in a part at least; independent values in a bin."""
 _LOUD = 10.0
 """Power over the noise's from which on no narrower low-pass is tried."""
 _PEAKS, _NARROW, _AROUND = 5, 10.0, 20
 """Peaks at most; power of one over the median of its neighbours; neighbours on each side."""
+_SLOWEST, _MOVED = 3, 0.2
+"""First frequency of a spectrum that may be a peak; share of a peak that the motion has there, too, if it is its own."""
+_LEAST_WEIGHT = 3.0
+"""Blocks of equal length that those of a bin are worth at least."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +232,12 @@ def locate(
     best: tuple[_Joined, list[np.ndarray]] | None = None
     for octave in range(7):
         cutoff = widest / 2.0**octave
-        if cutoff * shortest < 20.0 and best is not None:
+        if cutoff * shortest < _SHORTEST and best is not None:
             break
         pairs = [narrowed(one, cutoff) for one in residuals]
         joined = _Joined([low for low, _ in pairs])
         # a wider one shows more: a narrower one must be worth it
-        if best is None or joined.z > 1.15 * max(best[0].z, SIGNIFICANT):
+        if best is None or joined.z > _NARROWER * max(best[0].z, LIMITS.significant):
             best = joined, [at for _, at in pairs]
         if joined.power > _LOUD * joined.noise:
             break
@@ -248,13 +257,13 @@ def locate(
     motion = coordinates[longest]["speed"].values if "speed" in names else None
     bands, peaks = _spectrum(residuals[longest], motion, joined.parts[longest])
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
-    beyond = (z > SIGNIFICANT and missing > floor) or any(
-        (abs(region.mean_z) > SIGNIFICANT and abs(region.mean) > floor)
-        or (region.excess_z > SIGNIFICANT and region.excess > floor**2)
+    beyond = (z > LIMITS.significant and missing > floor) or any(
+        (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
+        or (region.excess_z > LIMITS.significant and region.excess > floor**2)
         for one in found.values()
         for region in one.regions
     )
-    beyond = beyond or any(one.excess_z > SIGNIFICANT and one.amplitude > floor for one in peaks)
+    beyond = beyond or any(one.excess_z > LIMITS.significant and one.amplitude > floor for one in peaks)
     return Localised(
         residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
         float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), found, bands, peaks,
@@ -313,7 +322,7 @@ def _mean_error(
     scatter = np.sum((sums - mean * numbers) ** 2, axis=0) * (freedom + 1.0) / freedom
     by_scatter = np.sqrt(scatter) / number
     square = np.bincount(index, joined.torque**2, minlength=count)[:count] / number
-    enough = (visits >= _LEAST_BLOCKS) & (weight >= 0.75 * _LEAST_BLOCKS)
+    enough = (visits >= _LEAST_BLOCKS) & (weight >= _LEAST_WEIGHT)
     by_scatter = np.where(enough, by_scatter, np.maximum(by_scatter, np.sqrt(square)))
     error = np.maximum(np.maximum(by_noise, by_scatter), np.finfo(float).tiny)
     t = mean / error
@@ -341,13 +350,13 @@ def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
 
 
 def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> float:
-    if joined.z < SIGNIFICANT:
+    if joined.z < LIMITS.significant:
         # nothing to be shared out
         return 0.0
     best = 0.0
-    counts = [1] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / 10.0, 2.0)]
+    counts = [1] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / _IN_A_BIN, 2.0)]
     if name == "time":
-        counts = [n for n in counts if n * _FOLDS <= max(joined.effective / 10.0, 10.0)]
+        counts = [n for n in counts if n * _FOLDS <= max(joined.effective / _IN_A_BIN, 2 * _FOLDS)]
     for count in counts:
         _, index, bins = _binned(name, one, np.linspace(0.0, 1.0, count + 1))
         fold = _folds(joined, name, bins)
@@ -369,7 +378,7 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
     total = float(np.sum(low.torque**2) - np.sum(low.deviation**2)) / len(low.time) * count
     total = max(total, _LEVEL_UNKNOWN * float(np.sum(one.deviation**2)))
     edges = one.bandwidth * 2.0 ** np.arange(-9.0, 2.0)
-    edges = np.concatenate([[0.0], edges[edges > 4.0 * resolution]])
+    edges = np.concatenate([[0.0], edges[edges > _BAND * resolution]])
     bands = []
     for begin, end in itertools.pairwise(edges):
         inside = (frequency >= begin) & (frequency < end)
@@ -383,7 +392,7 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
         moving = np.asarray(speed) - np.mean(speed)
         motion = np.abs(np.fft.rfft(moving * np.hanning(count))) ** 2
     peaks: list[SpectralPeak] = []
-    taken = np.arange(len(power)) < 3
+    taken = np.arange(len(power)) < _SLOWEST
     for at in np.argsort(-power):
         if len(peaks) == _PEAKS:
             break
@@ -393,11 +402,11 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
         taken[near] = True
         # a line of noise is exponential: so many times its mean is the largest of all
         z = float(np.sqrt(max(2.0 * (power[at] / (1.1 * floor[at]) - np.log(len(power))), 0.0)))
-        if z < SIGNIFICANT or power[at] < _NARROW * _around(power, at):
+        if z < LIMITS.significant or power[at] < _NARROW * _around(power, at):
             continue
         here = float(np.sum(np.maximum(beyond[near], 0.0)))
         share = here / max(total, here)
-        moved = motion is not None and float(np.sum(motion[near]) / np.sum(motion)) > 0.2 * share
+        moved = motion is not None and float(np.sum(motion[near]) / np.sum(motion)) > _MOVED * share
         peaks.append(SpectralPeak(float(frequency[at]), float(np.sqrt(2.0 * here / count)), share, z, moved))
     return tuple(bands), tuple(peaks)
 

@@ -32,10 +32,9 @@ from jaxbl.workers import announce
 from .confidence import Finding
 from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
-from .effect_search import FAR
-from .expected_errors import LEVEL
 from .history import Step
 from .neutral_effects import candidates, with_added
+from .thresholds import LIMITS
 
 _SMALL = 1e-6
 """Dry friction that stands for none, over the input's rms."""
@@ -238,7 +237,7 @@ def _summary(
     # noise of the recorded torque, which is known within a factor of two
     allowed = max(2.0 * model.torque_noise, _LEAST * size)
     changes = zip(search.own, alone.point.theta / task.config.uncertainty.relative, strict=False)
-    far = {number.path: float(z) for number, z in changes if abs(z) > FAR}
+    far = {number.path: float(z) for number, z in changes if abs(z) > LIMITS.far}
     names = [
         name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
     ]
@@ -290,7 +289,7 @@ def _summary(
             "free_run": {},
             "expected": {"theta_e": {"limit": limit}},
             "test": {
-                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": remainder, "weak": [],
+                "level": LIMITS.failing, "failed": failed, "far": far, "chance": False, "remainder": remainder, "weak": [],
                 "worse": holdout["rms"] > holdout["nominal_rms"], "little": False, "contradicting": False, "untested": {},
             },
             "controls": {},

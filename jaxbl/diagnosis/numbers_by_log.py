@@ -21,12 +21,10 @@ from jaxbl.records.least_squares import BlockRegression, rms
 from .diagnosis_task import DiagnosisTask
 from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
+from .thresholds import LIMITS
 
 _STEP = 1e-3
 """Change of theta by which a slope is found."""
-_APART = 6.0
-"""Standard errors by which two logs contradict each other: of some tens of pairs, with errors by twelve blocks, one in a
-hundred is so by chance."""
 _LEAST = 0.05
 """Share of the driving torque that the difference has to make."""
 _LOST = 0.1
@@ -77,7 +75,7 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
         apart = {
             (one, other): z
             for one, other in itertools.combinations(range(len(shown)), 2)
-            if (z := _apart(shown[one], shown[other], k, _LEAST * driving)) > _APART
+            if (z := _apart(shown[one], shown[other], k, _LEAST * driving)) > LIMITS.contradicting
         }
         if not apart:
             continue

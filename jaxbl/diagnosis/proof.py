@@ -15,13 +15,14 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
-from .blocks import SEEN, standard_errors_better
+from .blocks import standard_errors_better
 from .choice import Chosen
 from .diagnosis_task import input_rms
 from .expected_errors import Expected, expected_errors, failed
 from .neutral_effects import without
 from .reference_log import PREDICTABLE, Comparison, Errors, ReferenceLog
 from .setup import Setup, quiet
+from .thresholds import LIMITS
 
 
 class Control(NamedTuple):
@@ -101,7 +102,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
         [name for name in failed(log.with_slow(after), expected) if name not in weak],
-        bool(fitted.names) and len(weak) < len(expected) and better < -SEEN,
+        bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.seen,
         _controls(setup, chosen, log, before, after),
         weak,
         _find_untested(setup, chosen, log, expected),

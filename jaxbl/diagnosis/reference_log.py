@@ -233,7 +233,7 @@ class ReferenceLog:
             signals = np.stack([dry * np.sign(smoothed.velocity), steady * np.ones(len(segment)), moving])
             columns.append(low_passed(as_smoothed(signals, smoothed, self.period), piece, self.bandwidth[side]))
         friction = np.concatenate(columns, axis=1)
-        return friction[:2], friction[2] > 0.5
+        return friction[:2], np.rint(friction[2]) > 0
 
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""

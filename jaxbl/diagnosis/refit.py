@@ -28,23 +28,22 @@ from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
-from .candidates import SHARE, EffectNumbers
+from .candidates import EffectNumbers
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
-from .linearised_model import OFF, Linear, Predictor
+from .linearised_model import SILENT, Linear, Predictor
 from .neutral_effects import complete, lean
+from .thresholds import LIMITS
 
 _STEPS = 25
 """Of Gauss-Newton at most under one predictor, rejected ones among them."""
 _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
+_LEAST_STEP = 1e-3
+"""Share of a Gauss-Newton step below which nothing is left to be gained."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
 _STARTS = (1.0, 0.1)
 """Shares of what a candidate was proposed with from which fits begin: of dry friction the way there may lead over a hill."""
-ODDS = -2.0
-"""Log prior odds of each effect to be missing: a probability of 0.12."""
-RARER = -3.0
-"""The same of an effect over its special case: odds of one to twenty."""
 
 
 class _Point(NamedTuple):
@@ -124,9 +123,9 @@ class ModelFits:
         """Find the value of a size of an effect at which its torque is as large as effects are."""
         if (name, leaf) not in self._units:
             alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in numbers.items()} | {leaf: 1.0}
-            found = SHARE / max(self.given.torque_share(make_effect(name, **alone)), 1e-12)
+            found = LIMITS.effect_size / max(self.given.torque_share(make_effect(name, **alone)), 1e-12)
             nominal = self.given.nominal(name)
-            self._units[name, leaf] = found if nominal is None else min(found, OFF * nominal)
+            self._units[name, leaf] = found if nominal is None else min(found, LIMITS.number_error * nominal)
         return self._units[name, leaf]
 
 
@@ -140,7 +139,7 @@ class _Fit:
         added = {name: one for name, one in numbers.items() if name not in self.released}
         self.experiment = with_numbers(fits.nominal, added)
         prior = fits.prior.copy()
-        prior[list(self.released.values())] = np.hypot(prior[list(self.released.values())], OFF)
+        prior[list(self.released.values())] = np.hypot(prior[list(self.released.values())], LIMITS.number_error)
         free, theta, width = [], [], []
         for one in make_free_parameters(self.experiment, paths_of(added), 1.0):
             name, leaf = owner_of(one)
@@ -157,7 +156,7 @@ class _Fit:
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
         general = sum(bool(EFFECTS[name].special_cases) for name in numbers)
-        self.log_odds = ODDS * len(numbers) + RARER * general - choices
+        self.log_odds = LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
         """Find the prediction errors along the path of the predictor."""
@@ -213,7 +212,7 @@ class _Fit:
     def _descend(self, best: _Point) -> _Point:
         share = 1.0
         for _ in range(_STEPS):
-            if best.cost - self._promise(best) < _SETTLED or share < 1e-3:
+            if best.cost - self._promise(best) < _SETTLED or share < _LEAST_STEP:
                 break
             by = best.predictor.coefficients
             change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)
@@ -273,7 +272,8 @@ class _Fit:
             flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
             states = flat[:, -linear.states :]
             norm = np.sqrt(np.sum(states**2, axis=0))
-            basis = np.linalg.qr(states[:, norm > 1e-20 * np.max(norm)] / norm[norm > 1e-20 * np.max(norm)])[0]
+            shown = norm > SILENT * np.max(norm)
+            basis = np.linalg.qr(states[:, shown] / norm[shown])[0]
             rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
             pieces.append(rest.reshape(-1, sides, 1 + own)[signals.real])
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)

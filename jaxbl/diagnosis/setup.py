@@ -94,7 +94,7 @@ def set_up(task: DiagnosisTask) -> Setup:
     own = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
     prior = np.full(len(own), config.uncertainty.relative)
     _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
-    noise = _input_noise(input_rms(record), nominal, own, recorded)
+    noise = _input_noise(input_rms(record), nominal, recorded)
     segments = quiet(recorded, noise.unfelt)
     lacking = residual_torques(nominal, segments)
     sliding = [side for side in nominal.sides if record.statistics.channels[POSITION_CHANNELS[side]].unit == "m"]
@@ -112,15 +112,14 @@ def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:
     return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
 
 
-def _input_noise(size: float, nominal: Experiment, own: Sequence[FreeParameter], segments: Sequence[Segment]) -> InputNoise:
+def _input_noise(size: float, nominal: Experiment, segments: Sequence[Segment]) -> InputNoise:
     """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
     `size`, that is not asked."""
     noise = estimate_white_noise([one.torque for one in segments])
     if not _NOISY * size < noise:
         return InputNoise(0.0, noise)
     # the model as given: numbers that may change would absorb some of the noise
-    none, width = np.zeros(len(own)), np.ones(len(own))
-    given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, quiet(segments, noise)))
+    given, smooth = (Linear(nominal, (), np.zeros(0), np.zeros(0), some) for some in (segments, quiet(segments, noise)))
     smoothness = given.choose(()).smoothness
     share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
     # nats that it did not feel it, rather than did

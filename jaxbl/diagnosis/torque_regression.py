@@ -16,11 +16,11 @@ from jaxbl.drive.effects import Numbers
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.records.least_squares import BlockRegression
 
-from .blocks import SEEN
 from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
 from .linearised_model import Linear
 from .reference_log import ReferenceLog
 from .residuals import SideResiduals, as_smoothed, low_passed, narrowed
+from .thresholds import LIMITS
 
 _BLOCKS = 10
 """Of consecutive samples, each left out once: more than the eight of which a standard error is any use."""
@@ -139,7 +139,7 @@ class TorqueRegression:
         ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
         at = sum(other.width for other in beside)
         numbers = one.numbers(values[at : at + one.width].tolist())
-        if numbers is None or not z > SEEN:
+        if numbers is None or not z > LIMITS.seen:
             return None
         return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio))), after
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxbl.diagnosis.coordinates import CoordinateValues
-from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, residual_spectrum
+from jaxbl.diagnosis.localise import Coordinate, Localised, residual_spectrum
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, SideResiduals, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
@@ -164,7 +164,7 @@ def _spectra(residuals: SideResiduals, located: Mapping[str, Localised], unit: s
         ax.set_ylim(0.2 * noise.min(), 3.0 * max(missing.max(), noise.max()))
         decades(ax)
         ax.axvline(located[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="end of the band analysed")
-        narrow = [peak for peak in located[name].peaks if not peak.in_motion and peak.excess_z > SIGNIFICANT]
+        narrow = [peak for peak in located[name].peaks if not peak.in_motion]
         for peak in narrow[:3]:
             if peak.power_share < _LABELLED:
                 continue

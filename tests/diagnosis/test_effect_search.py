@@ -7,8 +7,9 @@ from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
 from jaxbl.diagnosis.confidence import weigh
-from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
+from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.reference_log import ReferenceLog
+from jaxbl.diagnosis.thresholds import LIMITS
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.identification.free_parameters import make_free_parameters
 from jaxbl.identification.identify import read_identification_task
@@ -54,7 +55,7 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
     case = cases(SEED, 4, "single", 2.0)[i]
     explanation = run_search(case, tmp_path)
     (name,) = case.hidden
-    assert explanation.left < CLEAR and explanation.fitted.names == (name,)
+    assert explanation.left < LIMITS.unknown and explanation.fitted.names == (name,)
     for key, value in case.truth["effects"][name].items():
         if key in _SIZES:
             # errors of nominal numbers are known no better than these are
@@ -66,12 +67,12 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
 
 def test_nothing_is_named_on_a_clean_machine(tmp_path):
     explanation = run_search(cases(SEED, 1, "none", 2.0)[0], tmp_path)
-    assert explanation.left < CLEAR and explanation.fitted.names == ()
+    assert explanation.left < LIMITS.unknown and explanation.fitted.names == ()
 
 
 def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
     explanation = run_search(cases(SEED, 1, "unknown", 1.0)[0], tmp_path)
-    assert explanation.left > CLEAR
+    assert explanation.left > LIMITS.unknown
 
 
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
@@ -85,7 +86,7 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     explanation = effect_search.run()
     # friction that contains it explains as much, and is no alternative
     (finding,) = weigh(explanation)
-    assert explanation.left < CLEAR and finding.effect == "motor.coulomb_friction"
+    assert explanation.left < LIMITS.unknown and finding.effect == "motor.coulomb_friction"
     assert finding.confidence > 0.99 and finding.alternatives == ()
 
 
@@ -102,7 +103,7 @@ def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
         tmp_path / "log.csv"
     )
     explanation = prepare_search(tmp_path / "log.csv", nominal_study()).run()
-    assert explanation.left < CLEAR and explanation.fitted.names == (name,)
+    assert explanation.left < LIMITS.unknown and explanation.fitted.names == (name,)
     for key, value in HIDDEN[name].items():
         assert explanation.fitted.numbers[name][key] == pytest.approx(value, rel=0.02)
 

@@ -10,9 +10,10 @@ from scipy import stats
 
 from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.expected_errors import LEVEL, _quantile, expected_errors, failed
+from jaxbl.diagnosis.expected_errors import _quantile, expected_errors, failed
 from jaxbl.diagnosis.proof import open_held_out
 from jaxbl.diagnosis.setup import set_up
+from jaxbl.diagnosis.thresholds import LIMITS
 
 
 def compare_with_expected(folder, log, effects, noise=None):
@@ -65,8 +66,10 @@ def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
 @pytest.mark.parametrize("freedom", [1, 4, 30])
 def test_the_quantile_is_that_of_sums_of_squares(freedom):
     drawn = stats.chi2.rvs(freedom, scale=3.0, size=4000, random_state=1)
-    assert _quantile(drawn, LEVEL) == pytest.approx(stats.chi2.ppf(1.0 - LEVEL, freedom, scale=3.0), rel=0.1)
-    assert _quantile(np.full(6, 2.0), LEVEL) == 2.0 and _quantile(np.zeros(6), LEVEL) == 0.0
+    assert _quantile(drawn, LIMITS.failing) == pytest.approx(
+        stats.chi2.ppf(1.0 - LIMITS.failing, freedom, scale=3.0), rel=0.1
+    )
+    assert _quantile(np.full(6, 2.0), LIMITS.failing) == 2.0 and _quantile(np.zeros(6), LIMITS.failing) == 0.0
 
 
 def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):

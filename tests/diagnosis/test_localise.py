@@ -12,9 +12,10 @@ from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.coordinates import CoordinateValues, all_coordinates, coordinates_of
-from jaxbl.diagnosis.localise import SIGNIFICANT, localise, locate
+from jaxbl.diagnosis.localise import localise, locate
 from jaxbl.diagnosis.residuals import Residual, residual_torques
 from jaxbl.diagnosis.sentences import sentence_of
+from jaxbl.diagnosis.thresholds import LIMITS
 
 PERIOD, COUNT = 5e-3, 4000
 TIME = PERIOD * np.arange(COUNT)
@@ -83,10 +84,10 @@ def test_a_slow_disturbance_is_no_function_of_the_motion(repeats):
     count, false = repeats(6, 20), 0
     for seed in range(count):
         location = locate_torque(0.2 * draw_noise(100 + seed, 0.99), seed)
-        assert location.significant and location.excess_z > SIGNIFICANT
+        assert location.significant and location.excess_z > LIMITS.significant
         for name in ("direction", "reversals", "|speed|", "speed", "turn"):
             assert location.coordinates[name].explained < 0.25
-            false += any(abs(region.mean_z) > SIGNIFICANT for region in location.coordinates[name].regions)
+            false += any(abs(region.mean_z) > LIMITS.significant for region in location.coordinates[name].regions)
     assert false <= count // 20
 
 
