@@ -1,7 +1,5 @@
 """Errors of two models beside one another, block by block of a log."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from .reference_log import Comparison, Errors, ReferenceLog
@@ -55,12 +53,6 @@ def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(BLOCKS), 2.0 * LIMITS.noise_structure))
 
 
-def is_better(new: Errors, old: Errors) -> bool:
-    """Tell whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return bool(np.sum(np.log([new[name] for name in old]) - np.log(list(old.values()))) < 0.0)
-
-
 _WORSE, _WORSE_SPEED = 1.02, 1.05
 """Errors of a model over those of another, or over the noise, up to which it is no worse: what numbers fitted on other data
 cost; of speeds the noise is known less well."""
@@ -82,13 +74,3 @@ def is_worse(after: Comparison, before: Comparison, noise: Errors) -> bool:
         if not standard_errors_between(other, own) > -LIMITS.sure:
             return True
     return False
-
-
-def take_folds(whole: Comparison, folds: Sequence[Comparison]) -> Comparison:
-    """A comparison whose samples are, part by part of the log, those of one model each; torques stay those of the whole."""
-    samples = {name: values.copy() for name, values in whole.samples.items()}
-    for i, fold in enumerate(folds):
-        for name, values in samples.items():
-            rows = np.array_split(np.arange(len(values)), len(folds))[i]
-            values[rows] = fold.samples[name][rows]
-    return whole.with_samples(samples)

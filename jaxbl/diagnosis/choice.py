@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .blocks import is_better, is_worse, standard_errors_better
+from .blocks import is_worse, standard_errors_better
 from .confidence import Finding, explained_share, is_little, weigh
 from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, failed
@@ -92,10 +92,7 @@ class Choice:
         """Search for effects, and settle the numbers."""
         found = self.search.run()
         fitted, compared = found.fitted, self.search.compare(found.fitted)
-        noise = self.log.noise_floor(self.before.torques)
-        if not fitted.names and (
-            is_worse(compared, self.before, noise) or not is_better(compared.errors, self.before.errors)
-        ):
+        if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.seen:
             fitted, compared = self._as_given(fitted), self.before
         findings = weigh(found)
         chosen = Chosen(found, fitted, compared, findings, _closest(found), 0.0, self.search.fits.given.drive)

@@ -14,12 +14,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxbl.drive.effects import EFFECTS, Numbers
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.identification.free_parameters import FreeParameter
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
-from .blocks import mean_squares, standard_errors_better, standard_errors_between, take_folds
+from .blocks import mean_squares, standard_errors_better, standard_errors_between
 from .candidates import Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
@@ -44,8 +44,6 @@ _KNOWN = 6.0
 """Standard errors of an effect's torque from which on it is not asked for again in the next round."""
 _AHEAD = 3
 """Steps that are followed where none is accepted."""
-_CONTRADICTED = -2.0
-"""Standard errors: what predicts worse than this in one way has to be wrong, whatever the others say."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 """Prior sizes of a free function that are tried, over `effect_size`: down to the least that counts."""
 _MOST = 8
@@ -95,11 +93,12 @@ class Trial(NamedTuple):
 
 class _Proposal(NamedTuple):
     """Effects that may be missing, their numbers, the change of the model's own numbers beside them, and the nats that they
-    promise; infinite where these are not known."""
+    promise; infinite where these are not known. And the best variant of a single one."""
 
     numbers: EffectNumbers
     change: np.ndarray
-    nats: float
+    nats: float = np.inf
+    variant: Candidate | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,9 +156,8 @@ class EffectSearch:
         """Compare a model with the log, each quarter by numbers that were fitted without it."""
         key = fitted.names, fitted.theta.tobytes()
         if key not in self._compared:
-            whole = self.log.compare(fitted.experiment)
-            folds = [] if fitted.left_out is None else [self.log.compare(fitted.move_by(one)) for one in fitted.left_out]
-            self._compared[key] = take_folds(whole, folds) if folds else whole
+            changes = np.zeros((1, len(fitted.theta))) if fitted.left_out is None else fitted.left_out
+            self._compared[key] = self.log.compare(fitted.experiment, models=[fitted.move_by(one) for one in changes])
         return self._compared[key]
 
     def gain(self, before: FittedModel, after: FittedModel) -> Gain:
@@ -177,7 +175,7 @@ class EffectSearch:
         # what is known of the model's own numbers counts, but for what two standard deviations explain
         known = [float(np.sum((each.theta[: len(self.fits.prior)] / self.fits.prior) ** 2)) for each in (before, after)]
         beyond = float(np.sqrt(max(known[0] - known[1] - LIMITS.sure**2, 0.0)))
-        shown = (most if least > _CONTRADICTED else least) + beyond
+        shown = (most if least > -LIMITS.sure else least) + beyond
         return Gain(after.log_evidence - before.log_evidence, shown, asked)
 
     def _is_possible(self, fitted: FittedModel) -> bool:
@@ -341,28 +339,33 @@ class EffectSearch:
         ranked = self._rank(linear, current.names, variants, predictor)
         if ranked:
             # a predictor chosen without an effect makes up for it
-            leaders = [linear.choose([one.variant]) for one in ranked[:_LEADERS]]
+            leaders = [linear.choose([one.variant]) for one in ranked[:_LEADERS] if one.variant is not None]
             predictor = min(leaders, key=lambda one: float(np.sum(np.log(one.deviation))))
             ranked = self._rank(linear, current.names, variants, predictor)
-        promised = {found.name: found for found in ranked[:_PROPOSED]}
+        promised = {next(iter(proposal.numbers)): proposal for proposal in ranked[:_PROPOSED]}
         by_torque = regression.propose()[:_BY_TORQUE]
-        some = [one for one in by_torque if one.name not in promised and one.share > _PROMISING * by_torque[0].share]
-        shares = {one.name: one.share for one in some}
-        found = [
-            _Proposal({name: one.numbers}, one.change, one.nats)
-            for name, one in promised.items()
-            if not any(contains(name, other) and one.nats < by.nats - LIMITS.general_odds for other, by in promised.items())
+        shown = [
+            effect for effect in by_torque if effect.name not in promised and effect.share > _PROMISING * by_torque[0].share
+        ]
+        shares = {effect.name: effect.share for effect in shown}
+        proposals = [
+            proposal
+            for name, proposal in promised.items()
+            if not any(
+                contains(name, other) and proposal.nats < special.nats - LIMITS.general_odds
+                for other, special in promised.items()
+            )
         ]
         none = np.zeros(len(own))
-        found += [
-            _Proposal({one.name: one.numbers}, none, np.inf)
-            for one in some
-            if not any(contains(one.name, other) and one.share < by + SHOWN for other, by in shares.items())
+        proposals += [
+            _Proposal({effect.name: effect.numbers}, none)
+            for effect in shown
+            if not any(contains(effect.name, other) and effect.share < share + SHOWN for other, share in shares.items())
         ]
         together = regression.propose_together()
         if len(together) > 1:
-            found.append(_Proposal(together, none, np.inf))
-        return found
+            proposals.append(_Proposal(together, none))
+        return proposals
 
     def _regress(self, linear: Linear, current: FittedModel, variants: Sequence[Candidate]) -> TorqueRegression:
         """Prepare the regression on what a model lacks; errors of numbers that may change take part, and are no finding."""
@@ -374,7 +377,7 @@ class EffectSearch:
 
     def _rank(
         self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor
-    ) -> list["_Promise"]:
+    ) -> list[_Proposal]:
         """Rank the best variants of effects by the linearised model, of those that promise anything."""
         if not np.isfinite(predictor.deviation).all():
             # no predictor follows this model
@@ -382,14 +385,14 @@ class EffectSearch:
         columns = linear.columns(variants, predictor.smoothness, predictor.deviation)
         base = evidence_of(columns)
         assert base is not None
-        best: dict[str, _Promise] = {}
+        best: dict[str, _Proposal] = {}
         for i, one in enumerate(variants):
             gone = [name for name in names if replaces(one.name, name)]
             found = evidence_of(_without(columns, linear, gone) if gone else columns, variants, i)
             if found is not None:
                 nats = self._nats(linear, base, found) - linear.choices(one.name)
                 if nats > max(best[one.name].nats if one.name in best else 0.0, 0.0):
-                    best[one.name] = _Promise(one.name, found.numbers, found.own[: len(self.fits.prior)], nats, one)
+                    best[one.name] = _Proposal({one.name: found.numbers}, found.own[: len(self.fits.prior)], nats, one)
         return sorted(best.values(), key=lambda one: -one.nats)
 
     def _nats(self, linear: Linear, base: Evidence, found: Evidence) -> float:
@@ -429,13 +432,3 @@ def _without(columns: Products, linear: Linear, names: Collection[str]) -> Produ
     scale = columns.scale.copy()
     scale[gone] = np.inf
     return dataclasses.replace(columns, products=change @ columns.products @ change.T, scale=scale)
-
-
-class _Promise(NamedTuple):
-    """The best variant of an effect on the linearised model: its numbers, the change of the model's own, and its gain."""
-
-    name: str
-    numbers: Numbers
-    change: np.ndarray
-    nats: float
-    variant: Candidate

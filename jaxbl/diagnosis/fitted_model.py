@@ -44,7 +44,6 @@ class FittedModel(NamedTuple):
         white: the same if prediction errors are white, as those of a complete model.
         linear: the model along the log; of the model as given, with its own numbers fitted.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
-        log_likelihood: nats; only differences count.
         log_odds: of the effects before the log is seen, nats.
         log_evidence: nats, by Laplace's method (D. MacKay, Neural Computation 4, 1992); only differences count.
         foretold: prediction errors, each quarter by numbers fitted without it, rad, shape (samples, sides).
@@ -59,7 +58,6 @@ class FittedModel(NamedTuple):
     white: np.ndarray
     linear: Linear
     left_out: np.ndarray | None = None
-    log_likelihood: float = np.nan
     log_odds: float = 0.0
     log_evidence: float = -np.inf
     foretold: np.ndarray | None = None

@@ -93,7 +93,14 @@ class _Model(NamedTuple):
         return -found.transpose(1, 0, 2, 3) / noise[:, None]
 
 
-def best_runs(experiment: Experiment, windows: Windows, passes: int, rest: bool, varying: NamedArrays | None = None) -> Run:
+def best_runs(
+    experiment: Experiment,
+    windows: Windows,
+    passes: int,
+    rest: bool,
+    varying: NamedArrays | None = None,
+    which: np.ndarray | None = None,
+) -> Run:
     """Runs from the initial states that suit the first fifth of each window best, found by damped Gauss-Newton.
 
     Args:
@@ -102,21 +109,23 @@ def best_runs(experiment: Experiment, windows: Windows, passes: int, rest: bool,
         passes: initial states that are tried for a window at most.
         rest: whether standstill is one of them.
         varying: numbers of the model that differ from sample to sample, by dotted paths, shape (windows, samples).
+        which: indices of the windows that are run; left out: all.
     """
     windows = jax.tree.map(np.asarray, windows)
     experiment, start = lean(experiment, windows.start)
-    model = _Model(experiment, dataclasses.replace(windows, start=start), varying or {})
+    windows, varying = dataclasses.replace(windows, start=start), varying or {}
+    # what was before a window is known where it goes on where another one ends
+    steps = np.rint(np.diff(windows.time) / float(experiment.run.sample_period))
+    within = np.concatenate([[False], steps == windows.torque.shape[1]]) | windows.rest
+    if which is not None:
+        windows, within = windows.only(which), within[which]
+        varying = {path: values[which] for path, values in varying.items()}
     with np.errstate(invalid="ignore", over="ignore"):
-        return _searched(model, passes, rest)
+        return _search_starts(_Model(experiment, windows, varying), passes, rest, within)
 
 
-def _within(model: _Model) -> np.ndarray:
-    """Whether a window goes on where the one before it ends; shape (windows,)."""
-    time, period = model.windows.time, float(model.experiment.run.sample_period)
-    return np.concatenate([[False], np.rint(np.diff(time) / period) == model.windows.torque.shape[1]])
-
-
-def _searched(model: _Model, passes: int, rest: bool) -> Run:
+def _search_starts(model: _Model, passes: int, rest: bool, within: np.ndarray) -> Run:
+    """Find the best start of each window; `within`: where what was before it is known."""
     windows, sides = model.windows, model.experiment.sides
     leaves, shape = jax.tree.flatten(windows.start)
     places: Any = shape.unflatten(range(len(leaves)))
@@ -128,13 +137,14 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
     still, known = best.copy(), np.ones_like(best)
     still[:, moving] = 0.0
     known[np.ix_(np.flatnonzero(windows.rest), moving)] = 0.0
-    within = _within(model) | windows.rest
     for effect, own in zip(model.experiment.effects, places.effects, strict=True):
         columns = jax.tree.leaves(own)
         if columns and (effect.state_from_measurement or effect.state_from_input):
             known[np.ix_(np.flatnonzero(within | effect.state_from_input), columns)] = 0.0
     residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
     states = [np.zeros((runs, samples)) for _ in leaves]
+    if not runs:
+        return Run(residual, shape.unflatten(states), np.zeros(len(sides)))
     cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()
     going = np.ones(runs, bool)
     for i in range(passes):

@@ -50,6 +50,8 @@ _STATES, _STATES_OF_ONE_RUN = 8, 3
 
 Errors = dict[str, float]
 """Rms errors by channel: `theta_e`, `velocity_motor`, `torque_motor` and so on."""
+_Part = tuple[int, int]
+"""Number of a part of a log, and of how many."""
 
 
 class Comparison(NamedTuple):
@@ -69,10 +71,6 @@ class Comparison(NamedTuple):
     samples: NamedArrays
     gain: float
     noise: Errors
-
-    def with_samples(self, samples: NamedArrays) -> "Comparison":
-        """The same with other errors."""
-        return self._replace(samples=samples, errors=_all_rms(samples))
 
 
 @dataclass(frozen=True)
@@ -167,17 +165,33 @@ class ReferenceLog:
             found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
 
-    def compare(self, experiment: Experiment, added: NamedArrays | None = None) -> Comparison:
-        """Errors of a model at this log's period on short windows, and the torques that it lacks; `added`: torques on its
-        sides besides, N m, sample by sample from the first to the last."""
-        experiment = at_period(experiment, self.period)
-        torques = residual_torques(experiment, self.segments)
-        for side, table in (added or {}).items():
+    def compare(self, whole: Experiment, added: NamedArrays | None = None, models: Sequence[Experiment] = ()) -> Comparison:
+        """Errors of a model at this log's period on short windows, and the torques that it lacks.
+
+        Args:
+            whole: the model.
+            added: torques on its sides besides, N m, sample by sample from the first to the last.
+            models: one for each part of the log, such as ones whose numbers were fitted without it, whose errors there are
+                taken in place of the model's.
+        """
+        torques, parts, noises = self._lacking(whole, added or {}), [], []
+        for i, model in enumerate(models or [whole]):
+            part = i, len(models) or 1
+            samples, noise = self._samples(model, self.samples, _STATES, added or {}, part)
+            narrowed = self._narrowed(self._lacking(model, {}) if models else torques)
+            parts.append(samples | {name: np.array_split(torque, part[1])[i] for name, torque in narrowed.items()})
+            noises.append(noise)
+        samples = {name: np.concatenate([errors[name] for errors in parts]) for name in parts[0]}
+        noise = {name: rms(np.array([added_noise[name] for added_noise in noises])) for name in noises[0]}
+        return Comparison(_all_rms(samples), torques, samples, float(whole.plant.input_gain), noise)
+
+    def _lacking(self, experiment: Experiment, added: NamedArrays) -> SideResiduals:
+        """Torques that a model lacks, those that are added left out."""
+        torques = residual_torques(at_period(experiment, self.period), self.segments)
+        for side, table in added.items():
             pieces = zip(torques[side], self._rows(), strict=True)
             torques[side] = [replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
-        positions, noise = self._samples(experiment, self.samples, _STATES, added or {})
-        samples = positions | self._narrowed(torques)
-        return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain), noise)
+        return torques
 
     def readings(self) -> NamedArrays:
         """Positions as they were read, rad, by channel."""
@@ -217,7 +231,7 @@ class ReferenceLog:
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
-        torques = residual_torques(at_period(experiment, self.period), self.segments)
+        torques = self._lacking(experiment, {})
         return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
 
     def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
@@ -226,7 +240,7 @@ class ReferenceLog:
         effects = [effect for effect in experiment.effects if effect.place == side]
         dry = not any(type(effect).exclusive for effect in effects)
         steady = not any(isinstance(effect, ConstantTorque) for effect in effects)
-        pieces, columns = residual_torques(at_period(experiment, self.period), self.segments)[side], []
+        pieces, columns = self._lacking(experiment, {})[side], []
         for segment, piece in zip(self.segments, pieces, strict=True):
             smoothed = segment.smoothed[side]
             moving = ~np.asarray(smoothed.held(self.period))
@@ -254,10 +268,12 @@ class ReferenceLog:
         deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
         return errors, one._growth(experiment, length, deviation)
 
-    def _samples(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> tuple[NamedArrays, Errors]:
+    def _samples(
+        self, experiment: Experiment, length: int, passes: int, added: NamedArrays, part: _Part = (0, 1)
+    ) -> tuple[NamedArrays, Errors]:
         """Errors of positions and speeds on windows of a length, under torques added sample by sample, where windows are
         foretold; shape (windows, samples). And what noise adds by way of the initial states, as of a comparison."""
-        run, firsts = self._runs(experiment, length, passes, added)
+        run, firsts = self._runs(experiment, length, passes, added, part)
         rows = firsts[:, None] + np.arange(length)[None, :]
         found = {
             POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
@@ -270,12 +286,15 @@ class ReferenceLog:
         noise = {POSITION_CHANNELS[side]: float(run.noise[i]) for i, side in enumerate(experiment.sides)}
         return {name: errors[:, count_seen(length) :] for name, errors in found.items()}, noise
 
-    def _runs(self, experiment: Experiment, length: int, passes: int, added: NamedArrays) -> tuple[Run, np.ndarray]:
+    def _runs(
+        self, experiment: Experiment, length: int, passes: int, added: NamedArrays, part: _Part = (0, 1)
+    ) -> tuple[Run, np.ndarray]:
         """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
-        experiment, paths = with_torques(experiment)
+        experiment, paths = with_torques(at_period(experiment, self.period))
         windows, firsts = windows_of(self.segments, experiment, length, self.rest)
         varying = {path: self._along(windows, added.get(side)) for side, path in paths.items()}
-        return best_runs(experiment, windows, passes, self.rest, varying), firsts
+        which = np.array_split(np.arange(len(firsts)), part[1])[part[0]]
+        return best_runs(experiment, windows, passes, self.rest, varying, which), firsts[which]
 
     def _along(self, windows: Windows, table: np.ndarray | None) -> np.ndarray:
         """A torque that is added, as one that resists, on windows; N m, shape (windows, samples)."""

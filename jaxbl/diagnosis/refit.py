@@ -262,7 +262,7 @@ class _Fit:
         none = np.full((own, own), np.inf)
         found = FittedModel(
             tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, own)),
-            0.5 * float(np.sum((point.theta / self.width) ** 2) - point.cost), self.log_odds, end=end,
+            self.log_odds, end=end,
         )  # fmt: skip
         if not np.isfinite(point.cost):
             return found

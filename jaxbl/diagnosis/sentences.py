@@ -8,10 +8,6 @@ from .thresholds import LIMITS
 
 _SIMPLER = 0.04
 """Share of the power by which a later coordinate must explain more than an earlier one, to be named in its place."""
-_MOST = 0.6
-"""Share of the power that a region has to hold to be named."""
-_HINT, _SHOWN = 0.1, 3.0
-"""Share of the power from which on a coordinate is hinted at; standard deviations of a mean that is said."""
 _TELLING = 0.5
 """Share of the power from which on a coordinate, or a narrow peak, is named."""
 _CROWDED = 0.35
@@ -46,7 +42,7 @@ def sentence_of(found: Localised, unit: str = "N m") -> str:
     telling = next((one for one in found.coordinates.values() if one.explained >= best - _SIMPLER), None)
     crowd = _crowded(found)
     clauses = []
-    if crowd is not None and (best < _TELLING or crowd[0] > _MOST):
+    if crowd is not None and (best < _TELLING or crowd[0] > _TELLING):
         clauses.append(crowd[1])
     own = [one for one in found.peaks if not one.in_motion]
     if own and own[0].power_share > max(best, _TELLING) - _SIMPLER:
@@ -60,9 +56,7 @@ def sentence_of(found: Localised, unit: str = "N m") -> str:
     if not clauses and found.excess_z < LIMITS.significant:
         return f"{side}, {_faint(found, unit)}"
     if not clauses:
-        hint = ""
-        if telling is not None and best > _HINT:
-            hint = f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
+        hint = "" if telling is None else f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
         clauses.append(f"spread over the log: no function of speed, position, load or time alone explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
 
@@ -87,7 +81,7 @@ def _percent(share: float) -> str:
 
 def _class_means(coordinate: Coordinate, unit: str) -> str:
     """Mean torques of the few classes of a coordinate."""
-    shown = [one for one in coordinate.regions if one.label and abs(one.mean_z) > _SHOWN]
+    shown = [one for one in coordinate.regions if one.label and abs(one.mean_z) > LIMITS.significant]
     return f" ({', '.join(f'{one.mean:+.2g} {unit} {one.label}' for one in shown)})" if shown else ""
 
 
@@ -110,7 +104,7 @@ def _crowded(found: Localised) -> tuple[float, str] | None:
         for rows in groups:
             held, spent = float(power[rows].sum()), float(time[rows].sum())
             score = held - spent
-            if held < _MOST or held < 2.0 * spent or score < _CROWDED or np.max(z[rows]) < LIMITS.significant:
+            if held < _TELLING or held < 2.0 * spent or score < _CROWDED or np.max(z[rows]) < LIMITS.significant:
                 continue
             # of regions that hold as much, the simpler coordinate's
             if best is None or score > best[0] + _SIMPLER:

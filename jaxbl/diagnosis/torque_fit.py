@@ -62,10 +62,7 @@ def fit_to_torque(fits: ModelFits, fitted: FittedModel, log: ReferenceLog) -> Fi
     order = np.argsort(np.concatenate([np.arange(count) / count for count in counts]), kind="stable")
     changes = leave_quarters_out(left[order, None], jacobian[order, None], np.diag(prior))
     model = fitted._replace(
-        experiment=experiment, theta=found.x, covariance=white @ middle @ white, white=white, left_out=changes,
-        log_likelihood=np.nan,
-    )  # fmt: skip
+        experiment=experiment, theta=found.x, covariance=white @ middle @ white, white=white, left_out=changes
+    )
     numbers = model.numbers
-    if not are_possible(numbers, log.period):
-        return None
-    return model._replace(linear=fits.linearise(numbers, found.x[:own]))
+    return model._replace(linear=fits.linearise(numbers, found.x[:own])) if are_possible(numbers, log.period) else None

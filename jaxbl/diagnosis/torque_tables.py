@@ -18,7 +18,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment, with_effects
 
-from .blocks import QUARTERS, is_worse, standard_errors_better, take_folds
+from .blocks import QUARTERS, is_worse, standard_errors_better
 from .reference_log import Comparison, Errors, ReferenceLog
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 from .thresholds import LIMITS
@@ -119,8 +119,8 @@ def tabulate(
             continue
         every = {**(best.tables if best else {}), side: tables}
         model = _with_tables(experiment, every)
-        folds = [log.compare(_with_tables(experiment, every, quarter)) for quarter in range(QUARTERS)]
-        with_tables, before = take_folds(log.compare(model), folds), best.compared if best else compared
+        quarters = [_with_tables(experiment, every, quarter) for quarter in range(QUARTERS)]
+        with_tables, before = log.compare(model, models=quarters), best.compared if best else compared
         if standard_errors_better(log, before, with_tables) > LIMITS.sure and not is_worse(with_tables, before, noise):
             best = Tabulation(every, model, with_tables, standard_errors_better(log, compared, with_tables))
     return best

@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxbl.diagnosis.blocks import standard_errors_better, standard_errors_between, take_folds
-from jaxbl.diagnosis.effect_search import EffectSearch
-from jaxbl.diagnosis.fitted_model import FittedModel
+from jaxbl.diagnosis.blocks import standard_errors_better, standard_errors_between
 from jaxbl.diagnosis.reference_log import Comparison
 
 POSITION, TORQUE = 1e-4, 1e-2
@@ -68,17 +66,3 @@ def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
     few = np.append(np.full(15, 4.0), 1e6)
     assert standard_errors_between(few, few / 3.0) > 5.0
     assert standard_errors_between(np.full(16, np.inf), moving[:1].repeat(16)) == np.inf
-
-
-def test_each_quarter_is_compared_by_the_numbers_that_were_fitted_without_it(monkeypatch):
-    log = SimpleNamespace(compare=lambda number: compare_errors(np.full(160, float(number)), np.full(8, float(number))))
-    search = EffectSearch.__new__(EffectSearch)
-    search.log, search._compared = log, {}  # type: ignore[assignment]
-    fitted = FittedModel((), 9.0, (), np.zeros(1), None, None, None, np.arange(4.0))  # type: ignore[arg-type]
-    monkeypatch.setattr(FittedModel, "move_by", lambda self, change: change)
-    compared = search.compare(fitted)
-    np.testing.assert_allclose(compared.samples["theta_e"] / POSITION, np.repeat(np.arange(4.0), 40))
-    np.testing.assert_allclose(compared.samples["torque_motor"] / TORQUE, np.repeat(np.arange(4.0), 2))
-    assert compared.errors["theta_e"] == pytest.approx(POSITION * np.sqrt(14.0 / 4.0))
-    # the torques that are missing stay those of all of it
-    assert take_folds(log.compare(5), [log.compare(1)]).torques == log.compare(5).torques

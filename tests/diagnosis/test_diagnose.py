@@ -10,7 +10,6 @@ from hidden_log import FRICTION, nominal_study, select_samples, simulate_direct_
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
 from jaxbl.config import read_config
-from jaxbl.diagnosis.blocks import is_better
 from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
 from jaxbl.diagnosis.diagnosis_summary import tied
@@ -211,20 +210,6 @@ def test_a_steady_torque_is_no_other_one_when_shuffled(logs):
         assert setup.fitted.permuted(setup.nominal, {"motor": [np.full(len(segment), 0.1)]}) is None
         wave = np.sin(np.linspace(0.0, 20.0, len(segment)))
         assert setup.fitted.permuted(setup.nominal, {"motor": [wave]}) is not None
-
-
-def test_new_numbers_are_better_all_in_all():
-    def is_better_by_position(before, after):
-        return is_better({"theta_e": after, "torque_motor": 1.1}, {"theta_e": before, "torque_motor": 1.0})
-
-    assert is_better_by_position(1.0, 0.9) and not is_better_by_position(1.0, 0.95)
-    # a model that diverges, or errs by nothing, is no error
-    assert is_better_by_position(np.inf, 1.0) and is_better_by_position(1.0, 0.0)
-    assert (
-        not is_better_by_position(1.0, np.inf)
-        and not is_better_by_position(np.inf, np.inf)
-        and not is_better_by_position(0.0, 1.0)
-    )
 
 
 def test_an_effect_that_predicts_worse_is_not_named(logs, monkeypatch):

@@ -39,3 +39,19 @@ def test_smoothing_leaves_torque_where_friction_jumps_and_little_elsewhere(log):
     with jax.enable_x64(True):
         bending = as_arrays(make_effect("load.presliding_friction", torque=1.0, length=0.01), float)
         assert reference_log.rounding(with_effects(model, (bending,))) == {}
+
+
+def test_each_part_of_a_log_is_compared_with_a_model_of_its_own(log):
+    with jax.enable_x64(True):
+        model = as_arrays(prepare(read_config(STUDY)), float)
+        reference_log = ReferenceLog(segments_of(log, model.sides), {"motor": 25.0, "load": 25.0})
+        path = "effects.load.coulomb_friction.torque"
+        models = [set_leaves(model, {path: np.asarray(torque)}) for torque in (4.0, 2.0, 0.0)]
+        parts = reference_log.compare(model, models=models)
+        wholes = [reference_log.compare(one) for one in models]
+    for name, errors in parts.samples.items():
+        expected = np.concatenate([np.array_split(one.samples[name], 3)[i] for i, one in enumerate(wholes)])
+        np.testing.assert_allclose(errors, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+        assert parts.errors[name] == pytest.approx(np.sqrt(np.mean(expected**2)))
+    # the torques that are missing are those of the one
+    np.testing.assert_array_equal(parts.torques["load"][0].torque, wholes[0].torques["load"][0].torque)
