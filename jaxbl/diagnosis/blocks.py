@@ -31,7 +31,7 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     ]
     together = standard_errors_between(*costs)
     by_channel = [standard_errors_between(*channel) for channel in zip(*costs, strict=True)]
-    return max(together, *by_channel) if min(by_channel) > -LIMITS.seen and max(by_channel) > LIMITS.seen else together
+    return max(together, *by_channel) if -min(by_channel) < LIMITS.seen < max(by_channel) else together
 
 
 def mean_squares(errors: np.ndarray, noise: float | np.ndarray) -> np.ndarray:

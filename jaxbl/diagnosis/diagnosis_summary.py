@@ -57,10 +57,8 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
             notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
     if chosen.verdict == "no_discrepancy":
         for side, one in located.items():
-            least, unit = (
-                LIMITS.significant * one.coordinates["all"].regions[0].mean_error,
-                record.unit_of(f"{side}.torque", "N m"),
-            )
+            least = LIMITS.significant * one.coordinates["all"].regions[0].mean_error
+            unit = record.unit_of(f"{side}.torque", "N m")
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     if (noise := setup.input_noise.unfelt) > 0.0:
         # a command is felt whole, if not as a torque

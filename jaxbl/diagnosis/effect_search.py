@@ -40,8 +40,6 @@ own before."""
 _PROMISING = 0.5
 """A candidate is tried where it promises this share of the most nats that another one gained (promises are linear), or takes
 away this share of the torque that the best one does; several together count by this share of their nats."""
-_KNOWN = 6.0
-"""Standard errors of an effect's torque from which on it is not asked for again in the next round."""
 _AHEAD = 3
 """Steps that are followed where none is accepted."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
@@ -191,18 +189,22 @@ class EffectSearch:
     def run(self) -> Explanation:
         """Find what is missing."""
         current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
-        visited: set[frozenset[str]] = set()
+        visited = set[frozenset[str]]()
         while True:
             # effects that make each other needless would come and go without end
             better = None if frozenset(current.names) in visited else self._next(current)
             visited.add(frozenset(current.names))
-            current, gains = self._reduce(better or current, thorough=better is None)
+            # in the end every effect is asked for, and of several at once each
+            thorough = better is None or len(better.names) > len(current.names) + 1
+            current, gains = self._reduce(better or current, thorough=thorough)
             if better is None and frozenset(current.names) in visited:
                 break
         rivals = {name: self._rivals(current, name) for name in current.names}
         found = Explanation(current, gains, rivals, self.remainder(current))
-        unknown = f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown"
-        self._note("fit free functions to what remains", Gain(found.left, np.nan), found.left > LIMITS.unknown, unknown)
+        self._note(
+            "fit free functions to what remains", Gain(found.left, np.nan), bool(found.left > LIMITS.unknown),
+            f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown",
+        )  # fmt: skip
         return found
 
     def _next(self, current: FittedModel) -> FittedModel | None:
@@ -219,10 +221,11 @@ class EffectSearch:
             single = [trial for trial in trials if len(trial.added) == 1 and trial.worth > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             for trial in trials:
-                followed = "most likely" if accepted else "followed, as none is accepted"
-                why = followed if trial is best else "less likely" if trial in accepted else trial.gain.rule
-                kept = trial is best and bool(accepted)
-                self._note(describe_change(ahead.numbers, trial.fitted.numbers), trial.gain, kept, why)
+                why = "less likely" if trial in accepted else trial.gain.rule
+                if trial is best:
+                    why = "most likely" if accepted else "followed, as none is accepted"
+                change = describe_change(ahead.numbers, trial.fitted.numbers)
+                self._note(change, trial.gain, trial is best and bool(accepted), why)
             if best is None:
                 break
             if accepted:
@@ -235,7 +238,7 @@ class EffectSearch:
 
     def _try_all(self, current: FittedModel) -> list[Trial]:
         """Try what is proposed, but for what promises far less than others gained."""
-        trials: list[Trial] = []
+        trials = list[Trial]()
         for proposal in self._propose(current) if len(current.names) < _MOST else ():
             if not any(proposal.nats < _PROMISING * trial.worth for trial in trials):
                 trials.append(self._try(current, proposal))
@@ -259,17 +262,17 @@ class EffectSearch:
         gain = self.gain(current, fitted)
         return Trial(tuple(new), fitted, gain, gain.nats * (1.0 if len(new) == 1 else _PROMISING))
 
-    def _reduce(self, current: FittedModel, *, thorough: bool = False) -> tuple[FittedModel, dict[str, Gain]]:
+    def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
 
         Returns:
-            The model, and what each effect gains; unless `thorough`, well-known ones are not asked for.
+            The model, and what each effect gains; unless `thorough`, only special cases are tried.
         """
         while True:
             gains: dict[str, Gain] = {}
             for name in current.names:
                 fewer = self._simplify(current, name)
-                if fewer is None and (thorough or self._is_open(current, name)):
+                if fewer is None and thorough:
                     numbers = {other: one for other, one in current.numbers.items() if other != name}
                     less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
                     gains[name] = self.gain(less, current)
@@ -299,12 +302,6 @@ class EffectSearch:
                 return less
         return None
 
-    def _is_open(self, fitted: FittedModel, name: str) -> bool:
-        """Tell whether the torque of an effect is not known well."""
-        sizes = [i for i, one in enumerate(fitted.free) if one.path.startswith(f"effects.{name}.") and one.role == "size"]
-        known = [abs(fitted.theta[i]) > _KNOWN * fitted.deviation[i] for i in sizes]
-        return not any(known)
-
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""
         own, found = current.theta[: len(self.fits.prior)], []
@@ -324,7 +321,7 @@ class EffectSearch:
 
     def _note(self, tried: str, gain: Gain, kept: bool, why: str, *, loss: bool = False) -> None:
         nats, z = (-one if loss else one for one in gain[:2])
-        self.history.append(Step(tried, float(nats), None if np.isnan(z) else float(z), kept, why))
+        self.history.append(Step(tried, nats, None if np.isnan(z) else z, kept, why))
 
     # ---- proposals ----
 

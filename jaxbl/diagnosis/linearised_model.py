@@ -522,7 +522,7 @@ class Linear:
 
         def products(signals: MotionTorques, forces: Forces) -> tuple[np.ndarray, np.ndarray]:
             gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
-            return _eliminated(gram, self.states), self._power(forces, signals)
+            return _eliminate(gram, self.states), self._power(forces, signals)
 
         jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]
         total, power = np.zeros((at, at)), np.zeros(at)
@@ -666,6 +666,6 @@ def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:
     return gram[:-states, :-states] - gram[:-states, -states:] @ response
 
 
-def _eliminated(gram: np.ndarray, states: int) -> np.ndarray:
+def _eliminate(gram: np.ndarray, states: int) -> np.ndarray:
     """Products of columns without what the last of them, the initial states, explain."""
     return _without(gram, states, _response_and_loss(gram, states)[0])

@@ -89,7 +89,7 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Names of files, with as much of their folders as parts them."""
+    """Return names of files, with as much of their folders as parts them."""
     names = [path.name for path in paths]
     for depth in range(2, max(len(path.parts) for path in paths) + 1):
         longer = ["/".join(path.parts[-depth:]) for path in paths]
@@ -151,6 +151,6 @@ def _apart(one: _Shown, other: _Shown, k: int, least: float) -> float:
 
 
 def _rows_of(log: ReferenceLog, rows: slice) -> ReferenceLog:
-    """The segments of a log that lie in some rows."""
+    """Return the segments of a log that lie in some rows."""
     within = [one for one in log.segments if rows.start <= one.rows.start and one.rows.stop <= rows.stop]
     return dataclasses.replace(log, segments=within)

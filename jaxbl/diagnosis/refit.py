@@ -9,12 +9,12 @@ Association 90 (1995).
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxbl.drive.effects import EFFECTS, make_effect
+from jaxbl.drive.effects import EFFECTS, Numbers, make_effect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Arrays
@@ -38,8 +38,8 @@ _STEPS = 25
 """Of Gauss-Newton at most under one predictor, rejected ones among them."""
 _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
-_LEAST_STEP = 1e-3
-"""Share of a Gauss-Newton step below which nothing is left to be gained."""
+_LEAST_STEP = 0.05
+"""Share of a Gauss-Newton step below which nothing was ever gained: friction and gaps make errors rough."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
 _STARTS = (1.0, 0.1)
@@ -82,7 +82,7 @@ class ModelFits:
 
     @property
     def _torque(self) -> float:
-        """Size of the input, N m."""
+        """Return the size of the input, N m."""
         return float(np.std(np.concatenate([one.torque for one in self.segments])))
 
     def fit(
@@ -104,7 +104,7 @@ class ModelFits:
         """
         best, fit = None, None
         for share in _STARTS:
-            scaled = {name: self._scale(name, one, share if name in new else 1.0) for name, one in numbers.items()}
+            scaled = {name: _scale(name, one, share) if name in new else one for name, one in numbers.items()}
             tried = _Fit(self, scaled)
             before = own if begin is None or begin.end is None else begin.end.own
             point = tried.run(before + share * (own - before), None if begin is None else begin.end)
@@ -115,11 +115,7 @@ class ModelFits:
         assert best is not None and fit is not None
         return fit.finish(best)
 
-    def _scale(self, name: str, numbers: Mapping[str, float], share: float) -> dict[str, float]:
-        sizes = EFFECTS[name].sizes()
-        return {leaf: value * share if leaf in sizes else value for leaf, value in numbers.items()}
-
-    def unit(self, name: str, leaf: str, numbers: Mapping[str, float]) -> float:
+    def unit(self, name: str, leaf: str, numbers: Numbers) -> float:
         """Find the value of a size of an effect at which its torque is as large as effects are."""
         if (name, leaf) not in self._units:
             alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in numbers.items()} | {leaf: 1.0}
@@ -229,7 +225,7 @@ class _Fit:
         return best
 
     def _path(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> list[Segment]:
-        """The segments with the filtered motion of a model in place of the smoothed one."""
+        """Return the segments with the filtered motion of a model in place of the smoothed one."""
         sides = self.experiment.sides
         experiment = set_free_parameters(self.experiment, self.free, theta)
         gain = Linear.gain_of(smoothness, self.segments[0].period)
@@ -319,6 +315,11 @@ class _Fit:
                 covariance=rows @ found.covariance @ rows.T + shared, white=rows @ found.white @ rows.T + shared,
             )  # fmt: skip
         return found
+
+
+def _scale(name: str, numbers: Numbers, share: float) -> Numbers:
+    sizes = EFFECTS[name].sizes()
+    return {leaf: value * share if leaf in sizes else value for leaf, value in numbers.items()}
 
 
 def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray) -> np.ndarray:

@@ -174,7 +174,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     assert len(columns.products) > model_columns + 2 * module._TOGETHER
     predicted = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
     gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
-    expected = module._eliminated(gram, model.states)
+    expected = module._eliminate(gram, model.states)
     size = np.sqrt(np.diag(expected))
     for places, offset in zip(columns.places, columns.offsets, strict=True):
         point = np.array([*range(model_columns), *places, *([offset] if offset >= 0 else [])])
@@ -229,7 +229,7 @@ def test_what_rounding_takes_is_known(growth):
     basis = np.linalg.qr(state_columns / np.linalg.norm(state_columns, axis=0))[0]
     remainder = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
     true = float(remainder[:, 0] @ remainder[:, 0])
-    error, loss_estimate = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
+    error, loss_estimate = abs(module._eliminate(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
     assert error < max(30.0 * loss_estimate, 1e-9 * true)
     assert loss_estimate < module._LOST or growth > 5.0
     assert loss_estimate > module._LOST or growth < 20.0
