@@ -92,7 +92,7 @@ class Candidate:
 
 
 def are_possible(effects: EffectNumbers, period: float) -> bool:
-    """Whether effects may have these numbers, and can be simulated with them; `period`: sampling period, s."""
+    """Tell whether effects may have these numbers, and can be simulated with them; `period`: sampling period, s."""
     return all(
         EFFECTS[name].possible(numbers) and not EFFECTS[name].find_fault(numbers, period)
         for name, numbers in effects.items()
@@ -327,8 +327,8 @@ class MotionTorques:
         return found
 
     def _shares(self, effect: AbstractEffect) -> bool:
-        """Whether an effect's torque follows from motion and input alone: not in the gear, where the model has torques of
-        its own; nor where the model says how it moves, or what holds it at rest."""
+        """Tell whether the torque of an effect follows from motion and input alone: not in the gear, where the model has
+        torques of its own; nor where the model says how it moves, or what holds it at rest."""
         place, own = self.experiment.drive.resolve_place(effect.place), type(effect)
         if place == "actuator":
             return True

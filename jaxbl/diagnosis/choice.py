@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.drive.effects import EFFECTS
+
 from .blocks import is_worse, standard_errors_better
 from .confidence import Finding, explained_share, is_little, weigh
 from .effect_search import EffectSearch, Explanation, VerdictName
@@ -77,7 +79,9 @@ class Choice:
 
     def __init__(self, setup: Setup):
         self.setup, self.log = setup, setup.fitted
-        exact = setup.task.config.uncertainty.exact
+        # a linear axis has no turns
+        rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
+        exact = [*setup.task.config.uncertainty.exact, *rotary]
         self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, exact)
         self.before = self.log.compare(setup.nominal)
         # asked for twice of one model, and made of many draws

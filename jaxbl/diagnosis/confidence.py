@@ -10,7 +10,7 @@ from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.simulate import Experiment
 
-from .effect_search import Explanation, Gain
+from .effect_search import Explanation
 from .expected_errors import Expected
 from .fitted_model import FittedModel, special_case
 from .reference_log import Errors
@@ -43,7 +43,7 @@ def weigh(found: Explanation) -> tuple[Finding, ...]:
 
 def _weigh(found: Explanation, name: str) -> Finding:
     fitted = found.fitted
-    odds = {trial.added[0]: float(np.exp(-_agreed_nats(trial.gain))) for trial in found.rivals[name]}
+    odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in found.rivals[name]}
     if (plain := special_case(fitted, name)) is not None:
         # as likely by the fit
         odds[plain] = 1.0
@@ -63,15 +63,8 @@ def _certainty(fitted: FittedModel, name: str) -> float:
     return float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
 
 
-def _agreed_nats(gain: Gain) -> float:
-    """Return the evidence over a rival as far as the blocks agree, whose z standard errors are z²/2 nats."""
-    by_blocks = 0.5 * gain.standard_errors * abs(gain.standard_errors)
-    agreed = min(gain.nats, by_blocks, key=abs) if gain.nats * by_blocks > 0.0 else by_blocks
-    return float(np.clip(agreed, -700.0, 700.0))
-
-
 def is_little(share: float | None) -> bool:
-    """Whether an explanation takes away less of the missing torque than it has to."""
+    """Tell whether an explanation takes away less of the missing torque than it has to."""
     return share is not None and share < LIMITS.least_explained
 
 

@@ -38,8 +38,8 @@ _PROPOSED, _BY_TORQUE, _LEADERS = 5, 4, 3
 """Effects of each kind of proposal that are put into the model in a round at most, and those that get a predictor of their
 own before."""
 _PROMISING = 0.5
-"""A candidate is tried where it promises this share of the most nats that another one gained (promises are linear), or takes
-away this share of the torque that the best one does; several together count by this share of their nats."""
+"""A candidate is tried where it promises this share of the most nats that an accepted one gained (promises are linear), or
+takes away this share of the torque that the best one does; several together count by this share of their worth."""
 _AHEAD = 3
 """Steps that are followed where none is accepted."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
@@ -68,6 +68,13 @@ class Gain(NamedTuple):
         return self.nats > 0.0 and self.standard_errors > self.asked
 
     @property
+    def worth(self) -> float:
+        """Nats as far as the blocks agree, whose z standard errors are z²/2 nats."""
+        by_blocks = 0.5 * self.standard_errors * abs(self.standard_errors)
+        agreed = min(self.nats, by_blocks, key=abs) if self.nats * by_blocks > 0.0 else by_blocks
+        return float(np.clip(agreed, -700.0, 700.0))
+
+    @property
     def rule(self) -> str:
         """What is asked of it."""
         return f"nats above 0 and {self.asked:.2g} standard errors are asked"
@@ -80,13 +87,16 @@ class Trial(NamedTuple):
         added: the effects that it has more.
         fitted: the model.
         gain: over the model without them; of a rival, what the other one gains over it.
-        worth: by which the most likely is chosen, nats.
     """
 
     added: tuple[str, ...]
     fitted: FittedModel
     gain: Gain
-    worth: float
+
+    @property
+    def worth(self) -> float:
+        """Nats by which the most likely one is chosen: several at once have to be worth more than one of them."""
+        return self.gain.worth * (1.0 if len(self.added) == 1 else _PROMISING)
 
 
 class _Proposal(NamedTuple):
@@ -218,7 +228,7 @@ class EffectSearch:
             trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
             accepted = [trial for trial in trials if self.gain(current, trial.fitted).is_accepted]
             # structure in the noise is not followed
-            single = [trial for trial in trials if len(trial.added) == 1 and trial.worth > self.floor]
+            single = [trial for trial in trials if len(trial.added) == 1 and trial.gain.nats > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             for trial in trials:
                 why = "less likely" if trial in accepted else trial.gain.rule
@@ -237,10 +247,10 @@ class EffectSearch:
         return None
 
     def _try_all(self, current: FittedModel) -> list[Trial]:
-        """Try what is proposed, but for what promises far less than others gained."""
+        """Try what is proposed, but for what promises far less than others gained that are accepted."""
         trials = list[Trial]()
         for proposal in self._propose(current) if len(current.names) < _MOST else ():
-            if not any(proposal.nats < _PROMISING * trial.worth for trial in trials):
+            if not any(trial.gain.is_accepted and proposal.nats < _PROMISING * trial.gain.nats for trial in trials):
                 trials.append(self._try(current, proposal))
         return trials
 
@@ -258,9 +268,7 @@ class EffectSearch:
         if 1 < len(felt) < len(new):
             # together with others, one may turn out to be nothing
             return self._try(current, proposal._replace(numbers=felt))
-        # several at once have to be worth more than one of them
-        gain = self.gain(current, fitted)
-        return Trial(tuple(new), fitted, gain, gain.nats * (1.0 if len(new) == 1 else _PROMISING))
+        return Trial(tuple(new), fitted, self.gain(current, fitted))
 
     def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.

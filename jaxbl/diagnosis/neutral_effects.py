@@ -54,7 +54,7 @@ def _neutral_of(name: str, cls: type[AbstractEffect], dtype: Any) -> AbstractEff
 
 @cache
 def has_state(name: str) -> bool:
-    """Whether an effect has a state of its own."""
+    """Tell whether an effect has a state of its own."""
     return bool(jax.tree.leaves(jax.eval_shape(_neutral(name).init)))
 
 

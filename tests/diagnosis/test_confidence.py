@@ -23,7 +23,7 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, **numbers):
         experiment=SimpleNamespace(effects=(effect,)),
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
-    rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival), 0.0)]
+    rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
     (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {}))  # type: ignore[arg-type]
     return finding
 

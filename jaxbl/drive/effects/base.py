@@ -163,6 +163,7 @@ class AbstractEffect(eqx.Module):
         state_from_input: True if its state is the commanded input, whatever its numbers and the motion.
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
+        rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
         exclusive: a word; a place has at most one effect with the same word.
         special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
@@ -174,6 +175,7 @@ class AbstractEffect(eqx.Module):
     state_from_input: ClassVar[bool] = False
     state_from_measurement: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
+    rotary: ClassVar[bool] = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}
