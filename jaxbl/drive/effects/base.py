@@ -175,7 +175,7 @@ class AbstractEffect(eqx.Module):
     state_from_input: ClassVar[bool] = False
     state_from_measurement: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
-    rotary: ClassVar[bool] = False
+    rotary = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}
