@@ -164,8 +164,8 @@ class EffectSearch:
         """Compare a model with the log, each quarter by numbers that were fitted without it."""
         key = fitted.names, fitted.theta.tobytes()
         if key not in self._compared:
-            changes = np.zeros((1, len(fitted.theta))) if fitted.left_out is None else fitted.left_out
-            self._compared[key] = self.log.compare(fitted.experiment, models=[fitted.move_by(one) for one in changes])
+            models = [] if fitted.left_out is None else [fitted.move_by(change) for change in fitted.left_out]
+            self._compared[key] = self.log.compare(fitted.experiment, models=models)
         return self._compared[key]
 
     def gain(self, before: FittedModel, after: FittedModel) -> Gain:
