@@ -81,8 +81,8 @@ class Choice:
         self.setup, self.log = setup, setup.fitted
         # a linear axis has no turns
         rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
-        exact = [*setup.task.config.uncertainty.exact, *rotary]
-        self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, exact)
+        known = *setup.task.config.uncertainty.exact, *rotary
+        self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known)
         self.before = self.log.compare(setup.nominal)
         # asked for twice of one model, and made of many draws
         self._tested: tuple[FittedModel, bool, bool] | None = None

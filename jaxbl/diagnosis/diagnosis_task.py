@@ -17,8 +17,9 @@ HELD_OUT = 0.25
 _LEAST_SAMPLES = 100
 """Samples of a part of a log, and of what is held out: the smoother's ends, some ten samples each, are then a small part."""
 _SHOWN, _KNOWN = 0.1, 10.0
-"""Share of the torque, and standard errors, from which on an inertia is compared; that share of a residual, below which a
-gear is."""
+"""Share of the torque that an inertia takes, and its standard errors, from which on it is compared."""
+_LOOSE = 0.1
+"""Residual of a gear's ratio from which on it is not compared."""
 _ALIKE = 4.0
 """Factor between the inertias that two logs of one machine may show."""
 
@@ -115,7 +116,7 @@ def _check_machine(record: Record, other: Record) -> None:
     gears = record.statistics.gearing, other.statistics.gearing
     if gears[0] is not None and gears[1] is not None and not (gears[0].is_loose or gears[1].is_loose):
         ratios = gears[0].ratio, gears[1].ratio
-        clear = all(one.residual < _SHOWN for one in gears if one is not None)
+        clear = all(one.residual < _LOOSE for one in gears if one is not None)
         if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
             raise InputError(
                 f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "

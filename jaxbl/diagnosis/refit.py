@@ -39,7 +39,7 @@ _STEPS = 25
 _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
 _LEAST_STEP = 0.05
-"""Share of a Gauss-Newton step below which nothing was ever gained: friction and gaps make errors rough."""
+"""Share of a Gauss-Newton step below which no other is tried: friction and gaps make errors rough (benchmarks/NOTES.md)."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
 _STARTS = (1.0, 0.1)

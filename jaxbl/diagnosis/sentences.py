@@ -8,8 +8,8 @@ from .thresholds import LIMITS
 
 _SIMPLER = 0.04
 """Share of the power by which a later coordinate must explain more than an earlier one, to be named in its place."""
-_TELLING = 0.5
-"""Share of the power from which on a coordinate, or a narrow peak, is named."""
+_HINT, _TELLING = 0.1, 0.5
+"""Share of the power from which on a coordinate is hinted at; and from which on it, a region or a narrow peak is named."""
 _CROWDED = 0.35
 """Share of the power less share of the time from which on a region is named."""
 _PLACE = {
@@ -40,6 +40,7 @@ def sentence_of(found: Localised, unit: str = "N m") -> str:
     size = f"{found.missing:.2g} {unit} rms"
     best = max((one.explained for one in found.coordinates.values()), default=0.0)
     telling = next((one for one in found.coordinates.values() if one.explained >= best - _SIMPLER), None)
+    place = "" if telling is None else _PLACE.get(telling.name, f"a function of {telling.name}")
     crowd = _crowded(found)
     clauses = []
     if crowd is not None and (best < _TELLING or crowd[0] > _TELLING):
@@ -51,12 +52,11 @@ def sentence_of(found: Localised, unit: str = "N m") -> str:
         )
     elif telling is not None and best >= _TELLING:
         values = _class_means(telling, unit)
-        place = _PLACE.get(telling.name, f"a function of {telling.name}")
         clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
     if not clauses and found.excess_z < LIMITS.significant:
         return f"{side}, {_faint(found, unit)}"
     if not clauses:
-        hint = "" if telling is None else f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
+        hint = f" (most: {_percent(best)}, {place})" if best > _HINT else ""
         clauses.append(f"spread over the log: no function of speed, position, load or time alone explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
 

@@ -18,7 +18,9 @@ class Thresholds:
     )
     sure: float = parameter("standard errors", "that count as a difference between two models: 2 % by chance", default=2.0)
     noise_structure: float = parameter(
-        "nats a sample", "that structure in the noise brings, above all quantisation: 1.2 % of its variance", default=0.006
+        "nats a sample",
+        "that structure in the noise may bring, such as quantisation: 1.2 % of its variance",
+        default=0.006,
     )
     effect_odds: float = parameter(
         "nats", "log prior odds of each effect to be missing: a probability of 0.12, of some twenty effects two or three",
@@ -28,10 +30,12 @@ class Thresholds:
         "nats", "the same of a general effect over its special case: one to twenty", default=-3.0
     )
     effect_size: float = parameter(
-        "driving torque", "prior size of an effect: a good part of the torque; less would not be looked for", default=0.3
+        "driving torque", "prior size of an effect: a good part of the torque that drives the machine", default=0.3
     )
     number_error: float = parameter(
-        "nominal value", "prior size of the error of a number of the model: what a data sheet is wrong by", default=0.5
+        "nominal value",
+        "prior size of the error of an inertia or a viscous friction: nominal ones are right within a factor of two",
+        default=0.5,
     )
     least_torque: float = parameter(
         "driving torque", "of an effect that is named: twenty times the error of time stepping", default=1e-3
@@ -49,13 +53,15 @@ class Thresholds:
     far: float = parameter(
         "standard deviations", "of its prior, beyond which a number of the model hardly lies: one in a million", default=5.0
     )
-    failing: float = parameter("probability", "that a complete model fails the test on held-out data", default=0.01)
+    failing: float = parameter(
+        "probability", "that a complete model fails the test on held-out data, in any channel", default=0.01
+    )
     least_explained: float = parameter(
         "missing torque", "that an explanation takes away: with less it passes only as its numbers are open", default=0.5
     )
     significant: float = parameter(
         "standard deviations",
-        "from which on a missing torque is beyond noise: in a thousand regions once by chance",
+        "from which on a torque is beyond noise: several hundred regions are looked at",
         default=4.5,
     )
     contradicting: float = parameter(
