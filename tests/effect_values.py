@@ -53,6 +53,7 @@ VALUES = {
     },
     "load.tabulated": {"speeds": (-1.0, 2.5, 4.0), "speed_torques": (-0.1, 0.2, 0.4)},
     "load.flexibility": {"inertia": 0.08, "frequency": 1.5, "damping_ratio": 0.1},
+    "transmission.offset": {"offset": 0.03},
     "transmission.backlash": {"half_gap": 0.04},
     "transmission.hardening": {"cubic_stiffness": 20.0},
     "transmission.damping": {"damping": 0.1},

@@ -80,6 +80,7 @@ class Candidate:
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
         from_rest: whether nothing had happened before the first input known; else that one had lasted.
+        usual: coefficients as large as they may well be; 0 where their torque says that.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Candidate:
     numbers: Callable[[Sequence[float]], Numbers | None]
     offset: bool = False
     from_rest: bool = False
+    usual: float = 0.0
 
 
 def are_possible(effects: EffectNumbers, period: float) -> bool:
@@ -179,7 +181,8 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
                 numbers[leaf] += value * share
         return numbers | known if cls.possible(numbers) else None
 
-    return Candidate(name, len(effects), tuple(effects), columns, numbers_of)
+    usual = roles[cls.sizes()[0]].usual
+    return Candidate(name, len(effects), tuple(effects), columns, numbers_of, usual=usual)
 
 
 def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:

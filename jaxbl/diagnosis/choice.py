@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 
-from .blocks import is_worse, standard_errors_better
-from .confidence import Finding, explained_share, is_little, weigh
+from .blocks import standard_errors_better
+from .confidence import Finding, weigh
 from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, failed
 from .fitted_model import FittedModel
@@ -22,7 +22,6 @@ from .reference_log import Comparison
 from .residuals import SideResiduals
 from .setup import Setup
 from .thresholds import LIMITS
-from .torque_fit import fit_to_torque
 from .torque_tables import Tabulation, tabulate
 
 
@@ -47,8 +46,6 @@ class Chosen(NamedTuple):
         compared: how it compares on the log, each quarter by numbers fitted without it.
         findings: its effects, and how sure they are.
         rival: the best model with another effect, or None.
-        by_torque: standard errors by which numbers of least missing torque beat those of least prediction errors; 0 where
-            they are the latter.
         driving: torque that drives the machine, rms, N m.
     """
 
@@ -57,13 +54,12 @@ class Chosen(NamedTuple):
     compared: Comparison
     findings: tuple[Finding, ...]
     rival: Rival | None
-    by_torque: float
     driving: float
 
     @property
     def verdict(self) -> VerdictName:
         """What the log alone says."""
-        if self.found.left > LIMITS.unknown or self.by_torque > 0.0:
+        if self.found.left > LIMITS.unknown:
             return "unknown_effect"
         return "explained" if self.fitted.names else "no_discrepancy"
 
@@ -84,8 +80,6 @@ class Choice:
         known = *setup.task.config.uncertainty.exact, *rotary
         self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known)
         self.before = self.log.compare(setup.nominal)
-        # asked for twice of one model, and made of many draws
-        self._tested: tuple[FittedModel, bool, bool] | None = None
 
     @property
     def history(self) -> list[Step]:
@@ -99,8 +93,7 @@ class Choice:
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.seen:
             fitted, compared = self._as_given(fitted), self.before
         findings = weigh(found)
-        chosen = Chosen(found, fitted, compared, findings, _closest(found), 0.0, self.search.fits.given.drive)
-        return self._fit_to_torque(chosen) if self._leaves_more(chosen, or_little=True) else chosen
+        return Chosen(found, fitted, compared, findings, _closest(found), self.search.fits.given.drive)
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
@@ -111,34 +104,11 @@ class Choice:
         self.history.append(Step("add a table of what is left", None, z, tables is not None, why))
         return tables
 
-    def _leaves_more(self, chosen: Chosen, *, or_little: bool = False) -> bool:
-        """Tell whether a model leaves more on the log than a complete one would; or less than half explained."""
-        setup, fitted = self.setup, chosen.fitted
-        if self._tested is None or self._tested[0] is not fitted:
-            whole = self.log.compare(fitted.experiment)
-            expected = expected_errors(self.log, fitted, whole, setup.input_noise, chosen.driving)
-            share = explained_share(setup.nominal, self.before.errors, whole.errors, expected)
-            self._tested = fitted, bool(failed(self.log.with_slow(whole), expected)), is_little(share)
-        _, fails, little = self._tested
-        return fails or (or_little and little)
-
-    def _fit_to_torque(self, chosen: Chosen) -> Chosen:
-        """Take the numbers of least missing torque, if they are better by blocks."""
-        fitted = fit_to_torque(self.search.fits, chosen.fitted, self.log) if chosen.fitted.names else None
-        if fitted is None:
-            return chosen
-        compared = self.search.compare(fitted)
-        z = standard_errors_better(self.log, chosen.compared, compared)
-        noise = self.log.noise_floor(self.before.torques)
-        possible = self._is_plausible(fitted) and not is_worse(compared, self.before, noise)
-        kept = z > LIMITS.seen and possible
-        why = (
-            f"{LIMITS.seen:g} standard error is asked"
-            if possible
-            else "its numbers cannot be, or the model as given is better"
-        )
-        self.history.append(Step("numbers of least missing torque", None, z, kept, why))
-        return chosen._replace(fitted=fitted, compared=compared, by_torque=z) if kept else chosen
+    def _leaves_more(self, chosen: Chosen) -> bool:
+        """Tell whether a model leaves more on the log than a complete one would."""
+        whole = self.log.compare(chosen.fitted.experiment)
+        expected = expected_errors(self.log, chosen.fitted, whole, self.setup.input_noise, chosen.driving)
+        return bool(failed(self.log.with_slow(whole), expected))
 
     def _as_given(self, fitted: FittedModel) -> FittedModel:
         """Return the model with the numbers that it came with."""

@@ -47,11 +47,6 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
-    if chosen.by_torque > 0.0:
-        notes.append(
-            "The model is not complete: its numbers are those of least missing torque. By blocks of the log they are better "
-            f"than those of least prediction errors by {chosen.by_torque:.1f} standard errors."
-        )
     for one in chosen.findings:
         if task.separate and EFFECTS[one.effect].in_time:
             notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")

@@ -191,14 +191,14 @@ class EffectSearch:
         return (
             fitted.foretold is not None
             and are_possible(fitted.numbers, self.log.period)
-            and all(fitted.share(name) > LIMITS.least_torque for name in fitted.names)
+            and all(fitted.share(name) > LIMITS.small_torque for name in fitted.names)
         )
 
     # ---- the loop ----
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
+        current = self._read_record(self.fits.fit({}, np.zeros(len(self.fits.prior))))
         visited = set[frozenset[str]]()
         while True:
             # effects that make each other needless would come and go without end
@@ -216,6 +216,16 @@ class EffectSearch:
             f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown",
         )  # fmt: skip
         return found
+
+    def _read_record(self, current: FittedModel) -> FittedModel:
+        """Take in what belongs to the recording, where the log is for it: other effects would stand for it."""
+        for name in self.lacking:
+            if EFFECTS[name].of_record:
+                trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))))
+                kept = trial.gain.is_accepted
+                self._note(f"add {name}", trial.gain, kept, trial.gain.rule)
+                current = trial.fitted if kept else current
+        return current
 
     def _next(self, current: FittedModel) -> FittedModel | None:
         """Find the best model with more effects that is accepted.
@@ -263,7 +273,7 @@ class EffectSearch:
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
         fitted = self.fits.fit({**numbers, **new}, own + proposal.change, current, tuple(new), promise)
         felt = {
-            name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LIMITS.least_torque
+            name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LIMITS.small_torque
         }
         if 1 < len(felt) < len(new):
             # together with others, one may turn out to be nothing

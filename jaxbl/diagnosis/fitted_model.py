@@ -24,11 +24,13 @@ class FitEnd(NamedTuple):
     Attributes:
         own: theta of the model's own numbers.
         start: initial positions and velocities of each segment.
+        smoothness: of each side's predictor.
         cost: minus twice the log-likelihood, with the prior.
     """
 
     own: np.ndarray
     start: Arrays
+    smoothness: Sequence[float]
     cost: float
 
 

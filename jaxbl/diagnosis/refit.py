@@ -42,7 +42,7 @@ _LEAST_STEP = 0.05
 """Share of a Gauss-Newton step below which no other is tried: friction and gaps make errors rough (benchmarks/NOTES.md)."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
-_STARTS = (1.0, 0.1)
+_STARTS = (1.0, 0.0)
 """Shares of what a candidate was proposed with from which fits begin: of dry friction the way there may lead over a hill."""
 
 
@@ -71,7 +71,7 @@ class ModelFits:
     ):
         self.nominal, self.free, self.prior, self.segments = complete(experiment), tuple(free), prior, segments
         self.given = self.linearise({}, np.zeros(len(prior)))
-        self._units: dict[tuple[str, str], float] = {}
+        self._units: dict[tuple[str, ...], float] = {}
 
     def linearise(self, numbers: EffectNumbers, own: np.ndarray) -> Linear:
         """Linearise a model with some effects about the motion of the log."""
@@ -115,14 +115,19 @@ class ModelFits:
         assert best is not None and fit is not None
         return fit.finish(best)
 
-    def unit(self, name: str, leaf: str, numbers: Numbers) -> float:
-        """Find the value of a size of an effect at which its torque is as large as effects are."""
-        if (name, leaf) not in self._units:
-            alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in numbers.items()} | {leaf: 1.0}
-            found = LIMITS.effect_size / max(self.given.torque_share(make_effect(name, **alone)), 1e-12)
+    def unit(self, name: str, leaf: str, effects: EffectNumbers) -> float:
+        """Find the value of a size of one of some effects at which its torque is as large as effects are."""
+        # a torque of the gear hangs on the gap that is there
+        gear = {one: values for one, values in effects.items() if one != name and _place(one) == _place(name) == "transmission"}
+        key = name, leaf, *sorted(gear)
+        if key not in self._units:
+            along = self.linearise(gear, np.zeros(len(self.prior))) if gear else self.given
+            alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in effects[name].items()} | {leaf: 1.0}
+            found = LIMITS.effect_size / max(along.torque_share(make_effect(name, **alone)), 1e-12)
             nominal = self.given.nominal(name)
-            self._units[name, leaf] = found if nominal is None else min(found, LIMITS.number_error * nominal)
-        return self._units[name, leaf]
+            usual = EFFECTS[name].roles()[leaf].usual
+            self._units[key] = usual or (found if nominal is None else min(found, LIMITS.number_error * nominal))
+        return self._units[key]
 
 
 class _Fit:
@@ -140,7 +145,7 @@ class _Fit:
         for one in make_free_parameters(self.experiment, paths_of(added), 1.0):
             name, leaf = owner_of(one)
             if one.role == "size":
-                unit = fits.unit(name, leaf, numbers[name])
+                unit = fits.unit(name, leaf, numbers)
                 free.append(one._replace(nominal=0.0, scale=unit, positive=False))
                 theta.append(numbers[name][leaf] / unit)
                 width.append(1.0)
@@ -175,13 +180,15 @@ class _Fit:
             start = [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
         else:
             start = begin.start
-        best = self._descend(self.at(theta, start, self._choose(theta)))
-        for _ in range(_ROUNDS):
+        best = self._descend(self.at(theta, start, self._choose(theta) if begin is None else begin.smoothness))
+        for turn in range(_ROUNDS):
             if not np.isfinite(best.cost):
                 break
-            # along the smoothed motion what is chosen does not hang on what was chosen before
             near = best.linear.choose((), best.predictor.smoothness).smoothness
-            options = [self._choose(best.theta), best.linear.choose(()).smoothness, near]
+            options = [best.linear.choose(()).smoothness, near]
+            if turn == 0:
+                # along the smoothed motion what is chosen does not hang on what was chosen before
+                options.insert(0, self._choose(best.theta))
             others = [
                 self.at(best.theta, best.start, one)
                 for i, one in enumerate(options)
@@ -211,7 +218,9 @@ class _Fit:
             if best.cost - self._promise(best) < _SETTLED or share < _LEAST_STEP:
                 break
             by = best.predictor.coefficients
-            change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)
+            # a size that is far too large may go back to none at once
+            none = np.where([one.role == "size" for one in self.free], -best.theta, 0.0)
+            change = share * np.clip(by[0][1 : 1 + len(self.free)], np.minimum(-1.0, none), np.maximum(1.0, none))
             start = [one + share * at[-best.linear.states :][: len(one)] for one, at in zip(best.start, by, strict=True)]
             tried = self.at(best.theta + change, start, best.predictor.smoothness)
             if not tried.cost < best.cost:
@@ -253,7 +262,7 @@ class _Fit:
     def finish(self, point: _Point) -> FittedModel:
         """Make the model, its covariance, and its errors; each quarter's by numbers fitted without it."""
         experiment = set_free_parameters(self.experiment, self.free, point.theta)
-        end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.cost)
+        end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.predictor.smoothness, point.cost)
         own, sides = len(self.free), len(self.experiment.sides)
         none = np.full((own, own), np.inf)
         found = FittedModel(
@@ -315,6 +324,10 @@ class _Fit:
                 covariance=rows @ found.covariance @ rows.T + shared, white=rows @ found.white @ rows.T + shared,
             )  # fmt: skip
         return found
+
+
+def _place(name: str) -> str:
+    return name.partition(".")[0]
 
 
 def _scale(name: str, numbers: Numbers, share: float) -> Numbers:

@@ -34,6 +34,7 @@ from jaxbl.drive.effects import (
     StribeckFriction,
     Tabulated,
     TorqueRipple,
+    TwistOffset,
     ViscousFriction,
 )
 from jaxbl.drive.effects.loads import MAX_DAMPING_RATIO
@@ -294,6 +295,7 @@ for _cls, _answer in (
         unsaid("a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off"),
     ),
     (Eccentricity, unsaid("tendons between joints are linear in the positions")),
+    (TwistOffset, unsaid("it parts the zeros of two encoders; joints have zeros of their own")),
     (LoadFriction, unsaid("the friction of a joint does not depend on what its tendon carries")),
     (EncoderEffect, unsaid("the sensors of a model read true positions; it changes no motion")),
 ):

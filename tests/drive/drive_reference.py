@@ -82,6 +82,7 @@ def derivatives(t, y, u, law, effects, drive):
     amplitude, n, phase = (number_of("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
     ratio = drive["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
     z = theta_e - drive["gear_ratio"] * theta_s + amplitude * np.sin(n * theta_s + phase)
+    z -= number_of("transmission.offset", "offset")
     z_dot = omega_e - ratio * omega_s
     half_gap = number_of("transmission.backlash", "half_gap")
     if abs(z) < half_gap:

@@ -20,7 +20,7 @@ from .loads import (
     Flexibility,
 )
 from .tables import Tabulated
-from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity, LoadFriction
+from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity, LoadFriction, TwistOffset
 from .actuator import DELAY_SAMPLES, Delay, GainError, Saturation, Lag, BackEmf
 from .encoders import Offset, Skew, EncoderEccentricity
 from .base import (

@@ -95,6 +95,7 @@ class Role(NamedTuple):
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
         trial_count: number of values among which a harmonic was chosen, if that is not the number of `trials`.
+        usual: a size as large as it may well be; 0 where its torque says that.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
@@ -102,14 +103,17 @@ class Role(NamedTuple):
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
     trial_count: Callable[[Scales], int] | None = None
+    usual: float = 0.0
 
 
-def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
+def size(
+    unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, usual: float = 0.0, **limits: Any
+) -> Any:
     """Declare a number that the torque is proportional to; arguments of :func:`jaxbl.drive.parameters.parameter`.
 
     `trial` gives its trial value on a log with some :class:`Scales`.
     """
-    return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),)), **limits)
+    return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),), usual=usual), **limits)
 
 
 def angle(doc: str) -> Any:
@@ -164,6 +168,7 @@ class AbstractEffect(eqx.Module):
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
+        of_record: True if it belongs to a recording, not to the machine: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
         exclusive: a word; a place has at most one effect with the same word.
         special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
@@ -176,6 +181,7 @@ class AbstractEffect(eqx.Module):
     state_from_measurement: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
     rotary = False
+    of_record = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}

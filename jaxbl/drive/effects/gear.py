@@ -17,6 +17,19 @@ def _trial_harmonics(log: Scales) -> list[float]:
 
 
 @EFFECTS.add
+class TwistOffset(TransmissionEffect):
+    """Twist without torque, as where the zeros of both encoders do not agree: the law sees z - offset."""
+
+    kind = "offset"
+    of_record = True
+    # an encoder's zero may lie anywhere in a turn
+    offset: Scalar = size("rad", "twist without torque, on the motor side", trial=lambda log: 0.02 * log.twist, usual=1.8)
+
+    def transmission_error(self, state, load_position):
+        return -self.offset
+
+
+@EFFECTS.add
 class Backlash(TransmissionEffect):
     """A hard gap in series with the law: deflection z - clip(z, -b, b), where b is the half gap."""
 
