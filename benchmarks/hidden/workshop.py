@@ -458,7 +458,8 @@ def _case(
         "recipe": recipe,
         "effects": [] if alone else [effect | admissible_names(effect["effect"], axis, setup.drive) for effect in effects],
         "known": [effect["effect"] for effect in effects] if alone else [],
-        "optional": ["encoder.offset", "transmission.offset"] * bool(setup.offset) + ["motor.viscous_friction"] * viscous_zero,
+        "optional": ["encoder.offset", "transmission.offset"] * bool(setup.offset)
+        + ["motor.viscous_friction"] * viscous_zero,
         "further_off": rougher,
         "relative": relative,
         "true_numbers": offsets,

@@ -47,6 +47,8 @@ class Chosen(NamedTuple):
         findings: its effects, and how sure they are.
         rival: the best model with another effect, or None.
         driving: torque that drives the machine, rms, N m.
+        prior: standard deviation of theta of the model's own numbers.
+        further_off: whether that is more than is stated of them.
     """
 
     found: Explanation
@@ -55,6 +57,8 @@ class Chosen(NamedTuple):
     findings: tuple[Finding, ...]
     rival: Rival | None
     driving: float
+    prior: np.ndarray
+    further_off: bool
 
     @property
     def verdict(self) -> VerdictName:
@@ -93,11 +97,13 @@ class Choice:
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.seen:
             fitted, compared = self._as_given(fitted), self.before
         findings = weigh(found)
-        return Chosen(found, fitted, compared, findings, _closest(found), self.search.fits.given.drive)
+        fits, closest = self.search.fits, _closest(found)
+        further_off = fits is self.search.rough and fitted is found.fitted
+        return Chosen(found, fitted, compared, findings, closest, fits.given.drive, fits.prior, further_off)
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
-        if not self._is_plausible(chosen.fitted) or not self._leaves_more(chosen):
+        if not _is_plausible(chosen) or not self._leaves_more(chosen):
             return None
         tables = tabulate(self.log, chosen.fitted.experiment, chosen.compared, lacking, self.setup.sliding)
         z, why = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")
@@ -119,9 +125,10 @@ class Choice:
             experiment=self.setup.nominal, theta=np.zeros(len(own)), covariance=known, white=off, left_out=None
         )
 
-    def _is_plausible(self, fitted: FittedModel) -> bool:
-        """Tell whether a model's own numbers are where they may be by what is known of them."""
-        return bool(np.all(np.abs(fitted.theta[: len(self.setup.prior)]) < LIMITS.far * self.setup.prior))
+
+def _is_plausible(chosen: Chosen) -> bool:
+    """Tell whether a model's own numbers are where they may be by what is known of them."""
+    return bool(np.all(np.abs(chosen.fitted.theta[: len(chosen.prior)]) < LIMITS.far * chosen.prior))
 
 
 def _closest(found: Explanation) -> Rival | None:

@@ -149,7 +149,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         proof = prove(setup, chosen)
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
         apart = contradictions(task, fitted, setup.fitted, chosen.driving)
-        judgement = judge(chosen, proof, setup.prior, share, bool(apart))
+        judgement = judge(chosen, proof, share, bool(apart))
         done()
         announce("running the observers")
         missing = _missing(setup, proof, chosen, lacking_after)

@@ -75,6 +75,7 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
             key=lambda one: -one["share"],
         ),
         "parameters": describe_parameters(record, setup.own, values, errors),
+        "numbers_off": chosen.further_off,
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "history": [step._asdict() for step in history],

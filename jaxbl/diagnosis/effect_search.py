@@ -84,7 +84,7 @@ class Trial(NamedTuple):
     """Holds a model that was tried.
 
     Attributes:
-        added: the effects that it has more.
+        added: the effects that it has more; none where its own numbers are further off than stated.
         fitted: the model.
         gain: over the model without them; of a rival, what the other one gains over it.
     """
@@ -96,7 +96,7 @@ class Trial(NamedTuple):
     @property
     def worth(self) -> float:
         """Nats by which the most likely one is chosen: several at once have to be worth more than one of them."""
-        return self.gain.worth * (1.0 if len(self.added) == 1 else _PROMISING)
+        return self.gain.worth * (_PROMISING if len(self.added) > 1 else 1.0)
 
 
 class _Proposal(NamedTuple):
@@ -151,7 +151,10 @@ class EffectSearch:
             log: the log.
             exact: dotted paths of numbers that are known, and names of effects that are surely not missing.
         """
-        self.log, self.fits = log, ModelFits(experiment, free, np.asarray(prior), log.segments)
+        self.log, stated = log, np.asarray(prior)
+        self.fits = self.stated = ModelFits(experiment, free, stated, log.segments)
+        rough = np.hypot(stated, LIMITS.number_error)
+        self.rough = ModelFits(experiment, free, rough, log.segments, LIMITS.effect_odds)
         self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
         self.floor = LIMITS.noise_structure * sum(map(len, log.segments)) * len(experiment.sides)
         self.history: list[Step] = []
@@ -181,7 +184,8 @@ class EffectSearch:
         simulated = standard_errors_better(self.log, self.compare(before), self.compare(after))
         least, most = sorted((foretold, simulated))
         # what is known of the model's own numbers counts, but for what two standard deviations explain
-        known = [float(np.sum((each.theta[: len(self.fits.prior)] / self.fits.prior) ** 2)) for each in (before, after)]
+        own = len(self.stated.prior)
+        known = [float(np.sum((each.theta[:own] / each.linear.prior[:own]) ** 2)) for each in (before, after)]
         beyond = float(np.sqrt(max(known[0] - known[1] - LIMITS.sure**2, 0.0)))
         shown = (most if least > -LIMITS.sure else least) + beyond
         return Gain(after.log_evidence - before.log_evidence, shown, asked)
@@ -199,15 +203,16 @@ class EffectSearch:
     def run(self) -> Explanation:
         """Find what is missing."""
         current = self._read_record(self.fits.fit({}, np.zeros(len(self.fits.prior))))
-        visited = set[frozenset[str]]()
+        visited = set[tuple[bool, frozenset[str]]]()
         while True:
             # effects that make each other needless would come and go without end
-            better = None if frozenset(current.names) in visited else self._next(current)
-            visited.add(frozenset(current.names))
+            state = self.fits is self.rough, frozenset(current.names)
+            better = None if state in visited else self._next(current)
+            visited.add(state)
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
             current, gains = self._reduce(better or current, thorough=thorough)
-            if better is None and frozenset(current.names) in visited:
+            if better is None and (self.fits is self.rough, frozenset(current.names)) in visited:
                 break
         rivals = {name: self._rivals(current, name) for name in current.names}
         found = Explanation(current, gains, rivals, self.remainder(current))
@@ -236,7 +241,10 @@ class EffectSearch:
         ahead = current
         for _ in range(_AHEAD):
             trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
-            accepted = [trial for trial in trials if self.gain(current, trial.fitted).is_accepted]
+            if ahead is current and self.fits is self.stated:
+                trials.append(self._free_numbers(current))
+            over = [trial.gain if ahead is current else self.gain(current, trial.fitted) for trial in trials]
+            accepted = [trial for trial, gain in zip(trials, over, strict=True) if gain.is_accepted]
             # structure in the noise is not followed
             single = [trial for trial in trials if len(trial.added) == 1 and trial.gain.nats > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
@@ -249,8 +257,9 @@ class EffectSearch:
             if best is None:
                 break
             if accepted:
-                others = [trial for trial in accepted if trial is not best]
+                others = [trial for trial in accepted if trial is not best and trial.added]
                 self._tried |= {name: others for name in best.added}  # noqa: C420
+                self.fits = self.fits if best.added else self.rough
                 return best.fitted
             ahead = best.fitted
         self.history.append(Step("add one more effect", None, None, False, "none of them gains enough on the log"))
@@ -264,21 +273,26 @@ class EffectSearch:
                 trials.append(self._try(current, proposal))
         return trials
 
+    def _free_numbers(self, current: FittedModel) -> Trial:
+        """Let the model's own numbers be further off than stated."""
+        fitted = self.rough.fit(current.numbers, current.theta[: len(self.stated.prior)], current)
+        return Trial((), fitted, self.gain(current, fitted))
+
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
         """Put more effects into a model, in place of those that cannot stand beside them."""
-        new = proposal.numbers
-        numbers = {name: one for name, one in current.numbers.items() if not any(replaces(by, name) for by in new)}
-        announce(f"trying {' + '.join([*numbers, *new])}")
-        own = current.theta[: len(self.fits.prior)]
+        new, own = proposal.numbers, current.theta[: len(self.fits.prior)]
+        old = {name: one for name, one in current.numbers.items() if not any(replaces(by, name) for by in new)}
+        announce(f"trying {' + '.join([*old, *new])}")
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
-        fitted = self.fits.fit({**numbers, **new}, own + proposal.change, current, tuple(new), promise)
-        felt = {
-            name: one for name, one in new.items() if fitted.foretold is None or fitted.share(name) > LIMITS.small_torque
-        }
-        if 1 < len(felt) < len(new):
-            # together with others, one may turn out to be nothing
-            return self._try(current, proposal._replace(numbers=felt))
-        return Trial(tuple(new), fitted, self.gain(current, fitted))
+        fitted = self.fits.fit({**old, **new}, own + proposal.change, current, tuple(new), promise)
+        # beside others, one may turn out to be nothing
+        gone = [] if fitted.foretold is None else [one for one in fitted.names if fitted.share(one) <= LIMITS.small_torque]
+        if not gone or not new.keys() - gone:
+            return Trial(tuple(new), fitted, self.gain(current, fitted))
+        if old.keys() & gone:
+            # it stood for the new ones, which are compared with none of them
+            current = self.fits.fit({name: one for name, one in old.items() if name not in gone}, own, current)
+        return self._try(current, proposal._replace(numbers={name: one for name, one in new.items() if name not in gone}))
 
     def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
@@ -300,7 +314,20 @@ class EffectSearch:
                     current = fewer
                     break
             else:
-                return current, gains
+                less = self._as_stated(current) if thorough and self.fits is self.rough else None
+                if less is None:
+                    return current, gains
+                current = less
+
+    def _as_stated(self, current: FittedModel) -> FittedModel | None:
+        """Hold numbers to what is stated of them, if they gain nothing by being further off."""
+        less = self.stated.fit(current.numbers, np.zeros(len(self.stated.prior)), current)
+        gain = self.gain(less, current)
+        self._note("hold the numbers to what is stated", gain, not gain.is_accepted, gain.rule, loss=True)
+        if gain.is_accepted:
+            return None
+        self.fits = self.stated
+        return less
 
     def _simplify(self, current: FittedModel, name: str) -> FittedModel | None:
         """Put a special case of an effect in its place, if the effect gains nothing over that."""

@@ -2,8 +2,6 @@
 
 from typing import NamedTuple
 
-import numpy as np
-
 from jaxbl.json_types import JsonObject
 
 from .choice import Chosen
@@ -30,18 +28,17 @@ class Judgement(NamedTuple):
     test: JsonObject
 
 
-def judge(chosen: Chosen, proof: Proof, prior: np.ndarray, share: float | None, contradicting: bool = False) -> Judgement:
+def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool = False) -> Judgement:
     """Judge the model that stands by the proof.
 
     Args:
         chosen: the model.
         proof: what was held out.
-        prior: standard deviations of its own numbers, which are the first of the fitted ones.
         share: of the missing torque that it explains (:func:`.confidence.explained_share`).
         contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
     """
     fitted = chosen.fitted
-    away = fitted.theta[: len(prior)] / prior
+    away = fitted.theta[: len(chosen.prior)] / chosen.prior
     far = {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far}
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
     tested = [name for name in fitted.names if name not in untested]

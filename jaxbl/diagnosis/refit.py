@@ -63,13 +63,20 @@ class ModelFits:
         nominal: the model as given, with every effect at neutral numbers.
         free, prior: its own numbers that are not exactly known, and the standard deviation of each theta.
         segments: of the log.
+        log_odds: of that prior, nats.
         given: the model as given along the log.
     """
 
     def __init__(
-        self, experiment: Experiment, free: Sequence[FreeParameter], prior: np.ndarray, segments: Sequence[Segment]
+        self,
+        experiment: Experiment,
+        free: Sequence[FreeParameter],
+        prior: np.ndarray,
+        segments: Sequence[Segment],
+        log_odds: float = 0.0,
     ):
         self.nominal, self.free, self.prior, self.segments = complete(experiment), tuple(free), prior, segments
+        self.log_odds = log_odds
         self.given = self.linearise({}, np.zeros(len(prior)))
         self._units: dict[tuple[str, ...], float] = {}
 
@@ -118,11 +125,13 @@ class ModelFits:
     def unit(self, name: str, leaf: str, effects: EffectNumbers) -> float:
         """Find the value of a size of one of some effects at which its torque is as large as effects are."""
         # a torque of the gear hangs on the gap that is there
-        gear = {one: values for one, values in effects.items() if one != name and _place(one) == _place(name) == "transmission"}
+        beside = effects if _in_gear(name) else {}
+        gear = {one: values for one, values in beside.items() if _in_gear(one) and one != name}
         key = name, leaf, *sorted(gear)
         if key not in self._units:
             along = self.linearise(gear, np.zeros(len(self.prior))) if gear else self.given
-            alone = {key: 0.0 if key in EFFECTS[name].sizes() else value for key, value in effects[name].items()} | {leaf: 1.0}
+            sizes = EFFECTS[name].sizes()
+            alone = {one: 0.0 if one in sizes else value for one, value in effects[name].items()} | {leaf: 1.0}
             found = LIMITS.effect_size / max(along.torque_share(make_effect(name, **alone)), 1e-12)
             nominal = self.given.nominal(name)
             usual = EFFECTS[name].roles()[leaf].usual
@@ -157,7 +166,7 @@ class _Fit:
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
         general = sum(bool(EFFECTS[name].special_cases) for name in numbers)
-        self.log_odds = LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
+        self.log_odds = fits.log_odds + LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
         """Find the prediction errors along the path of the predictor."""
@@ -326,8 +335,8 @@ class _Fit:
         return found
 
 
-def _place(name: str) -> str:
-    return name.partition(".")[0]
+def _in_gear(name: str) -> bool:
+    return name.startswith("transmission.")
 
 
 def _scale(name: str, numbers: Numbers, share: float) -> Numbers:

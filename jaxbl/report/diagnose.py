@@ -105,6 +105,9 @@ def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
     names, verdict = _names(summary), summary["verdict"]
     them = "it" if len(summary["findings"]) == 1 else "them"
+    if summary.get("numbers_off"):
+        needed = "; no effect is needed." if verdict == "no_discrepancy" else "."
+        return f"The numbers are further off than stated{needed} {verdict_sentence(summary | {'numbers_off': False})}"
     if verdict == "explained":
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
     if verdict == "no_discrepancy":

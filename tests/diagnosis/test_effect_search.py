@@ -1,5 +1,7 @@
 """Effects hidden by the bench's own simulator are named; nothing is named where nothing or something unknown is hidden."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -121,3 +123,22 @@ def test_waves_a_turn_are_found_wherever_they_are_and_beside_friction(tmp_path):
     for effect in hidden:
         for key in {"torque", "amplitude", "phase"} & set(effect):
             assert numbers[effect["kind"]][key] == pytest.approx(effect[key], rel=0.03)
+
+
+def test_zeros_of_encoders_that_do_not_agree_are_found_first(tmp_path):
+    """No effect stands for the offset, which the whole shaft feels."""
+    case = next(case for case in cases(SEED, 6, "none", 2.0) if case.log.theta_s is not None)
+    dataclasses.replace(case.log, theta_e=case.log.theta_e + 0.3).write(tmp_path / "log.csv")
+    search = prepare_search(tmp_path / "log.csv", case.model | {"log": {"theta_e": {"offset": 0.0}}})
+    numbers = search.run().fitted.numbers
+    assert search.history[0].tried == "add transmission.offset" and search.history[0].kept
+    assert numbers == {"transmission.offset": {"offset": pytest.approx(0.3, abs=1e-3)}}
+
+
+def test_numbers_that_are_all_off_are_no_effect(tmp_path):
+    case = cases(SEED, 1, "rough", 2.0)[0]
+    case.log.write(tmp_path / "log.csv")
+    search = prepare_search(tmp_path / "log.csv", case.model)
+    explanation = search.run()
+    assert explanation.fitted.names == () and search.fits is search.rough
+    assert explanation.left < LIMITS.unknown

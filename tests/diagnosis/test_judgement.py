@@ -14,10 +14,10 @@ NAME, OTHER = "motor.coulomb_friction", "motor.cogging"
 
 def judge_model(names=(NAME,), theta=0.0, verdict="explained", share=1.0, contradicting=False, controls=(), **proof):
     fitted = SimpleNamespace(names=names, theta=np.array([theta]), free=[SimpleNamespace(path="drive.motor_inertia")])
-    chosen = SimpleNamespace(fitted=fitted, verdict=verdict)
+    chosen = SimpleNamespace(fitted=fitted, verdict=verdict, prior=np.array([0.02]))
     test = {"failed": [], "worse": False, "untested": {}, "has_power": True, "weak": []} | proof
     held_out = SimpleNamespace(controls=controls, **test)
-    return judge(chosen, held_out, np.array([0.02]), share, contradicting)  # type: ignore[arg-type]
+    return judge(chosen, held_out, share, contradicting)  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_the_proof_supports_stays():
