@@ -225,7 +225,7 @@ class EffectSearch:
     def _read_record(self, current: FittedModel) -> FittedModel:
         """Take in what belongs to the recording, where the log is for it: other effects would stand for it."""
         for name in self.lacking:
-            if EFFECTS[name].of_record:
+            if EFFECTS[name].in_log:
                 trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))))
                 kept = trial.gain.is_accepted
                 self._note(f"add {name}", trial.gain, kept, trial.gain.rule)
@@ -248,6 +248,12 @@ class EffectSearch:
             # structure in the noise is not followed
             single = [trial for trial in trials if len(trial.added) == 1 and trial.gain.nats > self.floor]
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
+            if best is not None and not best.added:
+                # it may be one of the numbers alone
+                errors = [self._try(current, one) for one in self._propose_errors(current)]
+                trials += errors
+                accepted += [trial for trial in errors if trial.gain.is_accepted]
+                best = max(accepted, key=lambda trial: trial.worth)
             for trial in trials:
                 why = "less likely" if trial in accepted else trial.gain.rule
                 if trial is best:
@@ -369,6 +375,11 @@ class EffectSearch:
         self.history.append(Step(tried, nats, None if np.isnan(z) else z, kept, why))
 
     # ---- proposals ----
+
+    def _propose_errors(self, current: FittedModel) -> list[_Proposal]:
+        """Propose that one of the model's own numbers is further off than stated, for each."""
+        names = [name for name in self.lacking if name not in current.names and current.linear.same(name) is not None]
+        return [_Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))) for name in names]
 
     def _propose(self, current: FittedModel) -> list[_Proposal]:
         """Propose effects that may be missing, most promising first."""

@@ -34,7 +34,7 @@ class Thresholds:
     )
     number_error: float = parameter(
         "nominal value",
-        "prior size of the error of an inertia or a viscous friction: nominal ones are right within a factor of two",
+        "prior size of the error of a number that is further off than stated: nominal ones are right within a factor of two",
         default=0.5,
     )
     least_torque: float = parameter(

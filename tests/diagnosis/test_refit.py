@@ -121,3 +121,13 @@ def test_numbers_without_a_quarter_are_those_of_a_fit_to_the_rest():
     for quarter, change in enumerate(changes):
         rest = np.delete(np.arange(400), slice(100 * quarter, 100 * (quarter + 1)))
         np.testing.assert_allclose(best + change, fit(rest), rtol=1e-9)
+
+
+@pytest.mark.parametrize("torque", [1e4, -0.3])
+def test_a_fit_with_more_effects_never_ends_above_the_one_without(fits, torque):
+    """However far from what the log shows it begins."""
+    less = fits.fit({NAME: {"torque": FRICTION["torque"]}}, np.zeros(len(fits.free)))
+    more = {NAME: less.numbers[NAME], "motor.constant_torque": {"torque": torque}}
+    found = fits.fit(more, less.theta[: len(fits.free)], less, ("motor.constant_torque",))
+    assert found.end.cost <= less.end.cost
+    assert abs(found.numbers["motor.constant_torque"]["torque"]) < 0.01 * FRICTION["torque"]

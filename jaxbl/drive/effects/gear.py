@@ -21,7 +21,7 @@ class TwistOffset(TransmissionEffect):
     """Twist without torque, as where the zeros of both encoders do not agree: the law sees z - offset."""
 
     kind = "offset"
-    of_record = True
+    in_log = "[log] theta_e.offset takes it off"
     # an encoder's zero may lie anywhere in a turn
     offset: Scalar = size("rad", "twist without torque, on the motor side", trial=lambda log: 0.02 * log.twist, usual=1.8)
 
