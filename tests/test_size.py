@@ -10,9 +10,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395914, 2.13, 2.47, 2.91),
+    "all": (395839, 2.11, 2.47, 2.91),
     "report": (61010, 0.25, 1.19, 0.67),
-    "diagnosis": (60574, 9.28, 7.98, 9.19),
+    "diagnosis": (60499, 9.15, 7.96, 9.14),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
     "identification": (34428, 7.39, 13.84, 16.02),
@@ -20,7 +20,7 @@ CEILINGS = {
     "exports": (22808, 0.02, 0.0, 0.0),
     "fused": (24474, 0.0, 0.0, 0.0),
     ".": (18352, 0.03, 0.0, 0.0),
-    "drive": (12682, 0.0, 2.2, 0.0),
+    "drive": (12682, 0.0, 2.19, 0.0),
     "throughput": (11727, 0.0, 0.0, 0.0),
     "cli": (9499, 0.09, 0.0, 0.0),
     "config": (9331, 0.0, 0.0, 0.0),

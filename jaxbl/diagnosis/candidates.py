@@ -80,7 +80,7 @@ class Candidate:
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
         from_rest: whether nothing had happened before the first input known; else that one had lasted.
-        usual: coefficients as large as they may well be; 0 where their torque says that.
+        usual: large coefficients; 0 where their torque says which are.
     """
 
     name: str
@@ -122,6 +122,8 @@ _AT_ONCE = 6
 """Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02
 """Change of the logarithm of a number by which the slope at a trial value is found."""
+ZERO = 1.8
+"""Prior standard deviation of an encoder's zero, rad: it may lie anywhere in a turn."""
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 _REACH = 4.0 * SPACING
@@ -181,8 +183,7 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
                 numbers[leaf] += value * share
         return numbers | known if cls.possible(numbers) else None
 
-    usual = roles[cls.sizes()[0]].usual
-    return Candidate(name, len(effects), tuple(effects), columns, numbers_of, usual=usual)
+    return Candidate(name, len(effects), tuple(effects), columns, numbers_of, usual=ZERO if cls.in_log else 0.0)
 
 
 def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:

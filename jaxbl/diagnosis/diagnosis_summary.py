@@ -50,8 +50,6 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
     for one in chosen.findings:
         if task.separate and EFFECTS[one.effect].in_time:
             notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
-        if said := EFFECTS[one.effect].in_log:
-            notes.append(f"{one.effect} is of the recording, not of the machine: {said}.")
     if chosen.verdict == "no_discrepancy":
         for side, one in located.items():
             least = LIMITS.significant * one.coordinates["all"].regions[0].mean_error

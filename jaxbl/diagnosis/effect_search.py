@@ -184,9 +184,9 @@ class EffectSearch:
         simulated = standard_errors_better(self.log, self.compare(before), self.compare(after))
         least, most = sorted((foretold, simulated))
         # what is known of the model's own numbers counts, but for what two standard deviations explain
-        own = len(self.stated.prior)
-        known = [float(np.sum((each.theta[:own] / each.linear.prior[:own]) ** 2)) for each in (before, after)]
-        beyond = float(np.sqrt(max(known[0] - known[1] - LIMITS.sure**2, 0.0)))
+        count = len(self.stated.prior)
+        moved = [float(np.sum((model.theta[:count] / model.linear.prior[:count]) ** 2)) for model in (before, after)]
+        beyond = float(np.sqrt(max(moved[0] - moved[1] - LIMITS.sure**2, 0.0)))
         shown = (most if least > -LIMITS.sure else least) + beyond
         return Gain(after.log_evidence - before.log_evidence, shown, asked)
 
@@ -195,7 +195,7 @@ class EffectSearch:
         return (
             fitted.foretold is not None
             and are_possible(fitted.numbers, self.log.period)
-            and all(fitted.share(name) > LIMITS.small_torque for name in fitted.names)
+            and all(fitted.share(name) > LIMITS.least_torque for name in fitted.names)
         )
 
     # ---- the loop ----
@@ -223,13 +223,14 @@ class EffectSearch:
         return found
 
     def _read_record(self, current: FittedModel) -> FittedModel:
-        """Take in what belongs to the recording, where the log is for it: other effects would stand for it."""
-        for name in self.lacking:
-            if EFFECTS[name].in_log:
-                trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))))
-                kept = trial.gain.is_accepted
-                self._note(f"add {name}", trial.gain, kept, trial.gain.rule)
-                current = trial.fitted if kept else current
+        """Take in what belongs to the recording, where it is larger than effects are: they would stand for it."""
+        for name in [name for name in self.lacking if EFFECTS[name].in_log]:
+            self.lacking.remove(name)
+            trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))))
+            kept = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
+            why = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
+            self._note(f"add {name}", trial.gain, kept, why)
+            current = trial.fitted if kept else current
         return current
 
     def _next(self, current: FittedModel) -> FittedModel | None:
@@ -250,7 +251,7 @@ class EffectSearch:
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             if best is not None and not best.added:
                 # it may be one of the numbers alone
-                errors = [self._try(current, one) for one in self._propose_errors(current)]
+                errors = [self._try(current, proposal) for proposal in self._propose_errors(current)]
                 trials += errors
                 accepted += [trial for trial in errors if trial.gain.is_accepted]
                 best = max(accepted, key=lambda trial: trial.worth)
@@ -286,19 +287,21 @@ class EffectSearch:
 
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
         """Put more effects into a model, in place of those that cannot stand beside them."""
-        new, own = proposal.numbers, current.theta[: len(self.fits.prior)]
-        old = {name: one for name, one in current.numbers.items() if not any(replaces(by, name) for by in new)}
+        new, theta = proposal.numbers, current.theta[: len(self.fits.prior)]
+        old = {name: numbers for name, numbers in current.numbers.items() if not any(replaces(by, name) for by in new)}
         announce(f"trying {' + '.join([*old, *new])}")
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
-        fitted = self.fits.fit({**old, **new}, own + proposal.change, current, tuple(new), promise)
+        fitted = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
         # beside others, one may turn out to be nothing
-        gone = [] if fitted.foretold is None else [one for one in fitted.names if fitted.share(one) <= LIMITS.small_torque]
+        gone = (
+            [] if fitted.foretold is None else [name for name in fitted.names if fitted.share(name) <= LIMITS.least_torque]
+        )
         if not gone or not new.keys() - gone:
             return Trial(tuple(new), fitted, self.gain(current, fitted))
         if old.keys() & gone:
             # it stood for the new ones, which are compared with none of them
-            current = self.fits.fit({name: one for name, one in old.items() if name not in gone}, own, current)
-        return self._try(current, proposal._replace(numbers={name: one for name, one in new.items() if name not in gone}))
+            current = self.fits.fit({name: old[name] for name in old if name not in gone}, theta, current)
+        return self._try(current, proposal._replace(numbers={name: new[name] for name in new if name not in gone}))
 
     def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.

@@ -37,7 +37,7 @@ class Expected(NamedTuple):
     Attributes:
         noise: rms by the readings' noise.
         open: rms by the numbers that the fit leaves open, and by noise of the input.
-        least: rms by a torque of `least_torque` of the driving torque, which is next to nothing; of slow torques the
+        least: rms by a torque of `least_torque` of the driving torque, which is too small to be named; of slow torques the
             least that counts.
         limit: rms that a complete model exceeds with probability `failing`, shared out among all channels.
         rounding: rms by smoothing of the model's own motion; 0 where the rest is enough to account for the errors.
@@ -83,7 +83,7 @@ def expected_errors(
     for side in fitted.experiment.sides:
         ratio = float(fitted.experiment.drive.ratio(side))
         small[f"torque_{side}"] = (least * ratio) ** 2
-        small |= {name: (LIMITS.small_torque * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
+        small |= {name: (LIMITS.slow_torque * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
     found, names = {}, [name for name in floor if not name.startswith("velocity")]
     for name in names:
         squares = np.array([one[name] for one in drawn])

@@ -270,6 +270,7 @@ def _summary(
         "verdict": verdict,
         "findings": findings,
         "parameters": describe_parameters(record, search.own, values, errors),
+        "numbers_off": False,
         "where": {"motor": {"sentence": sentence}},
         "rest": {},
         "contradictions": [],

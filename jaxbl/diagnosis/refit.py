@@ -28,7 +28,7 @@ from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
-from .candidates import EffectNumbers
+from .candidates import ZERO, EffectNumbers
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import SILENT, Linear, Predictor
 from .neutral_effects import complete, lean
@@ -126,16 +126,16 @@ class ModelFits:
         """Find the value of a size of one of some effects at which its torque is as large as effects are."""
         # a torque of the gear hangs on the gap that is there
         beside = effects if _in_gear(name) else {}
-        gear = {one: values for one, values in beside.items() if _in_gear(one) and one != name}
+        gear = {effect: numbers for effect, numbers in beside.items() if _in_gear(effect) and effect != name}
         key = name, leaf, *sorted(gear)
         if key not in self._units:
             along = self.linearise(gear, np.zeros(len(self.prior))) if gear else self.given
             sizes = EFFECTS[name].sizes()
-            alone = {one: 0.0 if one in sizes else value for one, value in effects[name].items()} | {leaf: 1.0}
-            found = LIMITS.effect_size / max(along.torque_share(make_effect(name, **alone)), 1e-12)
+            single = {key: 0.0 if key in sizes else value for key, value in effects[name].items()} | {leaf: 1.0}
+            unit = LIMITS.effect_size / max(along.torque_share(make_effect(name, **single)), 1e-12)
             nominal = self.given.nominal(name)
-            usual = EFFECTS[name].roles()[leaf].usual
-            self._units[key] = usual or (found if nominal is None else min(found, LIMITS.number_error * nominal))
+            unit = unit if nominal is None else min(unit, LIMITS.number_error * nominal)
+            self._units[key] = ZERO if EFFECTS[name].in_log else unit
         return self._units[key]
 
 
@@ -194,10 +194,9 @@ class _Fit:
             if not np.isfinite(best.cost):
                 break
             near = best.linear.choose((), best.predictor.smoothness).smoothness
-            options = [best.linear.choose(()).smoothness, near]
-            if turn == 0:
-                # along the smoothed motion what is chosen does not hang on what was chosen before
-                options.insert(0, self._choose(best.theta))
+            # along the smoothed motion what is chosen does not hang on what was chosen before
+            first = [self._choose(best.theta)] if turn == 0 else []
+            options = [*first, best.linear.choose(()).smoothness, near]
             others = [
                 self.at(best.theta, best.start, one)
                 for i, one in enumerate(options)

@@ -38,12 +38,12 @@ class Thresholds:
         default=0.5,
     )
     least_torque: float = parameter(
-        "driving torque", "that is anything at all: twenty times the error of time stepping", default=1e-3
+        "driving torque", "of an effect that is named: twenty times the error of time stepping", default=1e-3
     )
-    small_torque: float = parameter(
+    slow_torque: float = parameter(
         "driving torque",
-        "above which an effect is named, and that slow torques may leave: smoothing and laws of friction round reversals, "
-        "which leaves up to 0.016 beside complete models of generated drives",
+        "that slow torques may leave: smoothing rounds jumps of friction on the other side of a spring, which leaves up to "
+        "0.016 beside complete models of generated drives",
         default=0.02,
     )
     unknown: float = parameter(

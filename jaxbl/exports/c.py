@@ -277,7 +277,7 @@ class _C(Writer):
             **{f"n{key}": f"{value}{'f' if single else ''}" for key, value in
                {"0": "0.0", "1": "1.0", "2": "2.0", "half": "0.5"}.items()},
         }  # fmt: skip
-        lines: list[str] = []
+        lines = list[str]()
         order = ["floor", "ceil", "round_even", "round_away", "power_of_two"]
         for name in sorted(self._helper_types, key=lambda name: order.index(name) if name in order else len(order)):
             argument_type, result_type = self._helper_types[name]

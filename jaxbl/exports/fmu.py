@@ -243,7 +243,7 @@ def write_unit(unit: str) -> str:
 
 def find_base_units(unit: str) -> dict[str, int] | None:
     """Exponents of base units of a unit of :func:`write_unit`; None where a symbol in it is unknown."""
-    exponents: dict[str, int] = {}
+    exponents = dict[str, int]()
     numerator, *divisors = unit.split("/")
     for sign, part in ((1, numerator), *((-1, divisor) for divisor in divisors)):
         for factor in part.split("."):

@@ -70,9 +70,9 @@ def _collect_parts(
     sides = {side: SideParts(float(plant.inertia(side)), side in slides, float(drive.viscous(side))) for side in drive.sides}
     parts = MujocoParts(sides, None if law is None else float(drive.ratio("load")), float(run.sample_period))
     fastest = 0.0 if law is None else math.sqrt(float(law.stiffness) * parts.mobility)
-    parts.step /= max(run.substeps, _LEAST_STEPS, _round_up(float(run.sample_period) * fastest / RESOLUTION))
+    parts.step /= max(run.substeps, _LEAST_STEPS, _round_up(parts.step * fastest / RESOLUTION))
     answers = {"drive": exactly("bodies, and their joints with damping")}
-    notes: dict[str, list[str]] = {}
+    notes = dict[str, list[str]]()
     if law is not None:
         answers["transmission"] = answer = to_mujoco(law, parts)
         if answer.fidelity == "not said":
@@ -80,7 +80,7 @@ def _collect_parts(
         notes["transmission"] = [_write_note("transmission", law, answer)]
     names = [effect.name for effect in experiment.effects]
     # first those that make the gap: what others are depends on it
-    for i, effect in sorted(enumerate(experiment.effects), key=lambda numbered: float(numbered[1].free_play()) == 0.0):
+    for i, effect in sorted(enumerate(experiment.effects), key=lambda numbered: not numbered[1].free_play()):
         path, place = f"effects.{effect.name if names.count(effect.name) == 1 else i}", drive.resolve_place(effect.place)
         answers[path] = answer = to_mujoco(effect, parts, place if place in sides else "motor")
         if answer.fidelity != "not said":

@@ -240,7 +240,7 @@ def _(effect, parts, side):
 @_add.register(Damping)
 def _(effect, parts, side):
     parts.damping += effect.damping
-    if parts.half_gap == 0.0:
+    if not parts.half_gap:
         return exactly("damping of the tendon; with a gap its limits, which is only near")
     return nearly("limits of the tendon that act as spring and damper: as the law, but the flanks do not pull as they part")
 
@@ -295,7 +295,7 @@ for _cls, _answer in (
         unsaid("a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off"),
     ),
     (Eccentricity, unsaid("tendons between joints are linear in the positions")),
-    (TwistOffset, unsaid("it parts the zeros of two encoders; joints have zeros of their own")),
+    (TwistOffset, unsaid("joints have zeros of their own")),
     (LoadFriction, unsaid("the friction of a joint does not depend on what its tendon carries")),
     (EncoderEffect, unsaid("the sensors of a model read true positions; it changes no motion")),
 ):

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, NextStep
 
@@ -61,7 +62,7 @@ def diagnosis_lines(summary: JsonObject) -> Lines:
 
 
 _FAR = 10.0
-"""Factor between the torque and what [log] u says from which a unit is rather wrong: torque constants are known better."""
+"""Torque over what [log] u says, from which on a unit is rather wrong."""
 
 
 def _headline(summary: JsonObject) -> Lines:
@@ -75,7 +76,8 @@ def _headline(summary: JsonObject) -> Lines:
             )
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): "
-            f"{', '.join(map(_number, numbers.items()))}; {_percent(finding['share'])} of the driving torque."
+            f"{', '.join(map(_number, numbers.items()))}; "
+            f"{EFFECTS[finding['effect']].in_log or _percent(finding['share']) + ' of the driving torque'}."
         )
         if others:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
@@ -105,9 +107,9 @@ def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
     names, verdict = _names(summary), summary["verdict"]
     them = "it" if len(summary["findings"]) == 1 else "them"
-    if summary.get("numbers_off"):
-        needed = "; no effect is needed." if verdict == "no_discrepancy" else "."
-        return f"The numbers are further off than stated{needed} {verdict_sentence(summary | {'numbers_off': False})}"
+    if summary["numbers_off"]:
+        needed = "; no effect is needed" * (verdict == "no_discrepancy")
+        return f"The numbers are further off than stated{needed}. {verdict_sentence(summary | {'numbers_off': 0})}"
     if verdict == "explained":
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
     if verdict == "no_discrepancy":
@@ -232,18 +234,12 @@ def _reasons(summary: JsonObject) -> Lines:
 
 
 def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:
-    """Return each channel's failed test that shows it best, its error and limit: a torque may fail at several bandwidths."""
+    """Return of each channel the failed test that shows it best, its error and limit."""
     tested = {name: (torque["after"], torque["limit"]) for name, torque in gap.get("slow_torques", {}).items()}
     tested |= {name: (gap["holdout_rmse_after"][name], error["limit"]) for name, error in gap["expected"].items()}
-
-    def excess(name: str) -> float:
-        value, limit = tested[name]
-        # of a model that diverges one of them is not finite
-        return value / limit if value is not None and limit else float("inf")
-
-    best: dict[str, str] = {}
-    for name in sorted(gap["test"]["failed"], key=excess, reverse=True):
-        best.setdefault(name.partition(" ")[0], name)
+    best = dict[str, str]()
+    for name in sorted(gap["test"]["failed"], key=lambda name: _ratio(*tested[name]), reverse=True):
+        best.setdefault(name.split()[0], name)
     return [(name, *tested[name]) for name in best.values()]
 
 
@@ -294,7 +290,7 @@ def _remarks(summary: JsonObject) -> Lines:
     for name, torque in sorted(remaining, key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
         lines.append(
-            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({100.0 * torque['share']:.2g} % of the driving torque, "
+            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({_percent(torque['share'])} of the driving torque, "
             f"evidence {torque['evidence']:.3g} nats)."
         )
     after = gap["holdout_rmse_after"]

@@ -95,7 +95,6 @@ class Role(NamedTuple):
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
         trial_count: number of values among which a harmonic was chosen, if that is not the number of `trials`.
-        usual: a size as large as it may well be; 0 where its torque says that.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
@@ -103,17 +102,14 @@ class Role(NamedTuple):
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
     trial_count: Callable[[Scales], int] | None = None
-    usual: float = 0.0
 
 
-def size(
-    unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, usual: float = 0.0, **limits: Any
-) -> Any:
+def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
     """Declare a number that the torque is proportional to; arguments of :func:`jaxbl.drive.parameters.parameter`.
 
     `trial` gives its trial value on a log with some :class:`Scales`.
     """
-    return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),), usual=usual), **limits)
+    return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),)), **limits)
 
 
 def angle(doc: str) -> Any:
@@ -168,20 +164,20 @@ class AbstractEffect(eqx.Module):
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
-        in_log: what takes it off a log, if it belongs to a recording, not to the machine: a diagnosis asks for it first.
+        in_log: what takes it off a log, if it is of the recording: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
         exclusive: a word; a place has at most one effect with the same word.
         special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
     """
 
-    kind: ClassVar[str]
-    places: ClassVar[tuple[str, ...]]
-    velocity_dependent: ClassVar[bool] = False
-    state_from_input: ClassVar[bool] = False
-    state_from_measurement: ClassVar[bool] = False
-    in_time: ClassVar[bool] = False
+    kind = ""
+    places: ClassVar[tuple[str, ...]] = ()
+    velocity_dependent = False
+    state_from_input = False
+    state_from_measurement = False
+    in_time = False
     rotary = False
-    in_log: ClassVar[str] = ""
+    in_log = ""
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}
@@ -348,8 +344,8 @@ class ActuatorEffect(AbstractEffect):
     """
 
     places = ("actuator",)
-    rank: ClassVar[int] = 0
-    input_unit: ClassVar[str] = ""
+    rank = 0
+    input_unit = ""
 
 
 class EncoderEffect(AbstractEffect):
@@ -357,12 +353,11 @@ class EncoderEffect(AbstractEffect):
 
     Attributes:
         encoder: side of the encoder, "motor" or "load"; on a rigid drive it is always the motor's.
-        in_log: a sentence that says how a log is corrected for it, since models of logs have no such effects.
     """
 
     places = ("encoder",)
-    encoder: ClassVar[str] = "load"
-    in_log: ClassVar[str] = "its readings have it already"
+    encoder = "load"
+    in_log = "its readings have it already"
 
 
 class _Effects(Registry):
@@ -397,8 +392,8 @@ def _check_effect(name: str, cls: Any) -> None:
     if not (isinstance(cls, type) and issubclass(cls, AbstractEffect)):
         raise TypeError("should be a class derived from AbstractEffect")
     place, _, kind = name.partition(".")
-    if kind != getattr(cls, "kind", None) or place not in getattr(cls, "places", ()):
-        names = [f"{class_place}.{getattr(cls, 'kind', '?')}" for class_place in getattr(cls, "places", ())]
+    if kind != cls.kind or place not in cls.places:
+        names = [f"{class_place}.{cls.kind}" for class_place in cls.places]
         raise ValueError(f"its class acts as {' or '.join(names) or 'nothing'}; the entry should have that name")
     if not set(cls.places) <= set(PLACES) or not re.fullmatch(r"[a-z][a-z0-9_]*", kind):
         raise ValueError(f"places should be among {', '.join(PLACES)}, and kind a lower-case word")

@@ -22,8 +22,7 @@ class TwistOffset(TransmissionEffect):
 
     kind = "offset"
     in_log = "[log] theta_e.offset takes it off"
-    # an encoder's zero may lie anywhere in a turn
-    offset: Scalar = size("rad", "twist without torque, on the motor side", trial=lambda log: 0.02 * log.twist, usual=1.8)
+    offset: Scalar = size("rad", "twist without torque, at the motor", trial=lambda log: 0.02 * log.twist)
 
     def transmission_error(self, state, load_position):
         return -self.offset
