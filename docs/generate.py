@@ -6,6 +6,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 
 from jaxbl import config
+from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.diagnosis.thresholds import Thresholds
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import parameters
@@ -126,6 +127,11 @@ def page() -> str:
     )
     for field, about in parameters(Thresholds):
         parts.append(f"| `{field.name}` | {field.default:g} | {about.unit} | {about.doc} |")
+    parts.append(
+        "\n## Checks of a diagnosis\n\nWhat speaks against the model that a diagnosis ends with, in `gap.test` of "
+        "`diagnosis.json`; one is enough for the verdict `unknown_effect`.\n\n| check | finds |\n|---|---|"
+    )
+    parts += [f"| `{name}` | {finds} |" for name, finds in CHECKS.items()]
     return "\n".join(parts) + "\n"
 
 

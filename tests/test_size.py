@@ -10,9 +10,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395839, 2.11, 2.47, 2.91),
-    "report": (61010, 0.25, 1.19, 0.67),
-    "diagnosis": (60499, 9.15, 7.96, 9.14),
+    "all": (395817, 2.11, 2.44, 2.87),
+    "report": (61009, 0.25, 1.19, 0.67),
+    "diagnosis": (60478, 9.14, 7.78, 8.97),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
     "identification": (34428, 7.39, 13.84, 16.02),

@@ -15,7 +15,7 @@ from jaxbl.drive.effects import EFFECTS
 from .blocks import standard_errors_better
 from .confidence import Finding, weigh
 from .effect_search import EffectSearch, Explanation, VerdictName
-from .expected_errors import expected_errors, failed
+from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
 from .history import Step
 from .reference_log import Comparison
@@ -85,11 +85,6 @@ class Choice:
         self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known)
         self.before = self.log.compare(setup.nominal)
 
-    @property
-    def history(self) -> list[Step]:
-        """Every comparison that decided something."""
-        return self.search.history
-
     def choose(self) -> Chosen:
         """Search for effects, and settle the numbers."""
         found = self.search.run()
@@ -103,18 +98,15 @@ class Choice:
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
-        if not _is_plausible(chosen) or not self._leaves_more(chosen):
+        fitted = chosen.fitted
+        whole, away = self.log.compare(fitted.experiment), np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
+        expected = expected_errors(self.log, fitted, whole, self.setup.input_noise, chosen.driving)
+        if np.max(away, initial=0.0) > LIMITS.far or not list_failed(self.log.with_slow(whole), expected):
             return None
-        tables = tabulate(self.log, chosen.fitted.experiment, chosen.compared, lacking, self.setup.sliding)
+        tables = tabulate(self.log, fitted.experiment, chosen.compared, lacking, self.setup.sliding)
         z, why = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")
-        self.history.append(Step("add a table of what is left", None, z, tables is not None, why))
+        self.search.history.append(Step("add a table of what is left", None, z, tables is not None, why))
         return tables
-
-    def _leaves_more(self, chosen: Chosen) -> bool:
-        """Tell whether a model leaves more on the log than a complete one would."""
-        whole = self.log.compare(chosen.fitted.experiment)
-        expected = expected_errors(self.log, chosen.fitted, whole, self.setup.input_noise, chosen.driving)
-        return bool(failed(self.log.with_slow(whole), expected))
 
     def _as_given(self, fitted: FittedModel) -> FittedModel:
         """Return the model with the numbers that it came with."""
@@ -124,11 +116,6 @@ class Choice:
         return fitted._replace(
             experiment=self.setup.nominal, theta=np.zeros(len(own)), covariance=known, white=off, left_out=None
         )
-
-
-def _is_plausible(chosen: Chosen) -> bool:
-    """Tell whether a model's own numbers are where they may be by what is known of them."""
-    return bool(np.all(np.abs(chosen.fitted.theta[: len(chosen.prior)]) < LIMITS.far * chosen.prior))
 
 
 def _closest(found: Explanation) -> Rival | None:

@@ -14,7 +14,6 @@ from .effect_search import Explanation
 from .expected_errors import Expected
 from .fitted_model import FittedModel, special_case
 from .reference_log import Errors
-from .thresholds import LIMITS
 
 LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
@@ -61,11 +60,6 @@ def _certainty(fitted: FittedModel, name: str) -> float:
     paths = [f"effects.{name}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
     return float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
-
-
-def is_little(share: float | None) -> bool:
-    """Tell whether an explanation takes away less of the missing torque than it has to."""
-    return share is not None and share < LIMITS.least_explained
 
 
 def explained_share(experiment: Experiment, before: Errors, after: Errors, expected: Mapping[str, Expected]) -> float | None:

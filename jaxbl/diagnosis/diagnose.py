@@ -158,7 +158,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = _observed(setup, proof, observing)
         trace = trace_of(setup, proof, missing, observed)
         done()
-        summary = summary_of(setup, chosen, choice.history) | {"verdict": judgement.verdict, "explained_share": share}
+        summary = summary_of(setup, chosen, choice.search.history) | {"verdict": judgement.verdict, "explained_share": share}
         about, notes = observers_say(observing, observed[0], setup)
         for side, witness in about.items():
             summary["where"][side]["observed"] = witness

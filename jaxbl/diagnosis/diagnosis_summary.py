@@ -39,7 +39,7 @@ from .thresholds import LIMITS
 
 
 def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObject:
-    """The summary but for the proof, the verdict, and what the observers say."""
+    """Make the summary but for the proof, the verdict, and what the observers say."""
     task, record, located = setup.task, setup.task.record, setup.located
     fitted, found = chosen.fitted, chosen.found
     where = where_lacking(record, located)
@@ -84,7 +84,7 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
 
 
 def describe_parameters(record: Record, own: Sequence[FreeParameter], values: Numbers, errors: Numbers) -> JsonObject:
-    """The model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
+    """Describe the model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
     return {
         number.path: {
             "value": values[number.path],
@@ -97,7 +97,7 @@ def describe_parameters(record: Record, own: Sequence[FreeParameter], values: Nu
 
 
 def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
-    """A finding as in `diagnosis.json`, but for its share and gain; values and standard errors by path, `where` by side."""
+    """Describe a finding but for its share and gain; values and standard errors by path, `where` by side."""
     units = units_of(EFFECTS[one.effect])
     numbers = {
         leaf: {
@@ -120,14 +120,14 @@ def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numb
 
 
 def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
-    """What the held-out errors of a complete model would be, which of them are larger, and the controls."""
+    """Say what the held-out errors of a complete model would be, which of them are larger, and the controls."""
     expected = proof.expected
     before, after = (proof.log.with_slow(each) for each in (proof.before, proof.after))
     return {
-        "expected": {name: one._asdict() for name, one in expected.items() if " below " not in name},
+        "expected": {name: error._asdict() for name, error in expected.items() if " below " not in name},
         "slow_torques": {
-            name: {"before": before[name], "after": after[name]} | one._asdict()
-            for name, one in expected.items()
+            name: {"before": before[name], "after": after[name]} | error._asdict()
+            for name, error in expected.items()
             if " below " in name
         },
         "test": judgement.test,

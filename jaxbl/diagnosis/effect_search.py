@@ -251,7 +251,9 @@ class EffectSearch:
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             if best is not None and not best.added:
                 # it may be one of the numbers alone
-                errors = [self._try(current, proposal) for proposal in self._propose_errors(current)]
+                none = np.zeros(len(self.fits.prior))
+                names = {name for name in self.lacking if current.linear.same(name) is not None} - {*current.names}
+                errors = [self._try(current, _Proposal({name: EFFECTS[name].neutral()}, none)) for name in sorted(names)]
                 trials += errors
                 accepted += [trial for trial in errors if trial.gain.is_accepted]
                 best = max(accepted, key=lambda trial: trial.worth)
@@ -378,11 +380,6 @@ class EffectSearch:
         self.history.append(Step(tried, nats, None if np.isnan(z) else z, kept, why))
 
     # ---- proposals ----
-
-    def _propose_errors(self, current: FittedModel) -> list[_Proposal]:
-        """Propose that one of the model's own numbers is further off than stated, for each."""
-        names = [name for name in self.lacking if name not in current.names and current.linear.same(name) is not None]
-        return [_Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))) for name in names]
 
     def _propose(self, current: FittedModel) -> list[_Proposal]:
         """Propose effects that may be missing, most promising first."""

@@ -91,7 +91,7 @@ def expected_errors(
         drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LIMITS.failing / len(names))
         limit = (1.0 + unsure) ** 2 * floor[name] ** 2 + drawn_most + small[name]
         found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
-    if any(name.startswith("torque") for name in failed(log.with_slow(base), found)):
+    if any(name.startswith("torque") for name in list_failed(log.with_slow(base), found)):
         for name, rounding in log.rounding(fitted.experiment).items():
             if name in found:
                 limit = np.hypot(found[name].limit, (1.0 + _NOISE_ERROR) * rounding)
@@ -99,8 +99,8 @@ def expected_errors(
     return found
 
 
-def failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
-    """Channels in which a model leaves more than a complete one would, or in which nobody can say: draws of it diverge."""
+def list_failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
+    """List channels in which a model leaves more than a complete one would, or in which nobody can say: draws diverge."""
     return [name for name, one in expected.items() if not errors[name] <= one.limit < np.inf]
 
 

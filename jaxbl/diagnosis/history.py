@@ -29,4 +29,4 @@ def describe_change(before: EffectNumbers | Mapping[str, object], after: EffectN
     gone, new = (" and ".join(sorted(set(a) - set(b))) for a, b in ((before, after), (after, before)))
     if gone and new:
         return f"replace {gone} by {new}"
-    return f"add {new}" if new else f"remove {gone}" if gone else "fit the numbers anew"
+    return f"add {new}" if new else f"remove {gone}" if gone else "let all numbers be further off than stated"

@@ -1,14 +1,25 @@
-"""What a diagnosis may say of the model that stands, by the proof and the model's own numbers."""
+"""What a diagnosis may say of the model that stands: a table of checks, one of which is enough against it."""
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from jaxbl.json_types import JsonObject
 
 from .choice import Chosen
-from .confidence import is_little
 from .effect_search import VerdictName
 from .proof import Proof
 from .thresholds import LIMITS
+
+CHECKS = {
+    "failed": "More is left on the held-out data than a complete model would leave, in these channels",
+    "far": "Numbers of the model had to leave what is known of them, by so many standard deviations",
+    "chance": "Shuffled in time, the torque that was added does as well",
+    "remainder": "Something else is missing by the search",
+    "worse": "The model as given predicts the held-out data better",
+    "little": "It takes away less than half of the torque that is missing on the data not used for the fit",
+    "contradicting": "Logs do not agree on a number",
+}
+"""What speaks against a model, by the key in `gap.test` of `diagnosis.json`: one is enough for `unknown_effect`."""
 
 
 class Judgement(NamedTuple):
@@ -16,16 +27,29 @@ class Judgement(NamedTuple):
 
     Attributes:
         verdict: as in `diagnosis.json`.
-        test: what was asked, and the answers, as in `diagnosis.json`: `failed`, the channels in which the model leaves more
-            than a complete one would; `far`, its own numbers that had to leave what is known of them, and by how many
-            standard deviations; whether the added torque does as well shuffled in time (`chance`), something else is missing
-            by the search (`remainder`), the model as given predicts the proof better (`worse`), the effects take away less
-            than half of what is missing there (`little`), the logs do not agree (`contradicting`); `weak`, the channels that
-            test nothing, and `untested`, the effects that the proof says nothing of.
+        test: the answers to :data:`CHECKS`, as in `diagnosis.json`; `level`; `weak`, the channels that test nothing, and
+            `untested`, the effects that the proof says nothing of.
     """
 
     verdict: VerdictName
     test: JsonObject
+
+
+def judge_answers(
+    names: Sequence[str],
+    answers: Mapping[str, Any],
+    untested: JsonObject | None = None,
+    weak: Sequence[str] = (),
+    has_power: bool = True,
+) -> Judgement:
+    """Judge a model with effects of some `names` by the `answers` to :data:`CHECKS`; those left out are in its favour."""
+    test = {"level": LIMITS.failing, **dict.fromkeys(CHECKS, False), **answers, "weak": weak, "untested": untested or {}}
+    verdict: VerdictName = "explained" if names else "no_discrepancy"
+    if any(answers.values()):
+        verdict = "unknown_effect"
+    elif untested or not has_power:
+        verdict = "not_tested"
+    return Judgement(verdict, test)
 
 
 def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool = False) -> Judgement:
@@ -39,14 +63,16 @@ def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool
     """
     fitted = chosen.fitted
     away = fitted.theta[: len(chosen.prior)] / chosen.prior
-    far = {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far}
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
-    tested = [name for name in fitted.names if name not in untested]
-    chance = bool(tested) and any(control.kind == "permuted" and control.z < LIMITS.sure for control in proof.controls)
-    little, remainder = bool(tested) and is_little(share), chosen.verdict == "unknown_effect"
-    against = proof.failed or far or chance or proof.worse or little or contradicting or remainder
-    verdict = "unknown_effect" if against else "not_tested" if untested or not proof.has_power else chosen.verdict
+    tested = any(name not in untested for name in fitted.names)
     torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
-    reasons = {"chance": chance, "remainder": remainder, "worse": proof.worse, "little": little}
-    tested_by = {"level": LIMITS.failing, "failed": proof.failed, "far": far, "weak": proof.weak, "untested": torques}
-    return Judgement(verdict, tested_by | reasons | {"contradicting": contradicting})
+    answers = {
+        "failed": proof.failed,
+        "far": {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far},
+        "chance": tested and any(control.kind == "permuted" and control.z < LIMITS.sure for control in proof.controls),
+        "remainder": chosen.verdict == "unknown_effect",
+        "worse": proof.worse,
+        "little": tested and not proof.failed and share is not None and share < LIMITS.least_explained,
+        "contradicting": contradicting,
+    }
+    return judge_answers(fitted.names, answers, torques, proof.weak, proof.has_power)

@@ -33,6 +33,7 @@ from .confidence import Finding
 from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
 from .history import Step
+from .judgement import judge_answers
 from .neutral_effects import candidates, with_added
 from .thresholds import LIMITS
 
@@ -242,9 +243,8 @@ def _summary(
         name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
     ]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
-    verdict = (
-        "unknown_effect" if failed or remainder or far or alone.doubtful else "explained" if names else "no_discrepancy"
-    )
+    worse = bool(failed) and holdout["rms"] > holdout["nominal_rms"]
+    judgement = judge_answers(names, {"failed": failed, "far": far, "remainder": remainder, "worse": worse})
     force = record.unit_of("motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
@@ -267,7 +267,7 @@ def _summary(
     times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
-        "verdict": verdict,
+        "verdict": "unknown_effect" if alone.doubtful else judgement.verdict,
         "findings": findings,
         "parameters": describe_parameters(record, search.own, values, errors),
         "numbers_off": False,
@@ -289,10 +289,7 @@ def _summary(
             "units": {"theta_e": unit},
             "free_run": {},
             "expected": {"theta_e": {"limit": limit}},
-            "test": {
-                "level": LIMITS.failing, "failed": failed, "far": far, "chance": False, "remainder": remainder, "weak": [],
-                "worse": holdout["rms"] > holdout["nominal_rms"], "little": False, "contradicting": False, "untested": {},
-            },
+            "test": judgement.test,
             "controls": {},
         },
     }  # fmt: skip

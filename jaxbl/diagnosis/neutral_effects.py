@@ -38,7 +38,7 @@ def candidates(experiment: Experiment) -> list[str]:
 
 
 def corrected(name: str) -> str | None:
-    """Dotted path of the drive's number that an effect is the error of; None where it is of none."""
+    """Return the dotted path of the drive's number that an effect is the error of; None where it is of none."""
     number = EFFECTS[name].corrects if name in EFFECTS else None
     return None if number is None else f"drive.{name.partition('.')[0]}_{number}"
 
@@ -75,7 +75,7 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
 
 
 def without(experiment: Experiment, name: str) -> Experiment:
-    """A model with one of its effects at neutral numbers."""
+    """Return a model with one of its effects at neutral numbers."""
     return with_effects(experiment, tuple(_neutral(name) if one.name == name else one for one in experiment.effects))
 
 
@@ -109,7 +109,7 @@ class _AddedTorque(ConstantTorque):
 
 
 def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:
-    """A model with a further resisting torque on each side, of zero, and its dotted path by side."""
+    """Return a model with a further resisting torque on each side, of zero, and its dotted path by side."""
     added = [_AddedTorque(side=side, torque=np.zeros(())) for side in experiment.sides]  # type: ignore[arg-type]
     paths = {one.side: f"effects.{one.name}.torque" for one in added}
     return with_effects(experiment, (*experiment.effects, *added)), paths

@@ -18,7 +18,7 @@ from jaxbl.simulate import Experiment
 from .blocks import standard_errors_better
 from .choice import Chosen
 from .diagnosis_task import input_rms
-from .expected_errors import Expected, expected_errors, failed
+from .expected_errors import Expected, expected_errors, list_failed
 from .neutral_effects import without
 from .reference_log import PREDICTABLE, Comparison, Errors, ReferenceLog
 from .setup import Setup, quiet
@@ -101,7 +101,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     return Proof(
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
-        [name for name in failed(log.with_slow(after), expected) if name not in weak],
+        [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.seen,
         _controls(setup, chosen, log, before, after),
         weak,
@@ -132,7 +132,7 @@ def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Ma
     found = {}
     for name in chosen.fitted.names:
         less = without(chosen.fitted.experiment, name)
-        if not failed(log.with_slow(log.compare(less)), expected):
+        if not list_failed(log.with_slow(log.compare(less)), expected):
             torques = [_torque_between(part, chosen.fitted.experiment, less) for part in (log, setup.fitted)]
             found[name] = Untested(*torques)
     return found

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
+from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, NextStep
@@ -226,11 +227,7 @@ def _reasons(summary: JsonObject) -> Lines:
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
             "other. Noise of the torque channel does it, or too small a relative."
         )
-    if test["little"] and not test["failed"]:
-        lines.append("It takes away less than half of the torque that is missing on the data not used for the fit.")
-    if test["chance"]:
-        lines.append("Shuffled in time, the torque that was added does as well.")
-    return lines
+    return [*lines, *(f"{CHECKS[name]}." for name in ("little", "chance") if test[name])]
 
 
 def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:

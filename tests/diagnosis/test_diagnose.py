@@ -238,7 +238,8 @@ def test_an_effect_that_predicts_worse_is_not_named(logs, monkeypatch):
     # new numbers alone take the model's place only where they are better
     after, before = gap["holdout_rmse_after"], gap["holdout_rmse_before"]
     assert sum(np.log(after[name] / before[name]) for name in before) <= 0.0
-    assert diagnosis.model.effects == []
+    # the numbers may be further off than stated; what has no name is a table
+    assert summary["numbers_off"] and {effect.kind for effect in diagnosis.model.effects} <= {"motor.tabulated"}
 
 
 def test_what_is_held_out_is_read_once_when_the_model_stands(logs, monkeypatch):

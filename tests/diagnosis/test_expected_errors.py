@@ -10,7 +10,7 @@ from scipy import stats
 
 from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.expected_errors import _quantile, expected_errors, failed
+from jaxbl.diagnosis.expected_errors import _quantile, expected_errors, list_failed
 from jaxbl.diagnosis.proof import open_held_out
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.diagnosis.thresholds import LIMITS
@@ -41,14 +41,14 @@ def test_a_complete_model_passes_and_an_incomplete_one_fails(torque_noise, tmp_p
     log = simulate_multisine_log(torque_noise=torque_noise)
     errors, expected = compare_with_expected(tmp_path, log, {"motor.coulomb_friction": {"torque": FRICTION["torque"]}})
     assert {name.partition(" below ")[0] for name in expected} == {"theta_e", "torque_motor"}
-    assert failed(errors, expected) == []
+    assert list_failed(errors, expected) == []
     # an input with noise that the drive has not felt moves the model, by as much as is expected
     position = expected["theta_e"]
     if torque_noise:
         assert errors["theta_e"] > 3.0 * position.noise
         assert errors["theta_e"] == pytest.approx(position.open, rel=0.6)
     errors, expected = compare_with_expected(tmp_path, log, {})
-    assert "torque_motor" in failed(errors, expected)
+    assert "torque_motor" in list_failed(errors, expected)
 
 
 def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
@@ -57,10 +57,10 @@ def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
     )
     assert expected["torque_motor"].least == pytest.approx(0.5e-3)
     more = errors | {"torque_motor": 1.05 * expected["torque_motor"].limit}
-    assert failed(more, expected) == ["torque_motor"]
-    assert failed(errors | {"theta_e": np.inf}, expected) == ["theta_e"]
+    assert list_failed(more, expected) == ["torque_motor"]
+    assert list_failed(errors | {"theta_e": np.inf}, expected) == ["theta_e"]
     # a limit that is none excuses nothing
-    assert failed(errors, expected | {"theta_e": expected["theta_e"]._replace(limit=np.inf)}) == ["theta_e"]
+    assert list_failed(errors, expected | {"theta_e": expected["theta_e"]._replace(limit=np.inf)}) == ["theta_e"]
 
 
 @pytest.mark.parametrize("freedom", [1, 4, 30])
@@ -78,7 +78,7 @@ def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
     errors, expected = compare_with_expected(
         tmp_path, dataclasses.replace(log, u=log.u - slow), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     )
-    failures = failed(errors, expected)
+    failures = list_failed(errors, expected)
     assert "torque_motor" not in failures and any(name.startswith("torque_motor below ") for name in failures)
 
 
