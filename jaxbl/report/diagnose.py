@@ -102,19 +102,19 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
 
 
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
+_FURTHER_OFF = "The numbers are further off than stated"
 
 
 def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
-    names, verdict = _names(summary), summary["verdict"]
+    names, verdict, off = _names(summary), summary["verdict"], summary["numbers_off"]
     them = "it" if len(summary["findings"]) == 1 else "them"
-    if summary["numbers_off"]:
-        needed = "; no effect is needed" * (verdict == "no_discrepancy")
-        return f"The numbers are further off than stated{needed}. {verdict_sentence(summary | {'numbers_off': 0})}"
+    if verdict == "no_discrepancy":
+        return f"{_FURTHER_OFF}; no effect is needed. With others {_NO_MORE}." if off else f"No discrepancy: {_NO_MORE}."
+    if off:
+        return f"{_FURTHER_OFF}. {verdict_sentence(summary | {'numbers_off': 0})}"
     if verdict == "explained":
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
-    if verdict == "no_discrepancy":
-        return f"No discrepancy: {_NO_MORE}."
     if verdict == "not_tested":
         return _not_tested(summary)
     where = "; ".join(side["sentence"] for side in summary.get("where_after", summary["where"]).values())
@@ -193,7 +193,7 @@ def _changes(gap: JsonObject, before: Mapping[str, float | None], after: Mapping
 
 
 def _share(value: float | None) -> str:
-    if value is None or value < 0.005:
+    if not value or value < 0.005:
         return "none"
     return "more than 99.9 %" if value > 0.999 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
 
@@ -262,7 +262,7 @@ def _gap_lines(gap: JsonObject) -> Lines:
         for name, change in _changes(gap, gap["holdout_rmse_before"], gap["holdout_rmse_after"]).items()
     ]
     window = holdout["window"]
-    how = "predicted one sample ahead" if window is None else f"over windows of {window:.2g} s"
+    how = "predicted one sample ahead" if not window else f"over windows of {window:.2g} s"
     lines = [f"{place}, {how}, rms (noise; most that a complete model leaves): {', '.join(errors)}."]
     if "after" in run:
         lines.append(f"In one free run: {'; '.join(_changes(gap, run['before'], run['after']).values())}.")

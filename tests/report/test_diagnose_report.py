@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hidden.outcomes import FIRST_LINE
 from passed import PASSED
 
 from jaxbl.diagnosis.residuals import Residual
@@ -138,6 +139,13 @@ def test_other_verdicts_say_what_is_left():
     assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
     assert "No free run is compared: it is chaotic." in diagnosis_lines(change_summary(gap=gap))
+
+
+def test_numbers_that_are_further_off_come_first():
+    """In the words that the bench asks for; what else is found stays."""
+    off = SUMMARY | {"numbers_off": True}
+    assert diagnosis_lines(off | {"findings": [], "verdict": "no_discrepancy"})[0].startswith(FIRST_LINE)
+    assert diagnosis_lines(off)[0].endswith(diagnosis_lines(SUMMARY)[0])
 
 
 def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
