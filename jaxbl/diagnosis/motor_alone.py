@@ -270,7 +270,6 @@ def _summary(
         "verdict": "unknown_effect" if alone.doubtful else judgement.verdict,
         "findings": findings,
         "parameters": describe_parameters(record, search.own, values, errors),
-        "numbers_off": False,
         "where": {"motor": {"sentence": sentence}},
         "rest": {},
         "contradictions": [],

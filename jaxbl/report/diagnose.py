@@ -107,7 +107,7 @@ _FURTHER_OFF = "The numbers are further off than stated"
 
 def verdict_sentence(summary: JsonObject) -> str:
     """The verdict in one sentence."""
-    names, verdict, off = _names(summary), summary["verdict"], summary["numbers_off"]
+    names, verdict, off = _names(summary), summary["verdict"], summary.get("numbers_off")
     them = "it" if len(summary["findings"]) == 1 else "them"
     if verdict == "no_discrepancy":
         return f"{_FURTHER_OFF}; no effect is needed. With others {_NO_MORE}." if off else f"No discrepancy: {_NO_MORE}."
@@ -230,7 +230,7 @@ def _reasons(summary: JsonObject) -> Lines:
     return [*lines, *(f"{CHECKS[name]}." for name in ("little", "chance") if test[name])]
 
 
-def _plainest(gap: JsonObject) -> list[tuple[str, float | None, float | None]]:
+def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     """Return of each channel the failed test that shows it best, its error and limit."""
     tested = {name: (torque["after"], torque["limit"]) for name, torque in gap.get("slow_torques", {}).items()}
     tested |= {name: (gap["holdout_rmse_after"][name], error["limit"]) for name, error in gap["expected"].items()}

@@ -39,7 +39,6 @@ SUMMARY = {
             "alternatives": [{"effect": "load.stribeck_friction", "confidence": 0.07}],
         }
     ],
-    "numbers_off": False,
     "where": {"motor": {"sentence": "motor side: nothing beyond noise"}, "load": {"sentence": "load side, here"}},
     "rest": {"load.drift": {"evidence": -3.0, "share": 0.001}, "load.time": {"evidence": None, "share": 0.0}},
     "explained_share": 0.83,
