@@ -9,6 +9,7 @@ PASSED = {
     "worse": False,
     "little": False,
     "contradicting": False,
+    "doubtful": False,
     "weak": [],
     "untested": {},
 }

@@ -10,9 +10,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395811, 2.11, 2.44, 2.87),
-    "report": (61007, 0.25, 1.19, 0.67),
-    "diagnosis": (60474, 9.14, 7.78, 8.97),
+    "all": (395782, 2.11, 2.44, 2.87),
+    "report": (61001, 0.25, 1.19, 0.67),
+    "diagnosis": (60451, 9.14, 7.78, 8.97),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
     "identification": (34428, 7.39, 13.84, 16.02),

@@ -80,7 +80,7 @@ class Candidate:
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
         from_rest: whether nothing had happened before the first input known; else that one had lasted.
-        usual: large coefficients; 0 where their torque says which are.
+        spread: prior standard deviation of the coefficients; 0 where their torque sets it.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Candidate:
     numbers: Callable[[Sequence[float]], Numbers | None]
     offset: bool = False
     from_rest: bool = False
-    usual: float = 0.0
+    spread: float = 0.0
 
 
 def are_possible(effects: EffectNumbers, period: float) -> bool:
@@ -122,7 +122,7 @@ _AT_ONCE = 6
 """Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02
 """Change of the logarithm of a number by which the slope at a trial value is found."""
-ZERO = 1.8
+ZERO_SPREAD = 1.8
 """Prior standard deviation of an encoder's zero, rad: it may lie anywhere in a turn."""
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
@@ -183,7 +183,7 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
                 numbers[leaf] += value * share
         return numbers | known if cls.possible(numbers) else None
 
-    return Candidate(name, len(effects), tuple(effects), columns, numbers_of, usual=ZERO if cls.in_log else 0.0)
+    return Candidate(name, len(effects), tuple(effects), columns, numbers_of, spread=ZERO_SPREAD if cls.in_log else 0.0)
 
 
 def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:

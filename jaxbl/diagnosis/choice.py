@@ -48,7 +48,7 @@ class Chosen(NamedTuple):
         rival: the best model with another effect, or None.
         driving: torque that drives the machine, rms, N m.
         prior: standard deviation of theta of the model's own numbers.
-        further_off: whether that is more than is stated of them.
+        numbers_off: whether that is more than is stated of them.
     """
 
     found: Explanation
@@ -58,7 +58,7 @@ class Chosen(NamedTuple):
     rival: Rival | None
     driving: float
     prior: np.ndarray
-    further_off: bool
+    numbers_off: bool
 
     @property
     def verdict(self) -> VerdictName:
@@ -93,8 +93,8 @@ class Choice:
             fitted, compared = self._as_given(fitted), self.before
         findings = weigh(found)
         fits, closest = self.search.fits, _closest(found)
-        further_off = fits is self.search.rough and fitted is found.fitted
-        return Chosen(found, fitted, compared, findings, closest, fits.given.drive, fits.prior, further_off)
+        numbers_off = fits is self.search.rough and fitted is found.fitted
+        return Chosen(found, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""

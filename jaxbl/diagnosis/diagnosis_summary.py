@@ -69,13 +69,17 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
         "findings": sorted(
             (
                 describe_finding(record, one, values, errors, where)
-                | {"share": fitted.share(one.effect), "z": found.gains[one.effect].standard_errors}
+                | {
+                    "share": fitted.share(one.effect),
+                    "z": found.gains[one.effect].standard_errors,
+                    "in_log": EFFECTS[one.effect].in_log,
+                }
                 for one in chosen.findings
             ),
             key=lambda one: -one["share"],
         ),
         "parameters": describe_parameters(record, setup.own, values, errors),
-        "numbers_off": chosen.further_off,
+        "numbers_off": chosen.numbers_off,
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "history": [step._asdict() for step in history],

@@ -104,7 +104,7 @@ class _Proposal(NamedTuple):
     promise; infinite where these are not known. And the best variant of a single one."""
 
     numbers: EffectNumbers
-    change: np.ndarray
+    change: np.ndarray | float = 0.0
     nats: float = np.inf
     variant: Candidate | None = None
 
@@ -202,7 +202,7 @@ class EffectSearch:
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        current = self._read_record(self.fits.fit({}, np.zeros(len(self.fits.prior))))
+        current = self._add_recording_errors(self.fits.fit({}, np.zeros(len(self.fits.prior))))
         visited = set[tuple[bool, frozenset[str]]]()
         while True:
             # effects that make each other needless would come and go without end
@@ -222,11 +222,11 @@ class EffectSearch:
         )  # fmt: skip
         return found
 
-    def _read_record(self, current: FittedModel) -> FittedModel:
-        """Take in what belongs to the recording, where it is larger than effects are: they would stand for it."""
+    def _add_recording_errors(self, current: FittedModel) -> FittedModel:
+        """Add errors of the recording that are larger than effects are, which would stand for them."""
         for name in [name for name in self.lacking if EFFECTS[name].in_log]:
             self.lacking.remove(name)
-            trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}, np.zeros(len(self.fits.prior))))
+            trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}))
             kept = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
             why = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
             self._note(f"add {name}", trial.gain, kept, why)
@@ -251,9 +251,8 @@ class EffectSearch:
             best = max(accepted or single, key=lambda trial: trial.worth, default=None)
             if best is not None and not best.added:
                 # it may be one of the numbers alone
-                none = np.zeros(len(self.fits.prior))
                 names = {name for name in self.lacking if current.linear.same(name) is not None} - {*current.names}
-                errors = [self._try(current, _Proposal({name: EFFECTS[name].neutral()}, none)) for name in sorted(names)]
+                errors = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in sorted(names)]
                 trials += errors
                 accepted += [trial for trial in errors if trial.gain.is_accepted]
                 best = max(accepted, key=lambda trial: trial.worth)
@@ -301,7 +300,7 @@ class EffectSearch:
         if not gone or not new.keys() - gone:
             return Trial(tuple(new), fitted, self.gain(current, fitted))
         if old.keys() & gone:
-            # it stood for the new ones, which are compared with none of them
+            # it stood for the new ones: they are compared with the model that has neither
             current = self.fits.fit({name: old[name] for name in old if name not in gone}, theta, current)
         return self._try(current, proposal._replace(numbers={name: new[name] for name in new if name not in gone}))
 
@@ -409,15 +408,14 @@ class EffectSearch:
                 for other, special in promised.items()
             )
         ]
-        none = np.zeros(len(own))
         proposals += [
-            _Proposal({effect.name: effect.numbers}, none)
+            _Proposal({effect.name: effect.numbers})
             for effect in shown
             if not any(contains(effect.name, other) and effect.share < share + SHOWN for other, share in shares.items())
         ]
         together = regression.propose_together()
         if len(together) > 1:
-            proposals.append(_Proposal(together, none))
+            proposals.append(_Proposal(together))
         return proposals
 
     def _regress(self, linear: Linear, current: FittedModel, variants: Sequence[Candidate]) -> TorqueRegression:

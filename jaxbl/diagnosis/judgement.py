@@ -16,8 +16,9 @@ CHECKS = {
     "chance": "Shuffled in time, the torque that was added does as well",
     "remainder": "Something else is missing by the search",
     "worse": "The model as given predicts the held-out data better",
-    "little": "It takes away less than half of the torque that is missing on the data not used for the fit",
+    "little": "The effects take away less than half of the torque that is missing on the data not used for the fit",
     "contradicting": "Logs do not agree on a number",
+    "doubtful": "A gap is called for that the motor's encoder alone does not show",
 }
 """What speaks against a model, by the key in `gap.test` of `diagnosis.json`: one is enough for `unknown_effect`."""
 

@@ -541,8 +541,8 @@ class Linear:
             size = LIMITS.effect_size * self.drive / np.sqrt(power[1 + own :] / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
-            if one.offset or one.usual:
-                scale[list(place)] = one.usual or SPACING
+            if one.offset or one.spread:
+                scale[list(place)] = one.spread or SPACING
             elif (nominal := self.nominal(one.name)) is not None:
                 scale[list(place)] = np.minimum(scale[list(place)], LIMITS.number_error * nominal)
         centre = np.zeros(at)

@@ -243,8 +243,10 @@ def _summary(
         name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
     ]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
+    # where no more is left than a complete model leaves, neither model is better
     worse = bool(failed) and holdout["rms"] > holdout["nominal_rms"]
-    judgement = judge_answers(names, {"failed": failed, "far": far, "remainder": remainder, "worse": worse})
+    answers = {"failed": failed, "far": far, "remainder": remainder, "worse": worse, "doubtful": alone.doubtful}
+    judgement = judge_answers(names, answers)
     force = record.unit_of("motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
@@ -267,7 +269,7 @@ def _summary(
     times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
-        "verdict": "unknown_effect" if alone.doubtful else judgement.verdict,
+        "verdict": judgement.verdict,
         "findings": findings,
         "parameters": describe_parameters(record, search.own, values, errors),
         "where": {"motor": {"sentence": sentence}},

@@ -28,7 +28,7 @@ from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
-from .candidates import ZERO, EffectNumbers
+from .candidates import ZERO_SPREAD, EffectNumbers
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import SILENT, Linear, Predictor
 from .neutral_effects import complete, lean
@@ -135,7 +135,7 @@ class ModelFits:
             unit = LIMITS.effect_size / max(along.torque_share(make_effect(name, **single)), 1e-12)
             nominal = self.given.nominal(name)
             unit = unit if nominal is None else min(unit, LIMITS.number_error * nominal)
-            self._units[key] = ZERO if EFFECTS[name].in_log else unit
+            self._units[key] = ZERO_SPREAD if EFFECTS[name].in_log else unit
         return self._units[key]
 
 

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
-from jaxbl.drive.effects import EFFECTS
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, NextStep
 
@@ -78,7 +77,7 @@ def _headline(summary: JsonObject) -> Lines:
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): "
             f"{', '.join(map(_number, numbers.items()))}; "
-            f"{EFFECTS[finding['effect']].in_log or _percent(finding['share']) + ' of the driving torque'}."
+            f"{finding.get('in_log') or _percent(finding['share']) + ' of the driving torque'}."
         )
         if others:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
@@ -110,7 +109,9 @@ def verdict_sentence(summary: JsonObject) -> str:
     names, verdict, off = _names(summary), summary["verdict"], summary.get("numbers_off")
     them = "it" if len(summary["findings"]) == 1 else "them"
     if verdict == "no_discrepancy":
-        return f"{_FURTHER_OFF}; no effect is needed. With others {_NO_MORE}." if off else f"No discrepancy: {_NO_MORE}."
+        return (
+            f"{_FURTHER_OFF}; no effect is needed. With fitted ones {_NO_MORE}." if off else f"No discrepancy: {_NO_MORE}."
+        )
     if off:
         return f"{_FURTHER_OFF}. {verdict_sentence(summary | {'numbers_off': 0})}"
     if verdict == "explained":

@@ -164,7 +164,7 @@ class AbstractEffect(eqx.Module):
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
-        in_log: what takes it off a log, if it is of the recording: a diagnosis asks for it first.
+        in_log: words that say how it is taken off a log, if it is an error of the recording: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
         exclusive: a word; a place has at most one effect with the same word.
         special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
