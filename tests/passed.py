@@ -4,7 +4,6 @@ PASSED = {
     "level": 0.01,
     "failed": [],
     "far": {},
-    "chance": False,
     "remainder": False,
     "worse": False,
     "little": False,

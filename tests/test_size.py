@@ -10,15 +10,15 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395782, 2.11, 2.44, 2.87),
-    "report": (61001, 0.25, 1.19, 0.67),
-    "diagnosis": (60451, 9.14, 7.78, 8.97),
+    "all": (395037, 2.1, 2.31, 2.8),
+    "report": (60954, 0.25, 1.19, 0.67),
+    "diagnosis": (60006, 9.16, 7.53, 8.77),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
-    "identification": (34428, 7.39, 13.84, 16.02),
+    "identification": (34426, 7.36, 12.7, 15.66),
     "sweeps": (28678, 0.07, 0.0, 0.0),
     "exports": (22808, 0.02, 0.0, 0.0),
-    "fused": (24474, 0.0, 0.0, 0.0),
+    "fused": (24223, 0.0, 0.0, 0.0),
     ".": (18352, 0.03, 0.0, 0.0),
     "drive": (12682, 0.0, 2.19, 0.0),
     "throughput": (11727, 0.0, 0.0, 0.0),

@@ -99,7 +99,7 @@ def _errors(row: Row, kind: str) -> str:
 
 
 _REASONS = {
-    "chance": "control: shuffled torque", "remainder": "search: a rest", "worse": "the model as given predicts better",
+    "remainder": "search: a rest", "worse": "the model as given predicts better",
     "little": "less than half of the missing torque", "contradicting": "logs contradict each other",
 }  # fmt: skip
 """Reasons against a verdict, beside errors."""

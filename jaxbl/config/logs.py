@@ -10,8 +10,10 @@ class UncertaintyTable(Table):
 
     relative: float = declare_key("relative standard deviation of every number not in exact", 0.02, gt=0.0)
     exact: list[str] = declare_key(
-        "dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
-        ["drive.gear_ratio"],
+        "paths of numbers that are known exactly, and effects that are surely not missing, by name", ["drive.gear_ratio"]
+    )
+    expected: list[str] = declare_key(
+        "effects that surely act, by name: diagnose fits them from the first, and keeps them", []
     )
 
 
@@ -19,13 +21,11 @@ class IdentifyTable(Table):
     """Settings of `jaxbl identify`."""
 
     parameters: list[str] | None = declare_key(
-        "dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
-        "uncertainty.exact and have a value to start from",
-        None,
+        "paths of the numbers to find; left out: all that are not in uncertainty.exact and have a value to start from", None
     )
     method: Literal["output_error", "prediction_error"] = declare_key(
-        "output_error: the model runs freely over each window; prediction_error: each reading corrects it, "
-        "which is better where disturbances act that the model does not know",
+        "output_error: free runs over each window; prediction_error: each reading corrects the model, "
+        "which is better where disturbances act that it does not know",
         "output_error",
     )
     window: float | None = declare_key(

@@ -25,11 +25,10 @@ class Table(StrictTable):
 
     def build(self) -> Any:
         """The module that a generated table stands for."""
-        names = {name for name in type(self).model_fields if name not in ("kind", "law")}
+        values = ((name, getattr(self, name)) for name in type(self).model_fields if name not in ("kind", "law"))
         # of the class: an instance would bind a partial function from Python 3.14 on
-        values = {name: getattr(self, name) for name in names}
         return type(self).factory(
-            **{name: tuple(element) if isinstance(element, list) else element for name, element in values.items()}
+            **{name: tuple(element) if isinstance(element, list) else element for name, element in values}
         )
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
+from jaxbl.errors import InputError
 
 from .blocks import standard_errors_better
 from .confidence import Finding, weigh
@@ -18,6 +19,7 @@ from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
 from .history import Step
+from .neutral_effects import candidates
 from .reference_log import Comparison
 from .residuals import SideResiduals
 from .setup import Setup
@@ -81,8 +83,15 @@ class Choice:
         self.setup, self.log = setup, setup.fitted
         # a linear axis has no turns
         rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
-        known = *setup.task.config.uncertainty.exact, *rotary
-        self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known)
+        stated, sought = setup.task.config.uncertainty, candidates(setup.bare)
+        for name in stated.expected:
+            if name not in (*sought, *(effect.name for effect in setup.bare.effects)):
+                raise InputError(
+                    f"uncertainty.expected: '{name}' is no effect that is sought on this drive; it should be one of: "
+                    f"{', '.join(sought)}"
+                )
+        known = *stated.exact, *rotary
+        self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known, stated.expected)
         self.before = self.log.compare(setup.nominal)
 
     def choose(self) -> Chosen:

@@ -124,7 +124,7 @@ def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numb
 
 
 def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
-    """Say what the held-out errors of a complete model would be, which of them are larger, and the controls."""
+    """Say what the held-out errors of a complete model would be, which of them are larger, and the control."""
     expected = proof.expected
     before, after = (proof.log.with_slow(each) for each in (proof.before, proof.after))
     return {
@@ -135,10 +135,7 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
             if " below " in name
         },
         "test": judgement.test,
-        "controls": {
-            one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {})
-            for one in proof.controls
-        },
+        "controls": {"wrong": {"effect": one.effect, "rmse": one.errors, "z": one.z}} if (one := proof.control) else {},
     }
 
 

@@ -142,6 +142,7 @@ class EffectSearch:
         prior: Sequence[float],
         log: ReferenceLog,
         exact: Collection[str] = (),
+        expected: Collection[str] = (),
     ):
         """Prepare to explain a log.
 
@@ -150,8 +151,9 @@ class EffectSearch:
             free, prior: its own numbers that are not exactly known, and the relative standard deviation of each.
             log: the log.
             exact: dotted paths of numbers that are known, and names of effects that are surely not missing.
+            expected: names of effects that surely act: they are in the model from the first, and stay.
         """
-        self.log, stated = log, np.asarray(prior)
+        self.log, self.expected, stated = log, expected, np.asarray(prior)
         self.fits = self.stated = ModelFits(experiment, free, stated, log.segments)
         rough = np.hypot(stated, LIMITS.number_error)
         self.rough = ModelFits(experiment, free, rough, log.segments, LIMITS.effect_odds)
@@ -202,7 +204,7 @@ class EffectSearch:
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        current = self._add_recording_errors(self.fits.fit({}, np.zeros(len(self.fits.prior))))
+        current = self._begin()
         visited = set[tuple[bool, frozenset[str]]]()
         while True:
             # effects that make each other needless would come and go without end
@@ -222,13 +224,22 @@ class EffectSearch:
         )  # fmt: skip
         return found
 
-    def _add_recording_errors(self, current: FittedModel) -> FittedModel:
-        """Add errors of the recording that are larger than effects are, which would stand for them."""
-        for name in [name for name in self.lacking if EFFECTS[name].in_log]:
-            self.lacking.remove(name)
-            trial = self._try(current, _Proposal({name: EFFECTS[name].neutral()}))
-            kept = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
-            why = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
+    def _begin(self) -> FittedModel:
+        """Fit the model as given, with what is known to act and with errors of the recording that are larger than effects
+        are, which would stand for them."""
+        current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
+        for name in [name for name in self.lacking if name in self.expected or EFFECTS[name].in_log]:
+            proposals = [_Proposal({name: EFFECTS[name].neutral()})]
+            if name in self.expected:
+                linear, predictor, variants = self._vary(current, [name])
+                proposals = self._rank(linear, current.names, variants, predictor) or proposals
+            else:
+                self.lacking.remove(name)
+            trial = self._try(current, proposals[0])
+            kept, why = self._is_possible(trial.fitted), "known to act"
+            if name not in self.expected:
+                kept = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
+                why = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
             self._note(f"add {name}", trial.gain, kept, why)
             current = trial.fitted if kept else current
         return current
@@ -313,13 +324,15 @@ class EffectSearch:
         while True:
             gains: dict[str, Gain] = {}
             for name in current.names:
-                fewer = self._simplify(current, name)
+                certain = name in self.expected
+                fewer = None if certain else self._simplify(current, name)
                 if fewer is None and thorough:
                     numbers = {other: one for other, one in current.numbers.items() if other != name}
                     less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
                     gains[name] = self.gain(less, current)
-                    self._note(f"remove {name}", gains[name], not gains[name].is_accepted, gains[name].rule, loss=True)
-                    fewer = None if gains[name].is_accepted else less
+                    kept = certain or gains[name].is_accepted
+                    self._note(f"remove {name}", gains[name], not kept, gains[name].rule, loss=True)
+                    fewer = None if kept else less
                 if fewer is not None:
                     current = fewer
                     break
@@ -380,13 +393,16 @@ class EffectSearch:
 
     # ---- proposals ----
 
+    def _vary(self, current: FittedModel, names: Sequence[str]) -> tuple[Linear, Predictor, list[Candidate]]:
+        """List the variants of effects that a log may show, and linearise a model along it, with its predictor."""
+        linear = self.fits.linearise(current.numbers, current.theta[: len(self.fits.prior)])
+        # waves and frequencies are sought in what this predictor leaves
+        predictor = linear.choose(())
+        return linear, predictor, variants_of(self.fits.nominal, names, linear.scales)
+
     def _propose(self, current: FittedModel) -> list[_Proposal]:
         """Propose effects that may be missing, most promising first."""
-        own = current.theta[: len(self.fits.prior)]
-        linear = self.fits.linearise(current.numbers, own)
-        predictor = linear.choose(())
-        names = [name for name in self.lacking if name not in current.names]
-        variants = variants_of(self.fits.nominal, names, linear.scales)
+        linear, predictor, variants = self._vary(current, [name for name in self.lacking if name not in current.names])
         regression = self._regress(linear, current, variants)
         ranked = self._rank(linear, current.names, variants, predictor)
         if ranked:

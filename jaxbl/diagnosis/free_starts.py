@@ -14,7 +14,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
 from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
-from jaxbl.simulate import Experiment, NamedArrays
+from jaxbl.simulate import Experiment
 
 from .neutral_effects import lean
 
@@ -51,18 +51,16 @@ class Run(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """A model on windows of a log; `varying` are numbers by path that differ from sample to sample."""
+    """A model on windows of a log."""
 
     experiment: Experiment
     windows: Windows
-    varying: NamedArrays
 
     def states(self, starts: np.ndarray, which: np.ndarray) -> Arrays:
         """Along some windows, from starts of shape (windows, states)."""
         start = jax.tree.structure(self.windows.start).unflatten(list(starts.T))
         torque, time = self.windows.torque[which], self.windows.time[which]
-        varying = {path: values[which] for path, values in self.varying.items()}
-        return jax.tree.leaves(simulate_plants(self.experiment, start, torque, time, varying=varying))  # type: ignore[arg-type]
+        return jax.tree.leaves(simulate_plants(self.experiment, start, torque, time))  # type: ignore[arg-type]
 
     def residual(self, states: Arrays, which: np.ndarray) -> np.ndarray:
         w = self.windows
@@ -77,10 +75,7 @@ class _Model(NamedTuple):
         ways = [Direction(state=row) for row in np.eye(count).tolist()]
         time = w.time[which][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
         flat = shape.unflatten([one.ravel() for one in states])
-        varying = {path: values[which].ravel() for path, values in self.varying.items()}
-        changes, _ = step_derivatives(
-            self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways, varying
-        )
+        changes, _ = step_derivatives(self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways)
         steps = changes.reshape(count, count, runs, samples).transpose(3, 2, 1, 0)
         places: Any = shape.unflatten(range(count))
         rows = [places.position[side] for side in self.experiment.sides]
@@ -98,7 +93,6 @@ def best_runs(
     windows: Windows,
     passes: int,
     rest: bool,
-    varying: NamedArrays | None = None,
     which: np.ndarray | None = None,
 ) -> Run:
     """Runs from the initial states that suit the first fifth of each window best, found by damped Gauss-Newton.
@@ -108,20 +102,18 @@ def best_runs(
         windows: without weights.
         passes: initial states that are tried for a window at most.
         rest: whether standstill is one of them.
-        varying: numbers of the model that differ from sample to sample, by dotted paths, shape (windows, samples).
         which: indices of the windows that are run; left out: all.
     """
     windows = jax.tree.map(np.asarray, windows)
     experiment, start = lean(experiment, windows.start)
-    windows, varying = dataclasses.replace(windows, start=start), varying or {}
+    windows = dataclasses.replace(windows, start=start)
     # what was before a window is known where it goes on where another one ends
     steps = np.rint(np.diff(windows.time) / float(experiment.run.sample_period))
     within = np.concatenate([[False], steps == windows.torque.shape[1]]) | windows.rest
     if which is not None:
         windows, within = windows.only(which), within[which]
-        varying = {path: values[which] for path, values in varying.items()}
     with np.errstate(invalid="ignore", over="ignore"):
-        return _search_starts(_Model(experiment, windows, varying), passes, rest, within)
+        return _search_starts(_Model(experiment, windows), passes, rest, within)
 
 
 def _search_starts(model: _Model, passes: int, rest: bool, within: np.ndarray) -> Run:

@@ -13,7 +13,6 @@ from .thresholds import LIMITS
 CHECKS = {
     "failed": "More is left on the held-out data than a complete model would leave, in these channels",
     "far": "Numbers of the model had to leave what is known of them, by so many standard deviations",
-    "chance": "Shuffled in time, the torque that was added does as well",
     "remainder": "Something else is missing by the search",
     "worse": "The model as given predicts the held-out data better",
     "little": "The effects take away less than half of the torque that is missing on the data not used for the fit",
@@ -70,7 +69,6 @@ def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool
     answers = {
         "failed": proof.failed,
         "far": {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far},
-        "chance": tested and any(control.kind == "permuted" and control.z < LIMITS.sure for control in proof.controls),
         "remainder": chosen.verdict == "unknown_effect",
         "worse": proof.worse,
         "little": tested and not proof.failed and share is not None and share < LIMITS.least_explained,

@@ -79,10 +79,8 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
         # what is known has no error that a predictor could have
         order += [] if effect.state_from_input else range(at, at + states_of)
         at += states_of
-    # as they may differ from sample to sample elsewhere, where the same loop serves
-    none = {path: np.zeros(size) for path in added.values()}
     ways = _directions(free, theta, at, order, list(added.values()))
-    slope, value = step_derivatives(experiment, motion, torque, time, ways, none)
+    slope, value = step_derivatives(experiment, motion, torque, time, ways)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
     defect = np.zeros_like(value)

@@ -34,8 +34,6 @@ _BLOCKS, _FOLDS = 40, 5
 """Blocks of time, and sets of them that a function is made from and tried on in turn."""
 _LEAST_BLOCKS = 4
 """Blocks of time that a mean must come from to have a scatter."""
-_BAND = 4.0
-"""Frequencies of a spectrum up to the first band."""
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
 RESOLUTION = 5e-4
@@ -102,22 +100,6 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
-class Band:
-    """Power in a band of frequencies.
-
-    Attributes:
-        low, high: Hz.
-        power_share: share of all power beyond the noise.
-        excess_z: significance.
-    """
-
-    low: float
-    high: float
-    power_share: float
-    excess_z: float
-
-
-@dataclass(frozen=True)
 class SpectralPeak:
     """A narrow peak of the spectrum.
 
@@ -148,7 +130,7 @@ class Localised:
         excess_z: its significance.
         significant: whether there is anything beyond noise, as a whole or in a region.
         coordinates: by name.
-        bands, peaks: of the spectrum.
+        peaks: of the spectrum.
     """
 
     name: str
@@ -159,7 +141,6 @@ class Localised:
     excess_z: float
     significant: bool
     coordinates: dict[str, Coordinate]
-    bands: tuple[Band, ...]
     peaks: tuple[SpectralPeak, ...]
 
 
@@ -255,7 +236,7 @@ def locate(
     found = {name: _over_coordinate(name, one, joined, excess) for name, one in values.items()}
     longest = int(np.argmax([len(one.time) for one in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
-    bands, peaks = _spectrum(residuals[longest], motion, joined.parts[longest])
+    peaks = _find_peaks(residuals[longest], motion, joined.parts[longest])
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
     beyond = (z > LIMITS.significant and missing > floor) or any(
         (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
@@ -266,7 +247,7 @@ def locate(
     beyond = beyond or any(one.excess_z > LIMITS.significant and one.amplitude > floor for one in peaks)
     return Localised(
         residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
-        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), found, bands, peaks,
+        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), found, peaks,
     )  # fmt: skip
 
 
@@ -368,25 +349,15 @@ def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: 
     return min(best / excess, 1.0)
 
 
-def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[tuple[Band, ...], tuple[SpectralPeak, ...]]:
-    """Bands and narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
+def _find_peaks(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[SpectralPeak, ...]:
+    """Find narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
     frequency, power, floor = residual_spectrum(one)
-    count, resolution = len(one.time), frequency[1]
+    count = len(one.time)
     seen = frequency <= 2.0 * one.bandwidth
     frequency, power, floor = frequency[seen], power[seen], np.maximum(floor[seen], 1e-12 * np.max(floor))
     beyond = power - floor
     total = float(np.sum(low.torque**2) - np.sum(low.deviation**2)) / len(low.time) * count
     total = max(total, _LEVEL_UNKNOWN * float(np.sum(one.deviation**2)))
-    edges = one.bandwidth * 2.0 ** np.arange(-9.0, 2.0)
-    edges = np.concatenate([[0.0], edges[edges > _BAND * resolution]])
-    bands = []
-    for begin, end in itertools.pairwise(edges):
-        inside = (frequency >= begin) & (frequency < end)
-        if np.count_nonzero(inside) < 2:
-            continue
-        # neighbours of a Hann window share 1.5 bins
-        z = _excess_z(np.sum(power[inside]), np.sum(floor[inside]), 1.5 * np.sum(floor[inside] ** 2))
-        bands.append(Band(float(begin), float(end), float(np.sum(beyond[inside])) / total, float(z)))
     motion = None
     if speed is not None:
         moving = np.asarray(speed) - np.mean(speed)
@@ -408,7 +379,7 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
         share = here / max(total, here)
         moved = motion is not None and float(np.sum(motion[near]) / np.sum(motion)) > _MOVED * share
         peaks.append(SpectralPeak(float(frequency[at]), float(np.sqrt(2.0 * here / count)), share, z, moved))
-    return tuple(bands), tuple(peaks)
+    return tuple(peaks)
 
 
 def _around(power: np.ndarray, at: int) -> float:

@@ -61,11 +61,13 @@ class _Search(NamedTuple):
         model: with its own numbers and theirs free.
         effects: name -> place of its number among these.
         none: theta of the model as given: effects at next to nothing.
+        expected: names of effects that surely act.
     """
 
     model: UnseenLoad
     effects: dict[str, int]
     none: np.ndarray
+    expected: Collection[str] = ()
 
     @property
     def own(self) -> Sequence[FreeParameter]:
@@ -88,7 +90,7 @@ class _Search(NamedTuple):
         """Fit without some effects, from a point with them."""
         model, theta = self.without(names), point.theta.copy()
         theta[model.held] = self.none[model.held]
-        return model.finished(model.evaluate(point._replace(theta=theta)))
+        return model.finish(model.evaluate(point._replace(theta=theta)))
 
 
 def sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str]:
@@ -131,7 +133,7 @@ def _set_up(task: DiagnosisTask) -> _Search:
     effects = {name: len(own) + i for i, name in enumerate(names)}
     # what the model as given has: its own numbers, and next to none of the effects
     none = np.array([0.0 if i < len(own) else np.log(_SMALL) for i in range(len(free))])
-    return _Search(UnseenLoad(model, free, width, segments, rest), effects, none)
+    return _Search(UnseenLoad(model, free, width, segments, rest), effects, none, config.uncertainty.expected)
 
 
 def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
@@ -189,7 +191,7 @@ def _needed(search: _Search, point: Point, out: list[str], history: list[Step]) 
         tried = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
         worth = search.without(out).spread(point).inflation
         gains = {name: _gain(search, name, one, point, worth) for name, one in tried.items()}
-        least = min(gains, key=lambda name: gains[name], default=None)
+        least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
         needless = least is not None and not gains[least] >= SHOWN
         for name, gain in gains.items():
             why = f"{0.5 * SHOWN:g} nats are asked"
@@ -211,9 +213,9 @@ def _gain(search: _Search, name: str, without: Point, point: Point, inflation: n
 
 
 def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]:
-    """The fit as of :meth:`UnseenLoad.settled`, without frictions whose size the log leaves open; these join `out`."""
+    """The fit as of :meth:`UnseenLoad.settle`, without frictions whose size the log leaves open; these join `out`."""
     while True:
-        point, width = search.without(out).settled(point)
+        point, width = search.without(out).settle(point)
         deviation = {name: float(width.covariance[i, i]) ** 0.5 for name, i in search.effects.items()}
         open_ = [name for name in search.frictions(out) if not deviation[name] < UNSEEN]
         if not open_:

@@ -1,14 +1,19 @@
 """The proof: what a model leaves on data that neither its numbers nor its choice have seen.
 
 What is held out is opened here, once, after the model stands. It changes words and verdict, never the model. Of it nothing
-is fitted but the state in which each window begins, from the window's first fifth, which is not scored.
+is fitted but the state in which each window begins, from the window's first fifth, which is not scored; and of another log
+the zeros of its encoders, where the model has those of its own, from the log's first fifth, which is not scored either.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.drive.effects import EFFECTS
+from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
+from jaxbl.identification.logs import FIRST_FIFTH
 from jaxbl.identification.segments import segments_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
@@ -16,30 +21,30 @@ from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .blocks import standard_errors_better
+from .candidates import ZERO_SPREAD
 from .choice import Chosen
 from .diagnosis_task import input_rms
 from .expected_errors import Expected, expected_errors, list_failed
+from .fitted_model import FittedModel
 from .neutral_effects import without
 from .reference_log import PREDICTABLE, Comparison, Errors, ReferenceLog
+from .refit import ModelFits, owner_of
 from .setup import Setup, quiet
 from .thresholds import LIMITS
 
 
 class Control(NamedTuple):
-    """What must not do as well on the proof as the model with effects.
+    """The best model with another effect in place of one of them, which must not do as well on the proof.
 
     Attributes:
-        kind: `wrong`, the best model with another effect in place of one of them, or `permuted`, the torque that the effects
-            add, shuffled in time.
-        errors: rms, by channel.
-        z: standard errors by which the errors of the model with effects are smaller.
         effect: the other one.
+        errors: rms, by channel.
+        z: standard errors by which the errors of the model with the effects that were found are smaller.
     """
 
-    kind: str
+    effect: str
     errors: Errors
     z: float
-    effect: str = ""
 
 
 class Untested(NamedTuple):
@@ -58,7 +63,7 @@ class Proof(NamedTuple):
         expected: errors of a complete model, by channel.
         failed: channels in which the model leaves more, but for the weak ones.
         worse: whether the model as given predicts better, all channels together.
-        controls: of the model.
+        control: of the model, or None.
         weak: channels that test nothing, since a complete model may leave more than the motion or the driving torque.
         untested: effects without which the model would pass as well.
         gap: errors before and after, noise, and the free run, as in `diagnosis.json`.
@@ -71,7 +76,7 @@ class Proof(NamedTuple):
     expected: dict[str, Expected]
     failed: list[str]
     worse: bool
-    controls: list[Control]
+    control: Control | None
     weak: list[str]
     untested: dict[str, Untested]
     gap: JsonObject
@@ -89,10 +94,34 @@ def open_held_out(setup: Setup) -> tuple[Record, ReferenceLog]:
     return record, ReferenceLog(segments, setup.fitted.bandwidth, rest and setup.task.separate)
 
 
+def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog]:
+    """Give a model the zeros that another log counts from, by the first fifth of its segments; and the rest of that log."""
+    cuts = [(segment, round(FIRST_FIFTH * len(segment))) for segment in log.segments]
+    first, rest = (replace(log, segments=part) for part in zip(*((s[:cut], s[cut:]) for s, cut in cuts), strict=True))
+    kinds = [EFFECTS.get(owner_of(number)[0]) for number in chosen.fitted.free]
+    zeros = [i for i, kind in enumerate(kinds) if kind is not None and kind.in_log]
+    for i in zeros:
+        chosen = chosen._replace(fitted=_fit_zero(chosen.fitted, i, first))
+    return (chosen, replace(rest, rest=False)) if zeros else (chosen, log)
+
+
+def _fit_zero(fitted: FittedModel, i: int, log: ReferenceLog) -> FittedModel:
+    """Fit the twist at which two encoders show no torque, the i-th number of a model, to a log."""
+    number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
+    free = make_free_parameters(fitted.experiment, [number.path], 1.0)
+    spread = np.array([ZERO_SPREAD / free[0].scale])
+    found = ModelFits(fitted.experiment, free, spread, log.segments).fit({}, np.zeros(1))
+    theta[i] = number.theta(free[0].value(found.theta[0]))
+    white[i, i] = found.covariance[0, 0] * (free[0].scale / number.scale) ** 2
+    return fitted._replace(theta=theta, white=white, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
+
+
 def prove(setup: Setup, chosen: Chosen) -> Proof:
     """Open what was held out, and compare the model that stands with it."""
-    fitted, nominal = chosen.fitted, setup.nominal
     record, log = open_held_out(setup)
+    if setup.task.separate:
+        chosen, log = _take_zeros(chosen, log)
+    fitted, nominal = chosen.fitted, setup.nominal
     before, after = log.compare(nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
     sizes = _sizes(log, fitted.experiment, input_rms(record))
@@ -103,7 +132,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.seen,
-        _controls(setup, chosen, log, before, after),
+        _control(chosen, log, after),
         weak,
         _find_untested(setup, chosen, log, expected),
         _describe_gap(setup, chosen, record, log, before, after),
@@ -146,35 +175,25 @@ def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> 
     )
 
 
-def _controls(setup: Setup, chosen: Chosen, log: ReferenceLog, before: Comparison, after: Comparison) -> list[Control]:
-    if not chosen.fitted.names:
-        return []
-    found = []
-    if chosen.rival is not None:
-        other = log.compare(chosen.rival.fitted.experiment)
-        found.append(Control("wrong", other.errors, standard_errors_better(log, other, after), chosen.rival.effect))
-    added = {
-        side: [first.torque - left.torque for first, left in zip(pieces, after.torques[side], strict=True)]
-        for side, pieces in before.torques.items()
-    }
-    shuffled = log.permuted(setup.nominal, added)
-    if shuffled is not None:
-        found.append(Control("permuted", shuffled.errors, standard_errors_better(log, shuffled, after)))
-    return found
+def _control(chosen: Chosen, log: ReferenceLog, after: Comparison) -> Control | None:
+    if chosen.rival is None:
+        return None
+    other = log.compare(chosen.rival.fitted.experiment)
+    return Control(chosen.rival.effect, other.errors, standard_errors_better(log, other, after))
 
 
 def _describe_gap(
     setup: Setup, chosen: Chosen, record: Record, log: ReferenceLog, before: Comparison, after: Comparison
 ) -> JsonObject:
     """Errors before and after, and the noise."""
-    part, noise = record.segments, log.noise_of(after)
+    noise = log.noise_of(after)
     reach, there = _reach(setup.fitted), _reach(log)
     found: JsonObject = {
         "holdout": {
             "file": str(record.path.resolve()),
             "separate": setup.task.separate,
-            "from": float(record.time[part[0].start]),
-            "to": float(record.time[part[-1].stop - 1]),
+            "from": float(record.time[log.segments[0].rows.start]),
+            "to": float(record.time[log.segments[-1].rows.stop - 1]),
             "window": log.samples * log.period,
             "bandwidth": dict(log.bandwidth),
         },

@@ -31,10 +31,6 @@ WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
 _LEAST_IN_WINDOW = 20
 """Samples of a window at least: ten times the states that are fitted to it."""
-_SHUFFLED = 0.5
-"""Length of the blocks that a permuted residual is made of, s: longer than a torque's own changes last."""
-_STEADY = 0.3
-"""Change by the shuffling, over the torque, up to which it is no control: of unrelated torques it is 1.4."""
 PREDICTABLE = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
 _SLOW = (2.0, 4.0, 8.0)
@@ -154,9 +150,9 @@ class ReferenceLog:
         """
         force = max(float(np.max(np.abs(one.torque))) for one in self.segments) * float(experiment.plant.input_gain)
         free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
-        experiment, added = with_torques(experiment)
+        experiment, _ = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.rest)[0])
-        simulated, found = _run(experiment, windows, windows.start, added).position, {}
+        simulated, found = _run(experiment, windows, windows.start).position, {}
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(
@@ -165,33 +161,27 @@ class ReferenceLog:
             found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
 
-    def compare(self, whole: Experiment, added: NamedArrays | None = None, models: Sequence[Experiment] = ()) -> Comparison:
+    def compare(self, whole: Experiment, models: Sequence[Experiment] = ()) -> Comparison:
         """Errors of a model at this log's period on short windows, and the torques that it lacks.
 
         Args:
             whole: the model.
-            added: torques on its sides besides, N m, sample by sample from the first to the last.
             models: one for each part of the log, such as ones whose numbers were fitted without it, whose errors there are
                 taken in place of the model's.
         """
-        torques, parts, noises = self._lacking(whole, added or {}), [], []
+        torques, parts, noises = self._lacking(whole), [], []
         for i, model in enumerate(models or [whole]):
             part = i, len(models) or 1
-            samples, noise = self._samples(model, self.samples, _STATES, added or {}, part)
-            narrowed = self._narrowed(self._lacking(model, {}) if models else torques)
+            samples, noise = self._samples(model, self.samples, _STATES, part)
+            narrowed = self._narrowed(self._lacking(model) if models else torques)
             parts.append(samples | {name: np.array_split(torque, part[1])[i] for name, torque in narrowed.items()})
             noises.append(noise)
         samples = {name: np.concatenate([errors[name] for errors in parts]) for name in parts[0]}
         noise = {name: rms(np.array([added_noise[name] for added_noise in noises])) for name in noises[0]}
         return Comparison(_all_rms(samples), torques, samples, float(whole.plant.input_gain), noise)
 
-    def _lacking(self, experiment: Experiment, added: NamedArrays) -> SideResiduals:
-        """Torques that a model lacks, those that are added left out."""
-        torques = residual_torques(at_period(experiment, self.period), self.segments)
-        for side, table in added.items():
-            pieces = zip(torques[side], self._rows(), strict=True)
-            torques[side] = [replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
-        return torques
+    def _lacking(self, experiment: Experiment) -> SideResiduals:
+        return residual_torques(at_period(experiment, self.period), self.segments)
 
     def readings(self) -> NamedArrays:
         """Positions as they were read, rad, by channel."""
@@ -210,7 +200,7 @@ class ReferenceLog:
         experiment = at_period(experiment, self.period)
         if experiment.plant.has_memory or any(one.transmitted is not None for one in self.segments):
             return {}
-        run, firsts = self._runs(experiment, self.samples, _STATES, {})
+        run, firsts = self._runs(experiment, self.samples, _STATES)
         pieces = []
         for i, first in enumerate(firsts):
             whole = next(one for one in self.segments if one.rows.start <= first < one.rows.stop)
@@ -231,7 +221,7 @@ class ReferenceLog:
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
-        torques = self._lacking(experiment, {})
+        torques = self._lacking(experiment)
         return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
 
     def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +230,7 @@ class ReferenceLog:
         effects = [effect for effect in experiment.effects if effect.place == side]
         dry = not any(type(effect).exclusive for effect in effects)
         steady = not any(isinstance(effect, ConstantTorque) for effect in effects)
-        pieces, columns = self._lacking(experiment, {})[side], []
+        pieces, columns = self._lacking(experiment)[side], []
         for segment, piece in zip(self.segments, pieces, strict=True):
             smoothed = segment.smoothed[side]
             moving = ~np.asarray(smoothed.held(self.period))
@@ -248,10 +238,6 @@ class ReferenceLog:
             columns.append(low_passed(as_smoothed(signals, smoothed, self.period), piece, self.bandwidth[side]))
         friction = np.concatenate(columns, axis=1)
         return friction[:2], np.rint(friction[2]) > 0
-
-    def _rows(self) -> list[np.ndarray]:
-        """Sampling periods from the log's first sample to each sample, segment by segment."""
-        return [np.round((one.time - self.segments[0].time[0]) / self.period).astype(int) for one in self.segments]
 
     def free_run(self, experiment: Experiment) -> tuple[Errors, float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
@@ -263,17 +249,15 @@ class ReferenceLog:
         spare = max(longest.bit_length() - 4, 0)
         length = longest >> spare << spare
         one = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
-        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN, {})[0])
+        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN)[0])
         smoothed = one.segments[0].smoothed
         deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
         return errors, one._growth(experiment, length, deviation)
 
-    def _samples(
-        self, experiment: Experiment, length: int, passes: int, added: NamedArrays, part: _Part = (0, 1)
-    ) -> tuple[NamedArrays, Errors]:
-        """Errors of positions and speeds on windows of a length, under torques added sample by sample, where windows are
-        foretold; shape (windows, samples). And what noise adds by way of the initial states, as of a comparison."""
-        run, firsts = self._runs(experiment, length, passes, added, part)
+    def _samples(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[NamedArrays, Errors]:
+        """Errors of positions and speeds on windows of a length, where windows are foretold; shape (windows, samples). And
+        what noise adds by way of the initial states, as of a comparison."""
+        run, firsts = self._runs(experiment, length, passes, part)
         rows = firsts[:, None] + np.arange(length)[None, :]
         found = {
             POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
@@ -286,65 +270,31 @@ class ReferenceLog:
         noise = {POSITION_CHANNELS[side]: float(run.noise[i]) for i, side in enumerate(experiment.sides)}
         return {name: errors[:, count_seen(length) :] for name, errors in found.items()}, noise
 
-    def _runs(
-        self, experiment: Experiment, length: int, passes: int, added: NamedArrays, part: _Part = (0, 1)
-    ) -> tuple[Run, np.ndarray]:
+    def _runs(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[Run, np.ndarray]:
         """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
-        experiment, paths = with_torques(at_period(experiment, self.period))
+        # the loop of steps is that of linearisations, which have these torques
+        experiment, _ = with_torques(at_period(experiment, self.period))
         windows, firsts = windows_of(self.segments, experiment, length, self.rest)
-        varying = {path: self._along(windows, added.get(side)) for side, path in paths.items()}
         which = np.array_split(np.arange(len(firsts)), part[1])[part[0]]
-        return best_runs(experiment, windows, passes, self.rest, varying, which), firsts[which]
-
-    def _along(self, windows: Windows, table: np.ndarray | None) -> np.ndarray:
-        """A torque that is added, as one that resists, on windows; N m, shape (windows, samples)."""
-        if table is None:
-            return np.zeros(windows.torque.shape)
-        first = np.round((np.asarray(windows.time) - self.segments[0].time[0]) / self.period).astype(int)
-        return -table[first[:, None] + np.arange(windows.torque.shape[1])]
+        return best_runs(experiment, windows, passes, self.rest, which), firsts[which]
 
     def _growth(self, experiment: Experiment, length: int, deviation: Mapping[str, float]) -> float:
         """Change of the positions by a standard deviation of the initial speeds, over the motion; the largest."""
-        experiment, added = with_torques(experiment)
+        experiment, _ = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, length, self.rest)[0])
         start, step = windows.start, 1e-3
         moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
         begun = start, PlantState(start.position, moved, start.effects)
-        one, other = (_run(experiment, windows, state, added).position for state in begun)
+        one, other = (_run(experiment, windows, state).position for state in begun)
         # of what diverges, or of a side that never moved, nothing can be predicted
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             change = {side: _rms([np.asarray(other[side][0] - one[side][0])]) / step for side in experiment.sides}
             return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
 
-    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]]) -> Comparison | None:
-        """Errors of the nominal model with what the extended one adds on each side, N m, segment by segment, in the wrong
-        order: blocks of time, shuffled. None where that makes no difference, as with a constant."""
-        at = np.concatenate(self._rows())
-        order = _order(len(at), max(round(_SHUFFLED / self.period), 1), np.random.default_rng(0))
-        tables, changed = {side: np.zeros(at[-1] + 1) for side in experiment.sides}, False
-        for side, table in tables.items():
-            torque = np.concatenate(list(added[side]))
-            table[at] = torque[order]
-            changed |= _rms([torque[order] - torque]) > _STEADY * _rms([torque])
-        return self.compare(experiment, tables) if changed else None
 
-
-def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
-    """Indices in which blocks have changed places: none stays."""
-    blocks = np.array_split(np.arange(count), max(count // size, 2))
-    places = random.permutation(len(blocks))
-    source = np.empty(len(blocks), int)
-    # a cycle through all of them
-    source[places] = np.roll(places, 1)
-    return np.concatenate([blocks[i] for i in source])[:count]
-
-
-def _run(experiment: Experiment, windows: Windows, start: PlantState, added: Mapping[str, str]) -> PlantState:
-    """States along each window, of a model with torques that may be added (`added`: their paths)."""
-    # none are: the same loop serves
-    none = {path: np.zeros(windows.torque.shape) for path in added.values()}
-    experiment, start = lean(experiment, start)
-    return simulate_plants(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
+def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
+    """States along each window."""
+    return simulate_plants(*lean(experiment, start), np.asarray(windows.torque), np.asarray(windows.time))
 
 
 def _all_rms(samples: NamedArrays) -> Errors:

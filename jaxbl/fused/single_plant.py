@@ -64,7 +64,6 @@ def simulate_plants(
     time: np.ndarray,
     measured: NamedArrays | None = None,
     gain: NamedArrays | None = None,
-    varying: NamedArrays | None = None,
 ) -> PlantState:
     """Simulate several runs of a plant.
 
@@ -75,20 +74,19 @@ def simulate_plants(
         time: of the first samples (s), `(runs,)`.
         measured: readings of each side (rad), `(runs, samples)`.
         gain: by which readings correct the state, as for :func:`jaxbl.simulate.plant_trajectory`.
-        varying: numbers of the experiment that differ from sample to sample, by path, `(runs, samples)`.
 
     Returns:
         States at the samples, leaves `(runs, samples)`.
     """
-    structure, varying = _PlantStructure.of(experiment, starts), varying or {}
+    structure = _PlantStructure.of(experiment, starts)
     sides = () if gain is None else tuple(sorted(gain))
-    loop = _trajectory_loop(structure, sides, _leaf_indices(structure, tuple(varying)))
+    loop = _trajectory_loop(structure, sides)
     if loop is None:
-        arguments = starts, torque, time, dict(measured or {}), dict(varying)
+        arguments = starts, torque, time, dict(measured or {})
         runs = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), arguments) for i in range(len(torque))]
         states = [_simulate_by_xla(experiment, gain, *run) for run in runs]  # pyright: ignore[reportCallIssue]
         return jax.tree.map(lambda *x: np.stack(x), *states)
-    columns = [torque, *((measured or {})[side] for side in sides), *varying.values()]
+    columns = [torque, *((measured or {})[side] for side in sides)]
     gains = [(gain or {})[side] for side in sides]
     return _run_loop(loop, structure.read_numbers(experiment), starts, columns, time, gains)
 
@@ -136,7 +134,7 @@ class PlantSimulator:
     def __init__(self, experiment: Experiment, state: PlantState, varied: Sequence[str], sides: Sequence[str]):
         self.experiment, self.varied, self.sides = experiment, tuple(varied), tuple(sorted(sides))
         structure = _PlantStructure.of(experiment, state)
-        self.loop = _trajectory_loop(structure, self.sides, ())
+        self.loop = _trajectory_loop(structure, self.sides)
         if self.loop is not None:
             self.numbers, read = np.array(structure.read_numbers(experiment), float), _read_indices(structure)
             self.places = [read.index(i) if i in read else -1 for i in _leaf_indices(structure, self.varied)]
@@ -168,7 +166,6 @@ def step_derivatives(
     torque: np.ndarray,
     time: np.ndarray,
     directions: Sequence[Direction],
-    varying: NamedArrays | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the step that follows each sample, and the state after it.
 
@@ -176,18 +173,16 @@ def step_derivatives(
         experiment: with array leaves.
         states: at the samples, leaves `(samples,)`; likewise torque (N m) and time (s).
         directions: of change.
-        varying: numbers of the experiment that differ from sample to sample, by path, `(samples,)`.
 
     Returns:
         Change of the state along each direction `(directions, states, samples)`, in the order of the state's leaves, and the
         state after the step `(states, samples)`.
     """
-    structure, varying = _PlantStructure.of(experiment, states), varying or {}
-    leaves = jax.tree.leaves(states)
-    loop = _derivatives_loop(structure, _leaf_indices(structure, tuple(varying)))
+    structure, leaves = _PlantStructure.of(experiment, states), jax.tree.leaves(states)
+    loop = _derivatives_loop(structure)
     if loop is None:
         # numbers as arrays: one program for all directions
-        zeros, arguments = jax.tree.map(np.zeros_like, experiment), (states, torque, time, dict(varying))
+        zeros, arguments = jax.tree.map(np.zeros_like, experiment), (states, torque, time)
         derivatives = []
         for direction in directions:
             change = np.array(direction.state, float) if direction.state else np.zeros(len(leaves))
@@ -202,10 +197,7 @@ def step_derivatives(
 
     count = len(torque)
     width = -(-count // loop.lanes) * loop.lanes
-    values = [
-        np.pad(np.asarray(column, float), (0, width - count), "edge")
-        for column in (*leaves, torque, time, *varying.values())
-    ]
+    values = [np.pad(np.asarray(column, float), (0, width - count), "edge") for column in (*leaves, torque, time)]
     numbers, tangents = structure.read_numbers(experiment), structure.stack_tangents(directions)
     changes, new = np.empty((len(directions), len(leaves), width)), np.empty((len(leaves), width))
 
@@ -225,16 +217,14 @@ def _simulate_by_xla(
     torque: jax.Array,
     time: jax.Array,
     measured: TracedArrays,
-    varying: TracedArrays,
 ) -> PlantState:
     def sample(state: PlantState, sample_inputs: Any) -> tuple[PlantState, PlantState]:
-        index, torque, readings, numbers = sample_inputs
-        sample_time, varied = time + index * experiment.run.sample_period, set_leaves(experiment, numbers)
-        return move_plant(
-            varied.plant, varied.run, correct_by_readings(state, readings, gain or {}), torque, sample_time
-        ), state
+        index, torque, readings = sample_inputs
+        sample_time = time + index * experiment.run.sample_period
+        corrected = correct_by_readings(state, readings, gain or {})
+        return move_plant(experiment.plant, experiment.run, corrected, torque, sample_time), state
 
-    samples = jnp.arange(len(torque)).astype(float), torque, measured, varying
+    samples = jnp.arange(len(torque)).astype(float), torque, measured
     return jax.lax.scan(sample, jax.tree.map(lambda x: jnp.asarray(x, float), start), samples)[1]
 
 
@@ -244,19 +234,18 @@ def _derivatives_by_xla(
     states: PlantState,
     torque: jax.Array,
     time: jax.Array,
-    varying: TracedArrays,
     tangent: tuple[Experiment, PlantState, jax.Array],
 ) -> tuple[PlantState, PlantState]:
-    def differentiate(state: PlantState, torque: jax.Array, time: jax.Array, numbers: Any) -> tuple[PlantState, PlantState]:
+    def differentiate(state: PlantState, torque: jax.Array, time: jax.Array) -> tuple[PlantState, PlantState]:
         def step(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
             return move_plant(experiment.plant, experiment.run, state, torque, time)
 
-        primals = set_leaves(experiment, numbers), state, torque
+        primals = experiment, state, torque
         tangents = jax.tree.map(lambda x, change: jnp.broadcast_to(change, x.shape).astype(x.dtype), primals, tangent)
         new, change = jax.jvp(step, primals, tangents)
         return change, new
 
-    return jax.vmap(differentiate)(states, torque, time, varying)
+    return jax.vmap(differentiate)(states, torque, time)
 
 
 class _PlantStructure(NamedTuple):
@@ -304,12 +293,12 @@ class _PlantStructure(NamedTuple):
             row[-1] = direction.torque
         return tangents
 
-    def build_experiment(self, numbers: Sequence[Any], replacements: Mapping[int, Any]) -> Experiment:
-        """The experiment from the numbers that a step reads, with replacements by leaf index; all other leaves are zero."""
+    def build_experiment(self, numbers: Sequence[Any]) -> Experiment:
+        """The experiment from the numbers that a step reads; all other leaves are zero."""
         # of NumPy, so that they leave no trace
         leaves: Leaves = [np.zeros(shape, dtype) for shape, dtype in self.leaf_types]
         for i, number in zip(_read_indices(self), numbers, strict=True):
-            leaves[i] = replacements.get(i, number)
+            leaves[i] = number
         return self.experiment_tree.unflatten(leaves)
 
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> Leaves:
@@ -353,12 +342,12 @@ def _find_read_indices(structure: _PlantStructure) -> tuple[int, ...]:
 
 
 @program_cache.compile_once
-def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
-    """The loop from state, numbers, first time and gains, and a sample's index, torque, readings and varying numbers."""
+def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) -> Any:
+    """The loop from state, numbers, first time and gains, and a sample's index, torque and readings."""
 
     def sample(state: Leaves, numbers: Leaves, start: Any, gains: Leaves, index: Any, inputs: Leaves) -> Any:
-        torque, *readings = inputs[: 1 + len(sides)]
-        experiment = structure.build_experiment(numbers, dict(zip(varying, inputs[1 + len(sides) :], strict=True)))
+        torque, *readings = inputs
+        experiment = structure.build_experiment(numbers)
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
         plant_state = correct_by_readings(
             structure.state_tree.unflatten(state), dict(zip(sides, readings, strict=True)), gain
@@ -368,29 +357,25 @@ def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = (), va
 
     count = structure.state_tree.num_leaves
     constants = [_NUMBER] * len(_read_indices(structure)), _NUMBER, [_NUMBER] * (2 * len(sides))
-    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides) + len(varying))
+    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
     examples = [_NUMBER] * count, *constants, index, inputs
     return sample, examples, {"carry": count, "lanes": 1, "constants": len(jax.tree.leaves(constants))}
 
 
 @program_cache.compile_once
-def _derivatives_loop(structure: _PlantStructure, varying: tuple[int, ...] = ()) -> Any:
-    """The loop from a lane's state, torque, time and varying numbers, from numbers, and from a tangent of numbers, state and
-    torque."""
+def _derivatives_loop(structure: _PlantStructure) -> Any:
+    """The loop from a lane's state, torque and time, from numbers, and from a tangent of numbers, state and torque."""
 
     def differentiate(
-        state: Leaves, torque: Any, time: Any, varied: Leaves, numbers: Leaves, tangent: tuple[Any, ...]
+        state: Leaves, torque: Any, time: Any, numbers: Leaves, tangent: tuple[Any, ...]
     ) -> tuple[Leaves, Leaves]:
         def step(numbers: Leaves, state: Leaves, torque: Any) -> Leaves:
-            return structure.step(structure.build_experiment(numbers, {}), state, torque, time)
+            return structure.step(structure.build_experiment(numbers), state, torque, time)
 
-        replacements = dict(zip(varying, varied, strict=True))
-        numbers = [replacements.get(i, number) for i, number in zip(_read_indices(structure), numbers, strict=True)]
         new, change = jax.jvp(step, (numbers, state, torque), tangent)
         return change, new
 
     count = structure.state_tree.num_leaves
     state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read_indices(structure))
-    varied = [_NUMBER] * len(varying)
-    examples = state, _NUMBER, _NUMBER, varied, numbers, (numbers, state, _NUMBER)
-    return differentiate, examples, {"values": count + 2 + len(varying), "constants": 2 * len(numbers) + count + 1}
+    examples = state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER)
+    return differentiate, examples, {"values": count + 2, "constants": 2 * len(numbers) + count + 1}

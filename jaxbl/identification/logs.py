@@ -183,15 +183,15 @@ def read_with_holdout(
     return record, other
 
 
-_FIRST_FIFTH = 0.2
+FIRST_FIFTH = 0.2
 """Share of a log that is held out by which its clocks and zero points are found."""
 
 
 def _read_held_out(config: Config, holdout: Logs, record: Record, seeks_delay: bool) -> Record:
     """Logs that are held out from another record, without the part that their clocks and zero points are found by."""
-    other, parts = read_logs(config, holdout, record, seeks_delay=seeks_delay, share=_FIRST_FIFTH), []
+    other, parts = read_logs(config, holdout, record, seeks_delay=seeks_delay, share=FIRST_FIFTH), []
     for _, rows in other.logs:
-        first = rows.start + round(_FIRST_FIFTH * (rows.stop - rows.start))
+        first = rows.start + round(FIRST_FIFTH * (rows.stop - rows.start))
         parts += [slice(max(part.start, first), part.stop) for part in other.segments if first < part.stop <= rows.stop]
     found = any(value and value != record.corrections.get(key) for key, value in other.corrections.items())
     return replace(other, segments=tuple(parts)) if found else other

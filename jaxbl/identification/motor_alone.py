@@ -76,14 +76,14 @@ def search_alone(
     absent: list[int] = []
     gap, why = None, ""
     if model.gap is None:
-        point, width = model.settled(model.fit())
+        point, width = model.settle(model.fit())
     else:
         gap = GapSearch(model).run()
         point, width = gap.best, gap.spread
         why = why_not(gap, model, settings.spread, record)
         absent = [model.gap] if why else []
         if not gap.needed:
-            point, width = dataclasses.replace(model, held=absent).settled(gap.without)
+            point, width = dataclasses.replace(model, held=absent).settle(gap.without)
     if not np.isfinite(point.deviance):
         raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
     alone = alone_of(model, point, width, absent, gap, why)

@@ -58,17 +58,18 @@ class Segment:
     def __len__(self) -> int:
         return len(self.time)
 
-    def first(self, samples: int) -> "Segment":
-        """Its beginning."""
-        n = min(samples, len(self))
+    def __getitem__(self, part: slice) -> "Segment":
+        """Some of its samples, in a row."""
+        first = part.start or 0
         smoothed = {
-            side: one._replace(state=one.state[:n], covariance=one.covariance[:n], innovations=one.innovations[:n])
+            side: one._replace(state=one.state[part], covariance=one.covariance[part], innovations=one.innovations[part])
             for side, one in self.smoothed.items()
         }
-        readings = {side: one[:n] for side, one in self.readings.items()}
-        transmitted = None if self.transmitted is None else self.transmitted[:n]
-        rows = slice(self.rows.start, self.rows.start + n)
-        return Segment(rows, self.time[:n], self.period, self.torque[:n], readings, smoothed, transmitted, self.before)
+        readings = {side: one[part] for side, one in self.readings.items()}
+        transmitted = None if self.transmitted is None else self.transmitted[part]
+        time, begin = self.time[part], self.rows.start + first
+        rows, before = slice(begin, begin + len(time)), self.torque[:first][-DELAY_SAMPLES:] if first else self.before
+        return Segment(rows, time, self.period, self.torque[part], readings, smoothed, transmitted, before)
 
     @cached_property
     def torques(self) -> dict[Any, Any]:

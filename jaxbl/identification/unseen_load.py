@@ -366,33 +366,33 @@ class UnseenLoad:
         """Go on from the numbers of a point, of another model or with another predictor; as :meth:`solve`."""
         return self.solve(self.evaluate(point._replace(smoothness=smoothness or point.smoothness)), steps)
 
-    def finished(self, point: Point) -> Point:
+    def finish(self, point: Point) -> Point:
         """Fit with the predictor that suits it best: the one whose errors are least is chosen, fitted, and so on."""
         for _ in range(_CHOICES):
             before = point.smoothness
-            predictors = [self.evaluate(point._replace(smoothness=float(one))) for one in _SMOOTHNESS]
+            predictors = [self.evaluate(point._replace(smoothness=float(tried))) for tried in _SMOOTHNESS]
             point = self.solve(_likeliest([point, *predictors]), _MORE)
             if point.smoothness == before:
                 break
         return point
 
-    def followed(self, point: Point) -> Point:
-        """From a predictor that follows the readings closely to the one that suits the model."""
-        return self.finished(self.resume(point, _MORE, _FOLLOWING[-1]))
+    def follow(self, point: Point) -> Point:
+        """Go from a predictor that follows the readings closely to the one that suits the model."""
+        return self.finish(self.resume(point, _MORE, _FOLLOWING[-1]))
 
     def fit(self) -> Point:
         """Fit without a gap to be found, from the nominal numbers."""
         coarse = self.coarse()
-        ends = [coarse.followed(coarse.begun(theta, _FOLLOWING[0])) for theta in self.beginnings()]
-        return self.finished(_likeliest(ends))
+        ends = [coarse.follow(coarse.begun(theta, _FOLLOWING[0])) for theta in self.beginnings()]
+        return self.finish(_likeliest(ends))
 
     def unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
         inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
         return inertia * float(np.sqrt(point.smoothness)) * self.noise / self.period**2
 
-    def settled(self, point: Point) -> tuple[Point, Spread]:
-        """The best of a point and of fits beside it, and the covariance there.
+    def settle(self, point: Point) -> tuple[Point, Spread]:
+        """Find the best of a point and of fits beside it, and the covariance there.
 
         Impacts make the likelihood rough over less than its standard errors, and plant steps are finite: what predictors
         with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error; so does
@@ -489,7 +489,7 @@ class Gap(NamedTuple):
         return self.gain >= SHOWN
 
     def of(self, point: Point, spread: Spread) -> "Gap":
-        """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settled`."""
+        """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settle`."""
         return self._replace(best=point, spread=spread) if self.needed else self._replace(without=point)
 
 
@@ -546,7 +546,7 @@ class GapSearch:
         self.model_held, self.coarse_held, self.near_held = (
             replace(each, held=[self.place]) for each in (model, self.coarse, self.near)
         )
-        self.part = replace(self.near_held, segments=[max(model.segments, key=len).first(_PART)])
+        self.part = replace(self.near_held, segments=[max(model.segments, key=len)[:_PART]])
         self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
 
     def _with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
@@ -559,7 +559,7 @@ class GapSearch:
         announce("trying half gaps")
         starts = self._starts()
         announce("fitting the gap")
-        best, spread = self.model.settled(self._best(starts))
+        best, spread = self.model.settle(self._best(starts))
         announce("fitting without a gap")
         without = self._without(best)
         worth = float(spread.inflation[self.place]) ** 2
@@ -594,8 +594,8 @@ class GapSearch:
             points = [self.near.solve(self.near.begun(theta, smoothness), _MORE) for theta in found]
             points.sort(key=lambda point: point.variance)
             found = [point.theta for point in points[:kept] if point.variance < _HOPELESS * points[0].variance]
-        ends = [self.coarse.followed(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
-        return self.model.finished(_likeliest(ends))
+        ends = [self.coarse.follow(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
+        return self.model.finish(_likeliest(ends))
 
     def _without(self, best: Point) -> Point:
         """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
@@ -604,14 +604,14 @@ class GapSearch:
         for theta in (self._begun(none).theta, self._with_gap(none, best.theta)):
             point = self.near_held.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW)
             found.append(self.coarse_held.resume(point, _MORE, _FOLLOWING[1]))
-        return self.model_held.finished(self.coarse_held.followed(_likeliest(found)))
+        return self.model_held.finish(self.coarse_held.follow(_likeliest(found)))
 
     def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
         """Whether the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
         point = self.near_held.resume(middle, _FEW, _FOLLOWING[0])
-        point = self.model_held.finished(self.coarse_held.followed(point))
+        point = self.model_held.finish(self.coarse_held.follow(point))
         if not (point.deviance - without.deviance) / worth <= LIMIT:
             return False
         plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
@@ -636,18 +636,13 @@ class GapSearch:
         return self.travel
 
     def _reversals(self, point: Point) -> int:
-        """How often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
+        """Count how often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
         experiment = set_leaves(self.model.experiment, self.model.numbers(point.theta))
         assert experiment.transmission is not None
         return self._turns(point, experiment, 0.05 * self.model.torque / float(experiment.transmission.stiffness))
 
     def _turns(self, point: Point, experiment: Experiment, size: float) -> int:
-        """Changes of sign of the twist between values of at least some size, rad: of flanks, where it is the half gap."""
+        """Count changes of sign of the twist between values of at least some size, rad: of flanks, if it is the half gap."""
         ratio = float(experiment.drive.ratio("load"))
-        states = self.model.states(point)
-        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), size) for one in states)
-
-
-def _changes(values: np.ndarray, size: float) -> int:
-    """Changes of sign between values of at least some size."""
-    return int(np.count_nonzero(np.diff(np.sign(values[np.abs(values) >= size]))))
+        twists = [np.asarray(state.position["motor"] - ratio * state.position["load"]) for state in self.model.states(point)]
+        return sum(int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size])))) for twist in twists)

@@ -228,7 +228,7 @@ def _reasons(summary: JsonObject) -> Lines:
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
             "other. Noise of the torque channel does it, or too small a relative."
         )
-    return [*lines, *(f"{CHECKS[name]}." for name in ("little", "chance") if test[name])]
+    return [*lines, f"{CHECKS['little']}."] if test["little"] else lines
 
 
 def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
@@ -292,7 +292,7 @@ def _remarks(summary: JsonObject) -> Lines:
             f"evidence {torque['evidence']:.3g} nats)."
         )
     after = gap["holdout_rmse_after"]
-    for name, control in gap["controls"].items():
+    if control := gap["controls"].get("wrong"):
         errors, z = control["rmse"], control["z"]
         channel = max(gap["expected"], key=lambda name: _ratio(errors[name], after[name]))
         outcome = "diverges"
@@ -301,12 +301,8 @@ def _remarks(summary: JsonObject) -> Lines:
                 f"leaves {rms_text(errors[channel])} {gap['units'][channel]} in {channel} in place of "
                 f"{rms_text(after[channel])}; it is {abs(z):.1f} standard errors {'worse' if z > 0.0 else 'better'}"
             )
-        effect = f" ({control['effect']})" if "effect" in control else ""
-        lines.append(f"Control: {_CONTROLS[name]}{effect} {outcome}.")
+        lines.append(f"Control: the best model with another effect ({control['effect']}) {outcome}.")
     return [*lines, *summary["notes"]]
-
-
-_CONTROLS = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}
 
 
 def _ratio(error: float | None, other: float | None) -> float:
@@ -368,17 +364,25 @@ def _history_table(summary: JsonObject) -> PageTable:
 
 
 def _gap_table(gap: JsonObject) -> PageTable:
-    controls, units = gap["controls"], gap["units"]
+    control, units = gap["controls"].get("wrong"), gap["units"]
     rows: list[list[Any]] = [
         [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
-        + [error.get(name) for error in (_limits(gap), *(control["rmse"] for control in controls.values()))]
+        + [error.get(name) for error in (_limits(gap), *([control["rmse"]] if control else []))]
         for name, before in gap["holdout_rmse_before"].items()
     ]
     for name, torque in gap.get("slow_torques", {}).items():
         channel, _, below = name.partition(" ")
         numbers = (torque[key] for key in ("before", "after", "noise", "limit"))
-        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers, *(None for _ in controls)])
-    head = ["channel", "unit", "before", "after", "noise", "complete model at most", *controls]
+        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers, *([None] if control else [])])
+    head = [
+        "channel",
+        "unit",
+        "before",
+        "after",
+        "noise",
+        "complete model at most",
+        *([control["effect"]] if control else []),
+    ]
     return PageTable("Held-out data, rms", head, rows)
 
 
@@ -429,7 +433,7 @@ def _tables(found: Diagnosis) -> Drawn:
 
 
 def _verdict(summary: JsonObject) -> Drawn:
-    """Each channel's error over its noise, before and after, with the controls; and the probability of each effect."""
+    """Each channel's error over its noise, before and after, with the control; and the probability of each effect."""
     gap, candidates = summary["gap"], _candidates(summary)
     height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.9, 0.42 * len(candidates) + 1.9)
     figure, (left, right) = subplots(11.0, height, columns=2, width_ratios=[2.3, 1.0])
@@ -438,8 +442,8 @@ def _verdict(summary: JsonObject) -> Drawn:
     caption = (
         f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
         "as given to the model with the missing effects. Black line: noise; bars: the most that noise, the uncertainty of "
-        "the numbers and torques too small to be named leave of a complete model. Controls, which must do worse: "
-        "another effect at its best, and the added torque shuffled in time. Right: probability of each effect, and of those "
+        "the numbers and torques too small to be named leave of a complete model. Control, which must do worse: "
+        "another effect at its best. Right: probability of each effect, and of those "
         "that this log does not rule out instead."
     )
     return Drawn("gap", figure, caption)
@@ -463,13 +467,10 @@ def _gap_panel(ax: Axes, gap: JsonObject) -> None:
     ax.axvline(1.0, color=BLACK, lw=1.6, label="noise")
     limits = over(_limits(gap))
     ax.plot(limits, rows, "|", color=BLACK, ms=16, mew=2.0, ls="none", label="a complete model at most", zorder=3)
-    markers = {"wrong": ("x", "another effect"), "permuted": ("+", "shuffled in time")}
     points = [before, after, limits]
-    for name, control in gap["controls"].items():
-        marker, label = markers[name]
-        effect = f" ({control['effect']})" if "effect" in control else ""
+    if control := gap["controls"].get("wrong"):
         points.append(over(control["rmse"]))
-        ax.plot(points[-1], rows + 0.24, marker, color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}{effect}")
+        ax.plot(points[-1], rows + 0.24, "x", color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {control['effect']}")
     values = np.concatenate(points)
     values = values[np.isfinite(values) & (values > 0.0)]
     ax.set(

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hidden_log import record_study
@@ -69,17 +68,6 @@ def test_noise_of_the_state_that_is_fitted_is_foretold(tmp_path):
     scatter = np.sqrt(np.mean(np.var(foretold, axis=0, ddof=1), axis=(0, 1)))
     np.testing.assert_allclose(scatter, np.hypot(1.0, runs[0].noise), rtol=0.1)
     assert (runs[0].noise > 0.3).all()
-
-
-def test_torques_may_be_added_sample_by_sample(log):
-    """Nothing changes where all of the input goes over the motor's added torque, without a dead time."""
-    (model, paths), record = log
-    model = set_leaves(model, {"effects.actuator.delay.delay": jnp.asarray(1e-30)})
-    windows, _ = windows_of(segments_of(record, model.sides), model, 250)
-    expected = best_runs(model, windows, 4, False)
-    idle = dataclasses.replace(windows, torque=0.0 * windows.torque)
-    actual = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
-    assert actual.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("from_rest", [False, True])
