@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import signal
 
-from jaxbl.identification.regression import Kinematics, kinematics_from
+from jaxbl.estimation.regression import Kinematics, kinematics_from
 
 
 def differentiate(time: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], cutoff: float) -> Kinematics:

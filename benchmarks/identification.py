@@ -32,13 +32,13 @@ from scipy.optimize import brentq  # noqa: E402
 
 from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
-from jaxbl.identification import identify as identify_module, log_columns  # noqa: E402
-from jaxbl.identification.free_parameters import make_free_parameters  # noqa: E402
-from jaxbl.identification.intervals import spread  # noqa: E402
-from jaxbl.identification.logs import arrays, gains_for, on_record  # noqa: E402
-from jaxbl.identification.regression import errors, regress  # noqa: E402
-from jaxbl.identification.search import ParameterSearch  # noqa: E402
-from jaxbl.identification.segments import segments_of  # noqa: E402
+from jaxbl.estimation import identify as identify_module, log_columns  # noqa: E402
+from jaxbl.estimation.free_parameters import make_free_parameters  # noqa: E402
+from jaxbl.estimation.intervals import spread  # noqa: E402
+from jaxbl.estimation.logs import arrays, gains_for, on_record  # noqa: E402
+from jaxbl.estimation.regression import errors, regress  # noqa: E402
+from jaxbl.estimation.search import ParameterSearch  # noqa: E402
+from jaxbl.estimation.segments import segments_of  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
 from jaxbl.simulate import plant_trajectory  # noqa: E402
 

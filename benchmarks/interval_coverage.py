@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from hidden.simulator import Machine, Run, Trace, simulate  # noqa: E402
 
-from jaxbl.identification.identify import identify  # noqa: E402
+from jaxbl.estimation.identify import identify  # noqa: E402
 
 KINDS = "quantised", "jitter", "noise", "impacts", "torque"
 LACKING, ZERO = "lacking", "zero"

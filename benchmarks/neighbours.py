@@ -106,7 +106,7 @@ def try_contradiction(rng: np.random.Generator, folder: Path) -> tuple[bool, str
 
 def try_wrong_units(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
     from jaxbl.config import read_model
-    from jaxbl.identification.logs import read_logs
+    from jaxbl.estimation.logs import read_logs
 
     period = 5e-3
     machine = draw_machine(rng, period)
@@ -161,7 +161,7 @@ def try_deaf(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
 
 def try_zeros(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
     from jaxbl.config import read_model
-    from jaxbl.identification.logs import read_with_holdout
+    from jaxbl.estimation.logs import read_with_holdout
 
     period = 2e-3
     waves = float(rng.choice([3, 5, 6, 7, 12, 14, 18, 24, 36]))

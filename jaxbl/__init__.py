@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from .config import Config as Config, read_config as read_config
     from .diagnosis.diagnose import Diagnosis as Diagnosis, diagnose as diagnose
     from .errors import InputError as InputError, NoResult as NoResult
+    from .estimation.element import ElementIdentification as ElementIdentification, identify_element as identify_element
+    from .estimation.identify import Identification as Identification, identify as identify
     from .exports import Export as Export, export as export
     from .gains.accuracy_laws import Law as Law, accuracy_laws as accuracy_laws
     from .gains.tune import Tuning as Tuning, tune as tune
     from .gains.verify import Verdict as Verdict, verify as verify
-    from .identification.element import ElementIdentification as ElementIdentification, identify_element as identify_element
-    from .identification.identify import Identification as Identification, identify as identify
     from .monitoring.watch import Watch as Watch, watch as watch
     from .records import (
         Inspection as Inspection,
@@ -48,8 +48,8 @@ _NAMES = {
     "gains.accuracy_laws": ("Law", "accuracy_laws"),
     "gains.tune": ("Tuning", "tune"),
     "gains.verify": ("Verdict", "verify"),
-    "identification.element": ("ElementIdentification", "identify_element"),
-    "identification.identify": ("Identification", "identify"),
+    "estimation.element": ("ElementIdentification", "identify_element"),
+    "estimation.identify": ("Identification", "identify"),
     "monitoring.watch": ("Watch", "watch"),
     "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
     "report.results": ("draw", "write_report"),

@@ -747,7 +747,7 @@ INTERRUPTED = "interrupted; nothing was written. Start again with: jaxbl identif
 
 
 def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
+    monkeypatch.setattr("jaxbl.estimation.identify.run_identification", interrupt)
     options = ["--holdout", "an axis.csv", "--profile"]
     assert call(*IDENTIFY, *options) == (
         130,

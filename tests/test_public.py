@@ -38,7 +38,7 @@ FLOORS = [
     {"observer", "records"},
     {"simulate"},
     {"config", "fused"},
-    {"sweeps", "identification"},
+    {"sweeps", "estimation"},
     {"gains", "diagnosis", "exports"},
     {"monitoring"},
     {"throughput"},
@@ -198,5 +198,5 @@ def test_every_study_is_valid_with_its_axes_and_figures(file):
 def test_public_functions_stay_functions_once_their_packages_are_imported():
     for name in dir(jaxbl):
         getattr(jaxbl, name)
-    importlib.import_module("jaxbl.identification.identify")
+    importlib.import_module("jaxbl.estimation.identify")
     assert all(callable(getattr(jaxbl, name)) for name in ("identify", "inspect", "run", "sweep", "verify", "tune"))

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
-from jaxbl.identification.compilation import jit
+from jaxbl.estimation.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
 from jaxbl.sweeps.metrics import ALL_METRICS

@@ -1,7 +1,7 @@
 """A simulated run as a segment of a log."""
 
-from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import smooth
+from jaxbl.estimation.segments import Segment
+from jaxbl.estimation.smoother import smooth
 
 
 def make_segment(trace, period=1e-3, torque=None, transmitted=None):

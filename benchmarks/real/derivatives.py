@@ -11,8 +11,8 @@ import numpy as np
 from scipy import signal
 
 from jaxbl.config import Config
-from jaxbl.identification.logs import on_record
-from jaxbl.identification.regression import Kinematics, balance
+from jaxbl.estimation.logs import on_record
+from jaxbl.estimation.regression import Kinematics, balance
 from jaxbl.records import Record
 
 sys.path.append(str(Path(__file__).parents[1]))

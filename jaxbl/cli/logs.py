@@ -115,8 +115,8 @@ def identify(
         if next_experiment is not None:
             raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], "identified", out), overwrite)
+    from jaxbl.estimation.identify import read_identification_task, run_identification
     from jaxbl.files import run_or_read
-    from jaxbl.identification.identify import read_identification_task, run_identification
     from jaxbl.report.identify import identification_lines, write_identification_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
@@ -147,8 +147,8 @@ def identify(
 def _identify_element(
     log: Path, table: "LogTable", gear_ratio: float | None, holdout: Path | None, folder: Path, overwrite: bool
 ) -> Outcome:
+    from jaxbl.estimation.element import read_element_task, run_element
     from jaxbl.files import run_or_read
-    from jaxbl.identification.element import read_element_task, run_element
     from jaxbl.report.element import element_lines, write_element_report
 
     task = read_element_task(log, table, gear_ratio, holdout=holdout)

@@ -9,7 +9,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep, command_line
 
 if TYPE_CHECKING:
-    from jaxbl.identification.logs import LogTask
+    from jaxbl.estimation.logs import LogTask
     from jaxbl.monitoring.watch import WatchTask
     from jaxbl.sweeps.sweep import StudyResult
 
@@ -76,7 +76,7 @@ def after_identification(task: "LogTask", summary: JsonObject, log_call: "LogCal
         log_call: the call.
     """
     from jaxbl.diagnosis.diagnosis_task import can_hold_out
-    from jaxbl.identification.search import is_noise
+    from jaxbl.estimation.search import is_noise
 
     steps, folder = [], log_call.folder
     if not all(map(is_noise, summary["residual"].values())):

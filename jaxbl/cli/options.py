@@ -11,7 +11,7 @@ from jaxbl.files import to_path
 from jaxbl.lines import doubts_among
 
 if TYPE_CHECKING:
-    from jaxbl.identification.logs import SealedRecord
+    from jaxbl.estimation.logs import SealedRecord
     from jaxbl.records import Record
 
 

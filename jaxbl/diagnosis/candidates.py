@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Path, Samples, SideSamples, effect_path, remembers_input
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.regression import Path, Samples, SideSamples, effect_path, remembers_input
 from jaxbl.simulate import Experiment, with_effects
 
 EffectNumbers = Mapping[str, Numbers]

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from jaxbl.identification.regression import Kinematics, transmitted
-from jaxbl.identification.segments import Segment
+from jaxbl.estimation.regression import Kinematics, transmitted
+from jaxbl.estimation.segments import Segment
 from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 

@@ -13,9 +13,9 @@ import pandas as pd
 from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
+from jaxbl.estimation.logs import Logs, arrays, gains_for
+from jaxbl.estimation.segments import at_period
 from jaxbl.files import to_jsonable
-from jaxbl.identification.logs import Logs, arrays, gains_for
-from jaxbl.identification.segments import at_period
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment

@@ -14,8 +14,8 @@ import pandas as pd
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
-from jaxbl.identification.free_parameters import FreeParameter
-from jaxbl.identification.logs import run_of
+from jaxbl.estimation.free_parameters import FreeParameter
+from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxbl.config import ConfigSource, read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import Logs, LogTask, SealedRecord, read_with_holdout
-from jaxbl.identification.segments import led_in
+from jaxbl.estimation.logs import Logs, LogTask, SealedRecord, read_with_holdout
+from jaxbl.estimation.segments import led_in
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 from jaxbl.records.plausibility import GEAR_TOLERANCE

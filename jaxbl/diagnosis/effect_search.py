@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.identification.free_parameters import FreeParameter
+from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 

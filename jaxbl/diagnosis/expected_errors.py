@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from jaxbl.identification.segments import Segment
+from jaxbl.estimation.segments import Segment
 
 from .fitted_model import FittedModel
 from .input_noise import smoothed_input

@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves, units_of
+from jaxbl.estimation.free_parameters import FreeParameter
+from jaxbl.estimation.logs import arrays
 from jaxbl.fused import Arrays
-from jaxbl.identification.free_parameters import FreeParameter
-from jaxbl.identification.logs import arrays
 from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear

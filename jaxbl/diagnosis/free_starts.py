@@ -1,6 +1,6 @@
 """Runs of a model over windows of a log, each from the initial state that suits its readings best.
 
-As :func:`jaxbl.identification.trajectory.projected_residual`, for a model without derivatives by its numbers: paths and the
+As :func:`jaxbl.estimation.trajectory.projected_residual`, for a model without derivatives by its numbers: paths and the
 derivatives of their steps by loops for this machine's processor, and no more values tried for a window than it needs.
 """
 
@@ -11,9 +11,9 @@ import jax
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
+from jaxbl.estimation.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
-from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.simulate import Experiment
 
 from .neutral_effects import lean

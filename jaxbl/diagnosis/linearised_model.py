@@ -25,15 +25,15 @@ from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
 from jaxbl.drive.effects.loads import TRIAL_ARC
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.free_parameters import FreeParameter, set_free_parameters
+from jaxbl.estimation.prediction import kalman_gain
+from jaxbl.estimation.regression import Path, effect_states
+from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.free_parameters import FreeParameter, set_free_parameters
-from jaxbl.identification.prediction import kalman_gain
-from jaxbl.identification.regression import Path, effect_states
-from jaxbl.identification.segments import Segment
 from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 from jaxbl.workers import map_in_threads

@@ -14,9 +14,9 @@ from functools import cached_property
 import jax
 import numpy as np
 
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Kinematics, balance
-from jaxbl.identification.segments import Segment
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.regression import Kinematics, balance
+from jaxbl.estimation.segments import Segment
 from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 

@@ -1,7 +1,7 @@
 """What a model lacks, from the motor's encoder and torque alone: a gap, and dry friction on either side of it.
 
 Other effects are not sought: without the load's encoder most of them look alike. All of these are put into the model at
-once and fitted (:mod:`jaxbl.identification.unseen_load`); then those without which the log is met as well are taken out, one
+once and fitted (:mod:`jaxbl.estimation.unseen_load`); then those without which the log is met as well are taken out, one
 after the other. The held-out data are predicted with the numbers found, initial states alone fitted.
 Reference: R. Kass, A. Raftery, Bayes factors, J. American Statistical Association 90 (1995), for the probabilities.
 """
@@ -18,12 +18,12 @@ from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters, units_of
 from jaxbl.errors import InputError
-from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
-from jaxbl.identification.intervals import UNSEEN, Spread
-from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
-from jaxbl.identification.segments import segments_of, signal_sizes
-from jaxbl.identification.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
+from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
+from jaxbl.estimation.intervals import UNSEEN, Spread
+from jaxbl.estimation.logs import default_paths, on_record
+from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
+from jaxbl.estimation.segments import segments_of, signal_sizes
+from jaxbl.estimation.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, with_effects

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.identification.logs import arrays
+from jaxbl.estimation.logs import arrays
 from jaxbl.records.least_squares import BlockRegression, rms
 
 from .diagnosis_task import DiagnosisTask

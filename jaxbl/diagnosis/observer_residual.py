@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Kinematics
-from jaxbl.identification.segments import Segment
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.regression import Kinematics
+from jaxbl.estimation.segments import Segment
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards, parzen_window

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
-from jaxbl.identification.logs import FIRST_FIFTH
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
+from jaxbl.estimation.logs import FIRST_FIFTH
+from jaxbl.estimation.segments import segments_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms

@@ -14,10 +14,10 @@ import numpy as np
 
 from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.plant import PlantState
+from jaxbl.estimation.segments import Segment, at_period, reading_noise, windows_of
+from jaxbl.estimation.smoother import smooth
+from jaxbl.estimation.trajectory import Windows
 from jaxbl.fused.single_plant import simulate_plants
-from jaxbl.identification.segments import Segment, at_period, reading_noise, windows_of
-from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise

@@ -17,13 +17,13 @@ import numpy as np
 from jaxbl.drive.effects import EFFECTS, Numbers, make_effect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
+from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters, set_free_parameters
+from jaxbl.estimation.intervals import spread_of
+from jaxbl.estimation.logs import arrays
+from jaxbl.estimation.regression import begun
+from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
-from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters, set_free_parameters
-from jaxbl.identification.intervals import spread_of
-from jaxbl.identification.logs import arrays
-from jaxbl.identification.regression import begun
-from jaxbl.identification.segments import Segment
 from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 

@@ -5,7 +5,7 @@ sampling rate, w_c^6 = q / (sigma^2 h). The model's torques pass the same low-pa
 but noise, also where its torques jump (friction at a reversal). What is found is H applied to the missing torque.
 
 Sign: the torque that is missing from the model, J a less all modelled torques; minus the residual of
-:func:`jaxbl.identification.regression.balance`.
+:func:`jaxbl.estimation.regression.balance`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ from jaxtyping import Array, Bool
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.drive.effects import Motion
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Kinematics, Samples, SideSamples, effect_path
-from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.regression import Kinematics, Samples, SideSamples, effect_path
+from jaxbl.estimation.segments import Segment
+from jaxbl.estimation.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.errors import InputError
-from jaxbl.identification.free_parameters import FreeParameter, make_free_parameters
-from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import Segment, segments_of, signal_sizes
+from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
+from jaxbl.estimation.logs import default_paths, on_record
+from jaxbl.estimation.segments import Segment, segments_of, signal_sizes
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.identification.segments import Segment
+from jaxbl.estimation.segments import Segment
 from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment, with_effects

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.identification.compilation import jit
+from jaxbl.estimation.compilation import jit
 from jaxbl.simulate import Experiment, NamedArrays, Sample, State, TracedArrays, initial_state, step
 
 BLOCKS = (256, 2048, 16_384)

@@ -15,8 +15,8 @@ from scipy.special import stdtrit
 
 from jaxbl.config import Config, ConfigSource, prepare, read_model
 from jaxbl.errors import InputError
+from jaxbl.estimation.logs import on_record, read_logs
 from jaxbl.files import to_jsonable
-from jaxbl.identification.logs import on_record, read_logs
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import (

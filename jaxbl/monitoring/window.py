@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.transmission import AbstractTransmission
-from jaxbl.identification.compilation import jit
+from jaxbl.estimation.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.records.linear_filters import savitzky_golay_slopes
 from jaxbl.simulate import Experiment, NamedArrays

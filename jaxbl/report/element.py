@@ -4,7 +4,7 @@ from pathlib import Path
 
 import tomli_w
 
-from jaxbl.identification.element import ElementIdentification
+from jaxbl.estimation.element import ElementIdentification
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
 

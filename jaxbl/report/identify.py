@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxbl.identification.identify import Identification
-from jaxbl.identification.search import is_noise
+from jaxbl.estimation.identify import Identification
+from jaxbl.estimation.search import is_noise
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, NextStep
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap, LogNorm
 
 from jaxbl.drive.parameters import units_of
-from jaxbl.identification.identify import Identification
+from jaxbl.estimation.identify import Identification
 from jaxbl.json_types import JsonObject
 
 from .figures import (

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.identification.identify import Identification
+from jaxbl.estimation.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards

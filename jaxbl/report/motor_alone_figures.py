@@ -4,7 +4,7 @@ half gap fits."""
 import numpy as np
 
 from jaxbl.diagnosis.diagnose import Diagnosis
-from jaxbl.identification.identify import Identification
+from jaxbl.estimation.identify import Identification
 
 from .figures import BLACK, BLUE, FAINT, VERMILION, Drawn, legend, limits, shade_gap, style, subplots
 

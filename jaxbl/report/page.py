@@ -31,8 +31,8 @@ from .picture import Picture, picture
 if TYPE_CHECKING:
     from jaxbl.config import Config
     from jaxbl.diagnosis.diagnose import Diagnosis
-    from jaxbl.identification.element import ElementIdentification
-    from jaxbl.identification.identify import Identification
+    from jaxbl.estimation.element import ElementIdentification
+    from jaxbl.estimation.identify import Identification
 
 
 class PageTable(NamedTuple):
@@ -122,8 +122,8 @@ def write_results(
 
 def format_model(result: "Identification | Diagnosis", trace: Path) -> str:
     """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
+    from jaxbl.estimation.logs import run_of
     from jaxbl.gains.machine_study import complete_study
-    from jaxbl.identification.logs import run_of
 
     data, record = result.model.to_dict(), result.record
     if result.replays:

@@ -7,12 +7,12 @@ from typing import Any
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
+from jaxbl.estimation.element import ElementIdentification
+from jaxbl.estimation.identify import Identification
 from jaxbl.files import catch_write_errors, to_path
 from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
-from jaxbl.identification.element import ElementIdentification
-from jaxbl.identification.identify import Identification
 from jaxbl.monitoring.watch import Watch
 from jaxbl.records import Inspection
 from jaxbl.sweeps.sweep import StudyResult

@@ -23,8 +23,8 @@ from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
+from jaxbl.estimation.logs import SealedRecord
 from jaxbl.files import read_json
-from jaxbl.identification.logs import SealedRecord
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 

@@ -13,10 +13,10 @@ from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.thresholds import LIMITS
 from jaxbl.drive.effects import DELAY_SAMPLES
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.identify import read_identification_task
-from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.identify import read_identification_task
+from jaxbl.estimation.logs import default_paths, on_record
+from jaxbl.estimation.segments import segments_of
 
 SEED = 21
 _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}

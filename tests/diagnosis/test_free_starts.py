@@ -13,9 +13,9 @@ from jaxbl.diagnosis.free_starts import best_runs, count_seen
 from jaxbl.diagnosis.neutral_effects import with_torques
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.segments import segments_of, windows_of
-from jaxbl.identification.trajectory import projected_residual
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.segments import segments_of, windows_of
+from jaxbl.estimation.trajectory import projected_residual
 from jaxbl.simulate import with_effects
 
 STUDY = multisine_study(

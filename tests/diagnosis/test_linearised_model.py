@@ -16,8 +16,8 @@ from jaxbl.diagnosis.candidates import Forces, MotionTorques, columns_of, forces
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.smoother import Smoothed
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.smoother import Smoothed
 
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
 SHAFT = {"law": "linear_shaft", "stiffness": 60.0}

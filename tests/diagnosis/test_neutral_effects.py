@@ -9,7 +9,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
-from jaxbl.identification.compilation import jit
+from jaxbl.estimation.compilation import jit
 from jaxbl.simulate import plant_trajectory
 
 NEVER_ADDED = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {

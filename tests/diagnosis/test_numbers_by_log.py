@@ -10,7 +10,7 @@ import pytest
 
 from jaxbl.config import prepare, read_model
 from jaxbl.diagnosis.numbers_by_log import contradictions
-from jaxbl.identification.free_parameters import make_free_parameters
+from jaxbl.estimation.free_parameters import make_free_parameters
 
 INERTIA, VISCOUS, SAMPLES = 4e-5, 1e-4, 4000
 

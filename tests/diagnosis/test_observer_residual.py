@@ -15,8 +15,8 @@ from jaxbl.diagnosis.observer_residual import compared, observed_torques
 from jaxbl.diagnosis.residuals import narrowed, residual_torques
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.identification.logs import on_record
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.logs import on_record
+from jaxbl.estimation.segments import segments_of
 
 GAINS = {
     "direct": {"motor": (2.0, 6.3)},

@@ -10,9 +10,9 @@ from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
 from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.residuals import narrowed
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.logs import default_paths, on_record
+from jaxbl.estimation.segments import segments_of
 
 COULOMB = {"kind": "motor.coulomb_friction", "torque": 20.0}
 VISCOUS = {"kind": "motor.viscous_friction", "viscous": 206.0}

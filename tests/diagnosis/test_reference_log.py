@@ -10,7 +10,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.segments import segments_of
 from jaxbl.simulate import with_effects
 
 STUDY = multisine_study(

@@ -8,7 +8,7 @@ from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrowed, noise_spectrum, residual_torques
-from jaxbl.identification.regression import balance
+from jaxbl.estimation.regression import balance
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}

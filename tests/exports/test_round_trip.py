@@ -11,9 +11,9 @@ from small_study import multisine_study
 
 from jaxbl.cli import app, main
 from jaxbl.config import read_config
-from jaxbl.identification.log_columns import observer_chain
-from jaxbl.identification.logs import on_record, read_logs
-from jaxbl.identification.segments import segments_of
+from jaxbl.estimation.log_columns import observer_chain
+from jaxbl.estimation.logs import on_record, read_logs
+from jaxbl.estimation.segments import segments_of
 from jaxbl.sweeps.trial import run
 
 TUNE = {"num": 4, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 6.0}, "lambda_ratio": {"start": 1.5, "stop": 6.0},

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from small_study import rigid_study, small_study
 
 from jaxbl.config import read_config
-from jaxbl.identification.identify import Identification
-from jaxbl.identification.regression import Kinematics, model_torques
+from jaxbl.estimation.identify import Identification
+from jaxbl.estimation.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.report.figures import save
 from jaxbl.report.identify import _headline, draw_identification, write_identification_report

@@ -16,11 +16,11 @@ from small_study import rigid_study, small_study
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
-from jaxbl.identification.intervals import refusals, spread
-from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
+from jaxbl.estimation.intervals import refusals, spread
+from jaxbl.estimation.smoother import smooth
+from jaxbl.estimation.trajectory import Fit, _Point, _solve, cut, fit
 from jaxbl.simulate import plant_trajectory
 
 TRUE = {

@@ -8,12 +8,12 @@ from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.intervals import spread
-from jaxbl.identification.prediction import kalman_gain, predictor
-from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import cut, fit
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.intervals import spread
+from jaxbl.estimation.prediction import kalman_gain, predictor
+from jaxbl.estimation.smoother import smooth
+from jaxbl.estimation.trajectory import cut, fit
 
 PERIOD, SAMPLES = 2e-3, 3000
 

@@ -318,7 +318,7 @@ def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequen
     """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
 
     Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
-    (1, samples, equations, ...), for :func:`jaxbl.identification.intervals.spread`.
+    (1, samples, equations, ...), for :func:`jaxbl.estimation.intervals.spread`.
     """
     import optimistix as optx
 

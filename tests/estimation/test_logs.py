@@ -10,7 +10,7 @@ from measured import NOMINAL, simulate_axis, simulate_late_log
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import on_record, read_logs, read_with_holdout
+from jaxbl.estimation.logs import on_record, read_logs, read_with_holdout
 from jaxbl.records import Record, read_record
 
 MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}

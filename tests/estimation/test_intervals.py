@@ -8,9 +8,9 @@ from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.intervals import interval, profile, spread
-from jaxbl.identification.trajectory import cut, fits
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.intervals import interval, profile, spread
+from jaxbl.estimation.trajectory import cut, fits
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 

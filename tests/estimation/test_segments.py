@@ -14,9 +14,9 @@ from scipy.signal import lfilter
 from jaxbl.config import read_model
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive.effects import DELAY_SAMPLES
-from jaxbl.identification.logs import on_record
-from jaxbl.identification.regression import Path, effect_path
-from jaxbl.identification.segments import led_in, reading_noise, segments_of, windows_of
+from jaxbl.estimation.logs import on_record
+from jaxbl.estimation.regression import Path, effect_path
+from jaxbl.estimation.segments import led_in, reading_noise, segments_of, windows_of
 from jaxbl.records import read_record
 
 LAG = {"kind": "actuator.lag", "time_constant": 0.05}

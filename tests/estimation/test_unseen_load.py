@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 
 from jaxbl import cli
 from jaxbl.errors import InputError
-from jaxbl.identification.identify import identify
-from jaxbl.identification.unseen_load import _changes
+from jaxbl.estimation.identify import identify
 from jaxbl.records import inspect
 
 STUDY = {
@@ -112,7 +111,3 @@ def test_a_load_that_may_never_be_met_has_no_numbers(tmp_path):
     summary = identify(write_motor_log(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
     assert "by a motor that, within a gap, never meets the load" in summary["backlash"]["why"]
     assert {parameter["interval"][1] for parameter in summary["parameters"].values()} == {None}
-
-
-def test_changes_of_sign_count_beyond_a_size():
-    assert _changes(np.array([1.0, 0.1, -0.1, 1.0, -1.0, 0.2, -1.0, 1.0]), 0.5) == 2

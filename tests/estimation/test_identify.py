@@ -12,12 +12,12 @@ from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.errors import InputError
-from jaxbl.identification import observer_gains
-from jaxbl.identification.compilation import jit
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.identify import identify
-from jaxbl.identification.logs import default_paths
-from jaxbl.identification.search import ParameterSearch
+from jaxbl.estimation import observer_gains
+from jaxbl.estimation.compilation import jit
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.identify import identify
+from jaxbl.estimation.logs import default_paths
+from jaxbl.estimation.search import ParameterSearch
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.report.identify import identification_lines, write_identification_report
 from jaxbl.simulate import plant_trajectory

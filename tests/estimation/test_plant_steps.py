@@ -6,10 +6,10 @@ import pytest
 from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
-from jaxbl.identification.free_parameters import make_free_parameters
-from jaxbl.identification.intervals import spread
-from jaxbl.identification.plant_steps import refine_steps
-from jaxbl.identification.trajectory import cut, fits
+from jaxbl.estimation.free_parameters import make_free_parameters
+from jaxbl.estimation.intervals import spread
+from jaxbl.estimation.plant_steps import refine_steps
+from jaxbl.estimation.trajectory import cut, fits
 from jaxbl.simulate import PlantState, plant_trajectory
 
 PERIOD, SAMPLES = 2e-2, 400

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from jaxbl.estimation.smoother import smooth, smoothed_accelerations
 from jaxbl.fused import signal_scan
-from jaxbl.identification.smoother import smooth, smoothed_accelerations
 
 PERIOD, NOISE, JERK = 2e-3, 1e-4, 3e3
 F = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])

@@ -10,9 +10,9 @@ from scipy import signal
 from small_study import rigid_study, small_study
 
 from jaxbl.config import prepare, read_config
-from jaxbl.identification.free_parameters import make_free_parameters, set_free_parameters
-from jaxbl.identification.intervals import interval, spread
-from jaxbl.identification.regression import (
+from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
+from jaxbl.estimation.intervals import interval, spread
+from jaxbl.estimation.regression import (
     Kinematics,
     balance,
     decimate,
@@ -22,7 +22,7 @@ from jaxbl.identification.regression import (
     regress,
     shortest,
 )
-from jaxbl.identification.smoother import smooth
+from jaxbl.estimation.smoother import smooth
 from jaxbl.records import read_record
 
 T = jnp.linspace(0.0, 2.0, 4001)
