@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from .reference_log import Comparison, Errors, ReferenceLog
+from .reference_log import BLOCKS, Comparison, ReferenceLog
 from .thresholds import LIMITS
 
-BLOCKS = 16
-"""Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
-logs."""
 QUARTERS = 4
-"""Parts of a log that numbers are fitted without, one after the other: each as much as is held out."""
+"""Parts of a log that numbers are fitted without, one after the other: four blocks, as much as is held out. In a row they
+would part a chirp's slow motion from its fast one, and neither foretells the other."""
 
 
 def standard_errors_better(log: ReferenceLog, control: Comparison, model: Comparison) -> float:
@@ -51,26 +49,3 @@ def standard_errors_between(control: np.ndarray, model: np.ndarray) -> float:
         return -np.inf if np.isfinite(control).all() else np.inf
     gains = np.mean(np.atleast_2d(np.log1p(control) - np.log1p(model)), axis=0)
     return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(BLOCKS), 2.0 * LIMITS.noise_structure))
-
-
-_WORSE, _WORSE_SPEED = 1.02, 1.05
-"""Errors of a model over those of another, or over the noise, up to which it is no worse: what numbers fitted on other data
-cost; of speeds the noise is known less well."""
-_SURELY = 1.1
-"""The same from which on it is worse, whatever the blocks say."""
-
-
-def is_worse(after: Comparison, before: Comparison, noise: Errors) -> bool:
-    """Tell whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the
-    blocks, or by much."""
-    for name, value in after.errors.items():
-        limit = _WORSE_SPEED if name.startswith("velocity") else _WORSE
-        most = max(before.errors[name], noise[name])
-        if value <= limit * most:
-            continue
-        if not value <= _SURELY * most:
-            return True
-        other, own = (mean_squares(each.samples[name], noise[name]) for each in (before, after))
-        if not standard_errors_between(other, own) > -LIMITS.sure:
-            return True
-    return False

@@ -119,11 +119,11 @@ class Choice:
 
     def _as_given(self, fitted: FittedModel) -> FittedModel:
         """Return the model with the numbers that it came with."""
-        own, known = self.setup.own, np.diag(self.setup.prior**2)
+        known = np.diag(self.setup.prior**2)
         # if nothing is missing, its numbers are off by as much as the fit says
         off = fitted.white + np.outer(fitted.theta, fitted.theta)
         return fitted._replace(
-            experiment=self.setup.nominal, theta=np.zeros(len(own)), covariance=known, white=off, left_out=None
+            experiment=self.setup.nominal, theta=0.0 * fitted.theta, covariance=known, white=off, left_out=None
         )
 
 

@@ -4,8 +4,9 @@ A round: effects are proposed by the prediction errors of the linearised model (
 missing torque (:mod:`.torque_regression`), there also several together. Each is put into the model, all numbers are fitted
 (:mod:`.refit`), and the two models are compared (:class:`Gain`). The best one that is accepted stays. Then whatever is there
 is asked for again: an effect stays if the model without it, or with its special case in its place, is worse by the same
-rule. In the end free functions of time, position and velocity are fitted to what remains: one that gains clearly says that
-something else is missing.
+rule. In the end what was passed by is tried in the place of what is there: rivals, other waves, and effects where numbers
+were taken to be off. Then free functions of time, position and velocity are fitted to what remains: one that gains
+clearly says that something else is missing.
 """
 
 import dataclasses
@@ -40,8 +41,6 @@ own before."""
 _PROMISING = 0.5
 """A candidate is tried where it promises this share of the most nats that an accepted one gained (promises are linear), or
 takes away this share of the torque that the best one does; several together count by this share of their worth."""
-_AHEAD = 3
-"""Steps that are followed where none is accepted."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 """Prior sizes of a free function that are tried, over `effect_size`: down to the least that counts."""
 _MOST = 8
@@ -162,6 +161,7 @@ class EffectSearch:
         self.history: list[Step] = []
         self._compared: dict[tuple, Comparison] = {}
         self._tried: dict[str, list[Trial]] = {}
+        self.passed_by: FittedModel | None = None
 
     # ---- models beside one another ----
 
@@ -204,30 +204,52 @@ class EffectSearch:
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        current = self._begin()
-        visited = set[tuple[bool, frozenset[str]]]()
-        while True:
-            # effects that make each other needless would come and go without end
-            state = self.fits is self.rough, frozenset(current.names)
-            better = None if state in visited else self._next(current)
-            visited.add(state)
-            # in the end every effect is asked for, and of several at once each
-            thorough = better is None or len(better.names) > len(current.names) + 1
-            current, gains = self._reduce(better or current, thorough=thorough)
-            if better is None and (self.fits is self.rough, frozenset(current.names)) in visited:
-                break
-        rivals = {name: self._rivals(current, name) for name in current.names}
-        found = Explanation(current, gains, rivals, self.remainder(current))
+        found = self._explain(self._begin())
+        if self.fits is self.rough and self.passed_by is not None and not found.left > LIMITS.unknown:
+            # a few effects may be likelier than numbers that are all off
+            self.fits = self.stated
+            others = self._explain(self.passed_by)
+            nats = others.fitted.log_evidence - found.fitted.log_evidence
+            self._note("effects in place of numbers that are off", Gain(nats, np.nan), nats > 0.0, "the likelier ones stay")
+            if nats > 0.0:
+                found = others
+            else:
+                self.fits = self.rough
         self._note(
             "fit free functions to what remains", Gain(found.left, np.nan), bool(found.left > LIMITS.unknown),
             f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown",
         )  # fmt: skip
         return found
 
+    def _explain(self, current: FittedModel) -> Explanation:
+        """Add, replace and take out effects until nothing is accepted."""
+        # effects that make each other needless would come and go without end
+        visited = set[tuple]()
+        while True:
+            state = self._identify(current)
+            better = None if state in visited else self._next(current)
+            visited.add(state)
+            # in the end every effect is asked for, and of several at once each
+            thorough = better is None or len(better.names) > len(current.names) + 1
+            current, gains = self._reduce(better or current, thorough=thorough)
+            if better is not None or self._identify(current) not in visited:
+                continue
+            rivals = {name: self._rivals(current, name) for name in current.names}
+            every = [(name, trial) for name in rivals for trial in (*rivals[name], *self._change_waves(current, name))]
+            accepted = [pair for pair in every if self.gain(current, pair[1].fitted).is_accepted]
+            name, best = max(accepted, key=lambda pair: -pair[1].gain.nats, default=("", None))
+            if best is None or self._identify(best.fitted) in visited:
+                return Explanation(current, gains, rivals, self.remainder(current))
+            (other,) = best.added
+            self._note(f"take {other} for {name}", best.gain, True, "it is better by the same rule", loss=True)
+            if name != other:
+                self._tried[other] = [Trial((name,), current, best.gain)]
+            current = best.fitted
+
     def _begin(self) -> FittedModel:
         """Fit the model as given, with what is known to act and with errors of the recording that are larger than effects
         are, which would stand for them."""
-        current = self.fits.fit({}, np.zeros(len(self.fits.prior)))
+        current = self.fits.fit({}, 0.0 * self.fits.prior)
         for name in [name for name in self.lacking if name in self.expected or EFFECTS[name].in_log]:
             proposals = [_Proposal({name: EFFECTS[name].neutral()})]
             if name in self.expected:
@@ -244,58 +266,58 @@ class EffectSearch:
             current = trial.fitted if kept else current
         return current
 
-    def _next(self, current: FittedModel) -> FittedModel | None:
-        """Find the best model with more effects that is accepted.
+    def _identify(self, fitted: FittedModel) -> tuple[bool, frozenset[tuple]]:
+        """Tell models apart by what is known of the numbers, by their effects, and by the waves of these."""
+        waves = ((name, *(numbers[leaf] for leaf in _waves(name))) for name, numbers in fitted.numbers.items())
+        return self.fits is self.rough, frozenset(waves)
 
-        Where none is, the most likely one is followed for some steps: of two effects that hide each other neither gains
-        alone.
-        """
-        ahead = current
-        for _ in range(_AHEAD):
-            trials = [trial for trial in self._try_all(ahead) if ahead is current or len(trial.added) == 1]
-            if ahead is current and self.fits is self.stated:
-                trials.append(self._free_numbers(current))
-            over = [trial.gain if ahead is current else self.gain(current, trial.fitted) for trial in trials]
-            accepted = [trial for trial, gain in zip(trials, over, strict=True) if gain.is_accepted]
-            # structure in the noise is not followed
-            single = [trial for trial in trials if len(trial.added) == 1 and trial.gain.nats > self.floor]
-            best = max(accepted or single, key=lambda trial: trial.worth, default=None)
-            if best is not None and not best.added:
-                # it may be one of the numbers alone
-                names = {name for name in self.lacking if current.linear.same(name) is not None} - {*current.names}
-                errors = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in sorted(names)]
-                trials += errors
-                accepted += [trial for trial in errors if trial.gain.is_accepted]
-                best = max(accepted, key=lambda trial: trial.worth)
-            for trial in trials:
-                why = "less likely" if trial in accepted else trial.gain.rule
-                if trial is best:
-                    why = "most likely" if accepted else "followed, as none is accepted"
-                change = describe_change(ahead.numbers, trial.fitted.numbers)
-                self._note(change, trial.gain, trial is best and bool(accepted), why)
-            if best is None:
-                break
-            if accepted:
-                others = [trial for trial in accepted if trial is not best and trial.added]
-                self._tried |= {name: others for name in best.added}  # noqa: C420
-                self.fits = self.fits if best.added else self.rough
-                return best.fitted
-            ahead = best.fitted
-        self.history.append(Step("add one more effect", None, None, False, "none of them gains enough on the log"))
-        return None
+    def _next(self, current: FittedModel) -> FittedModel | None:
+        """Find the best model with more effects that is accepted."""
+        trials = self._try_all(current)
+        accepted = [trial for trial in trials if trial.gain.is_accepted]
+        best = max(accepted, key=lambda trial: trial.worth, default=None)
+        for trial in trials:
+            why = "most likely" if trial is best else "less likely" if trial in accepted else trial.gain.rule
+            self._note(describe_change(current.numbers, trial.fitted.numbers), trial.gain, trial is best, why)
+        if self.fits is self.stated and self.passed_by is None:
+            fitted = self._try_numbers(current, 0.0 if best is None else best.worth)
+            if fitted is not None:
+                return fitted
+        if best is None:
+            self.history.append(Step("add one more effect", None, None, False, "none of them gains enough on the log"))
+            return None
+        self._tried |= {name: [trial for trial in accepted if trial is not best] for name in best.added}
+        return best.fitted
 
     def _try_all(self, current: FittedModel) -> list[Trial]:
         """Try what is proposed, but for what promises far less than others gained that are accepted."""
         trials = list[Trial]()
-        for proposal in self._propose(current) if len(current.names) < _MOST else ():
+        # as many effects as numbers are no likelier than that these are off
+        before = None if self.fits is self.rough else self.passed_by
+        most = _MOST if before is None else len(before.names) + len(self.stated.prior)
+        for proposal in self._propose(current) if len(current.names) < most else ():
             if not any(trial.gain.is_accepted and proposal.nats < _PROMISING * trial.gain.nats for trial in trials):
                 trials.append(self._try(current, proposal))
         return trials
 
-    def _free_numbers(self, current: FittedModel) -> Trial:
-        """Let the model's own numbers be further off than stated."""
+    def _try_numbers(self, current: FittedModel, worth: float) -> FittedModel | None:
+        """Let the model's own numbers be further off than stated, if it is worth more than effects are."""
         fitted = self.rough.fit(current.numbers, current.theta[: len(self.stated.prior)], current)
-        return Trial((), fitted, self.gain(current, fitted))
+        trial = Trial((), fitted, self.gain(current, fitted))
+        kept = trial.gain.is_accepted and trial.worth > worth
+        why = "most likely" if kept else "less likely" if trial.gain.is_accepted else trial.gain.rule
+        self._note("let all numbers be further off than stated", trial.gain, kept, why)
+        if not kept:
+            return None
+        # it may be one of the numbers alone
+        names = {name for name in self.lacking if current.linear.same(name) is not None} - {*current.names}
+        singles = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in sorted(names)]
+        best = max([trial, *(single for single in singles if single.gain.is_accepted)], key=lambda each: each.worth)
+        if best is trial:
+            self.fits, self.passed_by = self.rough, current
+        else:
+            self._note(f"add {best.added[0]}", best.gain, True, "it is one of the numbers alone")
+        return best.fitted
 
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
         """Put more effects into a model, in place of those that cannot stand beside them."""
@@ -344,7 +366,7 @@ class EffectSearch:
 
     def _as_stated(self, current: FittedModel) -> FittedModel | None:
         """Hold numbers to what is stated of them, if they gain nothing by being further off."""
-        less = self.stated.fit(current.numbers, np.zeros(len(self.stated.prior)), current)
+        less = self.stated.fit(current.numbers, 0.0 * self.stated.prior, current)
         gain = self.gain(less, current)
         self._note("hold the numbers to what is stated", gain, not gain.is_accepted, gain.rule, loss=True)
         if gain.is_accepted:
@@ -377,8 +399,8 @@ class EffectSearch:
             (other, *more) = trial.added
             if more or other in current.names or contains(other, name) or contains(name, other):
                 continue
-            numbers = {one: values for one, values in current.numbers.items() if one != name}
-            if any(replaces(one, other) or replaces(other, one) for one in numbers):
+            numbers = {effect: values for effect, values in current.numbers.items() if effect != name}
+            if any(replaces(effect, other) or replaces(other, effect) for effect in numbers):
                 continue
             fitted = self.fits.fit({**numbers, other: trial.fitted.numbers[other]}, own, current, (other,))
             gain = self.gain(fitted, current)
@@ -386,6 +408,25 @@ class EffectSearch:
             self._note(f"replace {name} by {other}", gain, False, why, loss=True)
             found.append(trial._replace(fitted=fitted, gain=gain))
         return found
+
+    def _change_waves(self, current: FittedModel, name: str) -> list[Trial]:
+        """Fit a model with the likeliest other waves of an effect, if it has any: a fit leaves whole numbers as they are."""
+        if not _waves(name):
+            return []
+        linear, predictor, variants = self._vary(current, [name])
+        variants = [
+            other
+            for other in variants
+            if any(getattr(other.effects[0], leaf) != current.numbers[name][leaf] for leaf in _waves(name))
+        ]
+        ranked = self._rank(linear, current.names, variants, predictor, -np.inf)
+        if not ranked:
+            return []
+        numbers = {**current.numbers, **ranked[0].numbers}
+        fitted = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, (name,))
+        gain = self.gain(fitted, current)
+        self._note(f"{name} with other waves", gain, False, "what is better by the same rule stays", loss=True)
+        return [Trial((name,), fitted, gain)]
 
     def _note(self, tried: str, gain: Gain, kept: bool, why: str, *, loss: bool = False) -> None:
         nats, z = (-one if loss else one for one in gain[:2])
@@ -443,9 +484,9 @@ class EffectSearch:
         return TorqueRegression(linear, current.names, self.compare(current).torques, self.log, base, others)
 
     def _rank(
-        self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor
+        self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor, least: float = 0.0
     ) -> list[_Proposal]:
-        """Rank the best variants of effects by the linearised model, of those that promise anything."""
+        """Rank the best variants of effects by the linearised model, of those that promise at `least` so many nats."""
         if not np.isfinite(predictor.deviation).all():
             # no predictor follows this model
             return []
@@ -453,14 +494,16 @@ class EffectSearch:
         base = evidence_of(columns)
         assert base is not None
         best: dict[str, _Proposal] = {}
-        for i, one in enumerate(variants):
-            gone = [name for name in names if replaces(one.name, name)]
+        for i, variant in enumerate(variants):
+            gone = [name for name in names if name == variant.name or replaces(variant.name, name)]
             found = evidence_of(_without(columns, linear, gone) if gone else columns, variants, i)
             if found is not None:
-                nats = self._nats(linear, base, found) - linear.choices(one.name)
-                if nats > max(best[one.name].nats if one.name in best else 0.0, 0.0):
-                    best[one.name] = _Proposal({one.name: found.numbers}, found.own[: len(self.fits.prior)], nats, one)
-        return sorted(best.values(), key=lambda one: -one.nats)
+                nats = self._nats(linear, base, found) - linear.choices(variant.name)
+                if nats > (best[variant.name].nats if variant.name in best else least):
+                    best[variant.name] = _Proposal(
+                        {variant.name: found.numbers}, found.own[: len(self.fits.prior)], nats, variant
+                    )
+        return sorted(best.values(), key=lambda proposal: -proposal.nats)
 
     def _nats(self, linear: Linear, base: Evidence, found: Evidence) -> float:
         """Tell the gain in evidence where the size of errors is not known."""
@@ -486,6 +529,11 @@ class EffectSearch:
                 best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
             gained[one.name] = best
         return gained
+
+
+def _waves(name: str) -> list[str]:
+    """List the numbers of an effect that are whole, which a fit leaves as they are."""
+    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind == "harmonic"]
 
 
 def _without(columns: Products, linear: Linear, names: Collection[str]) -> Products:

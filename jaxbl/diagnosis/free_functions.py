@@ -69,7 +69,7 @@ def _hats(values: np.ndarray, span: tuple[float, float], count: int) -> np.ndarr
 def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
     way, longest = np.diff(position, prepend=position[0]), np.maximum(lengths, 1e-300)
-    (found,) = scan_signal(_stopped, [longest], [np.zeros(len(lengths))], [way])
+    (found,) = scan_signal(_stopped, [longest], [0.0 * lengths], [way])
     return found
 
 

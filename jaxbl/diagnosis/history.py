@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from .candidates import EffectNumbers
-
 
 class Step(NamedTuple):
     """A model that was tried.
@@ -24,9 +22,9 @@ class Step(NamedTuple):
     why: str
 
 
-def describe_change(before: EffectNumbers | Mapping[str, object], after: EffectNumbers | Mapping[str, object]) -> str:
+def describe_change(before: Mapping[str, object], after: Mapping[str, object]) -> str:
     """Say which effects one model has that another has not: `add A`, `remove A`, `replace A by B`."""
     gone, new = (" and ".join(sorted(set(a) - set(b))) for a, b in ((before, after), (after, before)))
     if gone and new:
         return f"replace {gone} by {new}"
-    return f"add {new}" if new else f"remove {gone}" if gone else "let all numbers be further off than stated"
+    return f"add {new}" if new else f"remove {gone}"

@@ -64,14 +64,16 @@ def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool
     fitted = chosen.fitted
     away = fitted.theta[: len(chosen.prior)] / chosen.prior
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
-    tested = any(name not in untested for name in fitted.names)
     torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
     answers = {
         "failed": proof.failed,
         "far": {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far},
         "remainder": chosen.verdict == "unknown_effect",
         "worse": proof.worse,
-        "little": tested and not proof.failed and share is not None and share < LIMITS.least_explained,
+        "little": len(untested) < len(fitted.names)
+        and not proof.failed
+        and share is not None
+        and share < LIMITS.least_explained,
         "contradicting": contradicting,
     }
     return judge_answers(fitted.names, answers, torques, proof.weak, proof.has_power)

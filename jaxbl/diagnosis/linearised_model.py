@@ -465,7 +465,7 @@ class Linear:
         """Periods a turn at which a torque over the position of a side explains most."""
         count = self._wave_count(place)
         few = np.unique(np.round(np.geomspace(1.0, max(count, 2), _COARSE)))
-        by_place, power = np.zeros(_PLACES), np.zeros(len(few))
+        by_place, power = np.zeros(_PLACES), 0.0 * few
         for i, signals in enumerate(self.signals):
             position = np.asarray(signals.part.position[place])
             slope, more = self._answer(i, place, few, position)

@@ -129,9 +129,9 @@ def with_added(given: Iterable[Effect], added: Iterable[Effect], name_of: Callab
     return effects
 
 
-def bucket(count: int, least: int, digits: int = 3) -> int:
-    """The next number with so many binary digits: shapes of arrays are few then, and so are compiled programs."""
+def bucket(count: int, least: int) -> int:
+    """The next number with three binary digits: shapes of arrays are few then, and so are compiled programs."""
     size = least
     while size < count:
-        size += max(least >> (digits - 1), 1 << max(size.bit_length() - digits, 0))
+        size += 1 << (size.bit_length() - 3)
     return size

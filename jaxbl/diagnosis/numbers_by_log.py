@@ -8,8 +8,7 @@ numbers, into other ones in each log.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from pathlib import Path
+from os.path import commonpath, relpath
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +68,8 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
     parts = [(path, one) for path, one in parts if one.segments]
     if len(parts) < 2 or not fitted.free:
         return []
-    names, shown = _names([path for path, _ in parts]), [_shown(fitted, one) for _, one in parts]
+    folder = commonpath([path.parent for path, _ in parts])
+    names, shown = [relpath(path, folder) for path, _ in parts], [_shown(fitted, one) for _, one in parts]
     found = []
     for k, number in enumerate(fitted.free):
         apart = {
@@ -86,15 +86,6 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
         ]
         found.append(Contradiction(number.path, *sorted(both, key=lambda of: of.value)))
     return found
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Return names of files, with as much of their folders as parts them."""
-    names = [path.name for path in paths]
-    for depth in range(2, max(len(path.parts) for path in paths) + 1):
-        longer = ["/".join(path.parts[-depth:]) for path in paths]
-        names = [name if names.count(name) == 1 else more for name, more in zip(names, longer, strict=True)]
-    return names
 
 
 class _Shown(NamedTuple):

@@ -98,8 +98,8 @@ def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog
     """Give a model the zeros that another log counts from, by the first fifth of its segments; and the rest of that log."""
     cuts = [(segment, round(FIRST_FIFTH * len(segment))) for segment in log.segments]
     first, rest = (replace(log, segments=part) for part in zip(*((s[:cut], s[cut:]) for s, cut in cuts), strict=True))
-    kinds = [EFFECTS.get(owner_of(number)[0]) for number in chosen.fitted.free]
-    zeros = [i for i, kind in enumerate(kinds) if kind is not None and kind.in_log]
+    names = [owner_of(number)[0] for number in chosen.fitted.free]
+    zeros = [i for i, name in enumerate(names) if name in EFFECTS and EFFECTS[name].in_log]
     for i in zeros:
         chosen = chosen._replace(fitted=_fit_zero(chosen.fitted, i, first))
     return (chosen, replace(rest, rest=False)) if zeros else (chosen, log)
@@ -162,8 +162,7 @@ def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Ma
     for name in chosen.fitted.names:
         less = without(chosen.fitted.experiment, name)
         if not list_failed(log.with_slow(log.compare(less)), expected):
-            torques = [_torque_between(part, chosen.fitted.experiment, less) for part in (log, setup.fitted)]
-            found[name] = Untested(*torques)
+            found[name] = Untested(*(_torque_between(part, chosen.fitted.experiment, less) for part in (log, setup.fitted)))
     return found
 
 

@@ -27,6 +27,9 @@ from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques
 from .residuals import SideResiduals, as_smoothed, low_passed, narrowed, residual_torques
 
+BLOCKS = 16
+"""Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
+logs."""
 WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
 _LEAST_IN_WINDOW = 20
@@ -166,17 +169,21 @@ class ReferenceLog:
 
         Args:
             whole: the model.
-            models: one for each part of the log, such as ones whose numbers were fitted without it, whose errors there are
-                taken in place of the model's.
+            models: one for each part of the log (:func:`parts_of_blocks`), such as ones whose numbers were fitted without
+                it, whose errors there are taken in place of the model's.
         """
         torques, parts, noises = self._lacking(whole), [], []
         for i, model in enumerate(models or [whole]):
             part = i, len(models) or 1
             samples, noise = self._samples(model, self.samples, _STATES, part)
             narrowed = self._narrowed(self._lacking(model) if models else torques)
-            parts.append(samples | {name: np.array_split(torque, part[1])[i] for name, torque in narrowed.items()})
+            parts.append(samples | {name: torque[_rows_of(len(torque), part)] for name, torque in narrowed.items()})
             noises.append(noise)
-        samples = {name: np.concatenate([errors[name] for errors in parts]) for name in parts[0]}
+        samples = {}
+        for name in parts[0]:
+            errors = np.concatenate([part[name] for part in parts])
+            rows = np.concatenate([_rows_of(len(errors), (i, len(parts))) for i in range(len(parts))])
+            samples[name] = errors[np.argsort(rows)]
         noise = {name: rms(np.array([added_noise[name] for added_noise in noises])) for name in noises[0]}
         return Comparison(_all_rms(samples), torques, samples, float(whole.plant.input_gain), noise)
 
@@ -275,7 +282,7 @@ class ReferenceLog:
         # the loop of steps is that of linearisations, which have these torques
         experiment, _ = with_torques(at_period(experiment, self.period))
         windows, firsts = windows_of(self.segments, experiment, length, self.rest)
-        which = np.array_split(np.arange(len(firsts)), part[1])[part[0]]
+        which = _rows_of(len(firsts), part)
         return best_runs(experiment, windows, passes, self.rest, which), firsts[which]
 
     def _growth(self, experiment: Experiment, length: int, deviation: Mapping[str, float]) -> float:
@@ -290,6 +297,18 @@ class ReferenceLog:
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             change = {side: _rms([np.asarray(other[side][0] - one[side][0])]) / step for side in experiment.sides}
             return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
+
+
+def parts_of_blocks(parts: int) -> np.ndarray:
+    """Tell to which of so many parts each block of a log belongs, shape (blocks,): 0 1 2 3, 1 2 3 0, 2 3 0 1, 3 0 1 2 of
+    four. Each part has slow and fast motion of a chirp, and all of a motion that repeats."""
+    blocks = np.arange(BLOCKS)
+    return (blocks + blocks // parts) % parts
+
+
+def _rows_of(count: int, part: _Part) -> np.ndarray:
+    """Find the rows of a part of a log, in order."""
+    return np.flatnonzero(parts_of_blocks(part[1])[BLOCKS * np.arange(count) // count] == part[0])
 
 
 def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:

@@ -32,6 +32,7 @@ from .candidates import ZERO_SPREAD, EffectNumbers
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import SILENT, Linear, Predictor
 from .neutral_effects import complete, lean
+from .reference_log import BLOCKS, parts_of_blocks
 from .thresholds import LIMITS
 
 _STEPS = 25
@@ -42,8 +43,6 @@ _LEAST_STEP = 0.05
 """Share of a Gauss-Newton step below which no other is tried: friction and gaps make errors rough (benchmarks/NOTES.md)."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
-_STARTS = (1.0, 0.0)
-"""Shares of what a candidate was proposed with from which fits begin: of dry friction the way there may lead over a hill."""
 
 
 class _Point(NamedTuple):
@@ -77,7 +76,7 @@ class ModelFits:
     ):
         self.nominal, self.free, self.prior, self.segments = complete(experiment), tuple(free), prior, segments
         self.log_odds = log_odds
-        self.given = self.linearise({}, np.zeros(len(prior)))
+        self.given = self.linearise({}, 0.0 * prior)
         self._units: dict[tuple[str, ...], float] = {}
 
     def linearise(self, numbers: EffectNumbers, own: np.ndarray) -> Linear:
@@ -107,18 +106,23 @@ class ModelFits:
             own: theta of the model's own numbers, to begin with.
             begin: a model nearby, whose initial states are begun with.
             new: effects that it has not.
-            promise: nats that these may gain: where a fit gains less than half, another one begins nearer to none of them.
+            promise: nats that these may gain: if a fit gains less than half, another begins at none of them, as the way
+                to a dry friction may lead over a hill.
         """
+        end = None if begin is None else begin.end
+        before = own if end is None else end.own
+        starts = [(1.0, own, end), *([(0.0, before, end)] if new and end else [])]
+        if np.any(np.abs(before) > LIMITS.far * self.prior):
+            # numbers that are far from what is known of them stand for what is missing: no step may lead back from there
+            starts.append((1.0, 0.0 * own, None))
         best, fit = None, None
-        for share in _STARTS:
-            scaled = {name: _scale(name, one, share) if name in new else one for name, one in numbers.items()}
-            tried = _Fit(self, scaled)
-            before = own if begin is None or begin.end is None else begin.end.own
-            point = tried.run(before + share * (own - before), None if begin is None else begin.end)
+        for share, at, where in starts:
+            if best is not None and share == 0.0 and end is not None and end.cost - best.cost >= promise:
+                continue
+            tried = _Fit(self, {name: _scale(name, one, share) if name in new else one for name, one in numbers.items()})
+            point = tried.run(at, where)
             if best is None or point.cost < best.cost:
                 best, fit = point, tried
-            if begin is None or begin.end is None or not new or begin.end.cost - best.cost >= promise:
-                break
         assert best is not None and fit is not None
         return fit.finish(best)
 
@@ -129,7 +133,7 @@ class ModelFits:
         gear = {effect: numbers for effect, numbers in beside.items() if _in_gear(effect) and effect != name}
         key = name, leaf, *sorted(gear)
         if key not in self._units:
-            along = self.linearise(gear, np.zeros(len(self.prior))) if gear else self.given
+            along = self.linearise(gear, 0.0 * self.prior) if gear else self.given
             sizes = EFFECTS[name].sizes()
             single = {key: 0.0 if key in sizes else value for key, value in effects[name].items()} | {leaf: 1.0}
             unit = LIMITS.effect_size / max(along.torque_share(make_effect(name, **single)), 1e-12)
@@ -299,8 +303,8 @@ class _Fit:
             inverse = np.linalg.inv(spread.information + prior)
             middle = spread.information @ spread.covariance @ spread.information + prior
             covariance, changes = inverse @ middle @ inverse, leave_quarters_out(errors[:, :, 0], slopes, prior)
-            for rows, change in zip(np.array_split(np.arange(len(errors)), QUARTERS), changes, strict=True):
-                foretold[rows] += slopes[rows] @ change
+            for rows, part in zip(np.array_split(np.arange(len(errors)), BLOCKS), parts_of_blocks(QUARTERS), strict=True):
+                foretold[rows] += slopes[rows] @ changes[part]
         return self._release(
             found._replace(
                 covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold,
@@ -354,7 +358,8 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     Returns:
         Changes, shape (quarters, numbers).
     """
-    products = BlockRegression.of(errors.ravel(), slopes.reshape(errors.size, -1), QUARTERS).products
+    blocks = BlockRegression.of(errors.ravel(), slopes.reshape(errors.size, -1), BLOCKS).products
+    products = np.stack([blocks[parts_of_blocks(QUARTERS) == part].sum(axis=0) for part in range(QUARTERS)])
     precision = products.sum(axis=0)[:-1, :-1] + prior
     # no number moves by more than once its size: beyond that a first order says nothing
     return np.stack(

@@ -18,15 +18,13 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment, with_effects
 
-from .blocks import QUARTERS, is_worse, standard_errors_better
-from .reference_log import Comparison, Errors, ReferenceLog
+from .blocks import QUARTERS, standard_errors_better
+from .reference_log import BLOCKS, Comparison, Errors, ReferenceLog, parts_of_blocks
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
 from .thresholds import LIMITS
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
 """Points of a table: waves of 12 periods over the range, or 18 a turn, still show; speeds have them where samples are."""
-_BLOCKS = 12
-"""Of consecutive samples, each left out once; some make a quarter."""
 _GAIN = 0.03
 """Share of the rms that a table has to take away by cross-validation."""
 _STIFFNESS = 10.0 ** np.arange(-4.0, 5.0)
@@ -110,7 +108,6 @@ def tabulate(
         sliding: sides whose positions are no angles.
     """
     best: Tabulation | None = None
-    noise = log.noise_floor(compared.torques)
     for side in experiment.sides:
         if any(effect.name == f"{side}.{Tabulated.kind}" for effect in experiment.effects):
             continue
@@ -121,7 +118,7 @@ def tabulate(
         model = _with_tables(experiment, every)
         quarters = [_with_tables(experiment, every, quarter) for quarter in range(QUARTERS)]
         with_tables, before = log.compare(model, models=quarters), best.compared if best else compared
-        if standard_errors_better(log, before, with_tables) > LIMITS.sure and not is_worse(with_tables, before, noise):
+        if standard_errors_better(log, before, with_tables) > LIMITS.sure:
             best = Tabulation(every, model, with_tables, standard_errors_better(log, compared, with_tables))
     return best
 
@@ -138,7 +135,7 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
         )
         for over, points in choices.items()
     }
-    nothing = np.array([np.mean(part**2) for part in np.array_split(target, _BLOCKS)])
+    nothing = np.array([np.mean(part**2) for part in np.array_split(target, BLOCKS)])
     found = []
     for overs in _sets(list(choices)):
         if len(target) < _LEAST * sum(widths[over] for over in overs):
@@ -147,14 +144,14 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
         fits = [_Fit.of(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
         fit = min(fits, key=lambda one: float(np.mean(one.squares)))
         gain = nothing - fit.squares
-        sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(_BLOCKS)
+        sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(BLOCKS)
         if sure and 1.0 - np.sqrt(np.mean(fit.squares) / np.mean(nothing)) > _GAIN:
             found.append((overs, fit))
     if not found:
         return []
     _, best = min(found, key=lambda one: float(np.mean(one[1].squares)))
     # the fewest tables of those within one standard error of the best
-    limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(_BLOCKS)
+    limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(BLOCKS)
     overs, fit = next((overs, one) for overs, one in found if np.mean(one.squares) <= limit)
     ends = np.cumsum([widths[over] for over in overs])[:-1]
     parts = (np.split(values, ends, axis=-1) for values in (fit.values, fit.errors, fit.left_out))
@@ -206,8 +203,8 @@ class _Fit:
             penalty[at : at + width, at : at + width] += stiffness * second.T @ second
             at += width
         penalty *= np.mean(matrix**2) * len(target)
-        regression = BlockRegression.of(target, matrix, _BLOCKS, penalty)
-        left_out = np.stack([regression.fit(quarter) for quarter in np.array_split(np.arange(_BLOCKS), QUARTERS)])
+        regression = BlockRegression.of(target, matrix, BLOCKS, penalty)
+        left_out = np.stack([regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)])
         return cls(regression.fit(), regression.errors(), regression.held_out(), left_out)
 
 

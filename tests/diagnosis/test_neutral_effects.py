@@ -71,7 +71,7 @@ def test_buckets_are_few_and_large_enough():
     assert all(size <= max(1.26 * count, 1024) for size, count in zip(sizes, range(1, 100_000, 77), strict=True))
     assert len(set(sizes)) < 32
     assert all(size % 256 == 0 for size in sizes)
-    assert [bucket(count, 1) for count in (1, 2, 3, 5, 9, 17)] == [1, 2, 3, 5, 10, 20]
+    assert [bucket(count, 8) for count in (1, 9, 11, 13, 17, 21)] == [8, 10, 12, 14, 20, 24]
 
 
 def test_given_effects_keep_their_order():
