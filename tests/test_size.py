@@ -10,9 +10,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395474, 2.1, 2.31, 2.79),
+    "all": (395480, 2.09, 2.31, 2.79),
     "report": (60954, 0.25, 1.19, 0.67),
-    "diagnosis": (60443, 9.07, 7.45, 8.68),
+    "diagnosis": (60449, 9.06, 7.45, 8.68),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
     "estimation": (34426, 7.36, 12.7, 15.66),

@@ -84,12 +84,11 @@ class Choice:
         # a linear axis has no turns
         rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
         stated, sought = setup.task.config.uncertainty, candidates(setup.bare)
-        for name in stated.expected:
-            if name not in (*sought, *(effect.name for effect in setup.bare.effects)):
-                raise InputError(
-                    f"uncertainty.expected: '{name}' is no effect that is sought on this drive; it should be one of: "
-                    f"{', '.join(sought)}"
-                )
+        for name in {*stated.expected}.difference(sought, (effect.name for effect in setup.bare.effects)):
+            raise InputError(
+                f"uncertainty.expected: '{name}' is no effect that is sought on this drive; it should be one of: "
+                f"{', '.join(sought)}"
+            )
         known = *stated.exact, *rotary
         self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known, stated.expected)
         self.before = self.log.compare(setup.nominal)

@@ -224,7 +224,7 @@ class EffectSearch:
     def _explain(self, current: FittedModel) -> Explanation:
         """Add, replace and take out effects until nothing is accepted."""
         # effects that make each other needless would come and go without end
-        visited = set[tuple]()
+        visited = set()
         while True:
             state = self._identify(current)
             better = None if state in visited else self._next(current)
@@ -235,8 +235,12 @@ class EffectSearch:
             if better is not None or self._identify(current) not in visited:
                 continue
             rivals = {name: self._rivals(current, name) for name in current.names}
-            every = [(name, trial) for name in rivals for trial in (*rivals[name], *self._change_waves(current, name))]
-            accepted = [pair for pair in every if self.gain(current, pair[1].fitted).is_accepted]
+            accepted = [
+                (name, trial)
+                for name in rivals
+                for trial in (*rivals[name], *self._change_waves(current, name))
+                if self.gain(current, trial.fitted).is_accepted
+            ]
             name, best = max(accepted, key=lambda pair: -pair[1].gain.nats, default=("", None))
             if best is None or self._identify(best.fitted) in visited:
                 return Explanation(current, gains, rivals, self.remainder(current))
@@ -276,13 +280,15 @@ class EffectSearch:
         trials = self._try_all(current)
         accepted = [trial for trial in trials if trial.gain.is_accepted]
         best = max(accepted, key=lambda trial: trial.worth, default=None)
-        for trial in trials:
-            why = "most likely" if trial is best else "less likely" if trial in accepted else trial.gain.rule
-            self._note(describe_change(current.numbers, trial.fitted.numbers), trial.gain, trial is best, why)
+        fitted = None
         if self.fits is self.stated and self.passed_by is None:
             fitted = self._try_numbers(current, 0.0 if best is None else best.worth)
-            if fitted is not None:
-                return fitted
+        for trial in trials:
+            kept = trial is best and fitted is None
+            why = "most likely" if kept else "less likely" if trial in accepted else trial.gain.rule
+            self._note(describe_change(current.numbers, trial.fitted.numbers), trial.gain, kept, why)
+        if fitted is not None:
+            return fitted
         if best is None:
             self.history.append(Step("add one more effect", None, None, False, "none of them gains enough on the log"))
             return None
@@ -304,20 +310,19 @@ class EffectSearch:
         """Let the model's own numbers be further off than stated, if it is worth more than effects are."""
         fitted = self.rough.fit(current.numbers, current.theta[: len(self.stated.prior)], current)
         trial = Trial((), fitted, self.gain(current, fitted))
-        kept = trial.gain.is_accepted and trial.worth > worth
-        why = "most likely" if kept else "less likely" if trial.gain.is_accepted else trial.gain.rule
-        self._note("let all numbers be further off than stated", trial.gain, kept, why)
-        if not kept:
-            return None
-        # it may be one of the numbers alone
-        names = {name for name in self.lacking if current.linear.same(name) is not None} - {*current.names}
-        singles = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in sorted(names)]
-        best = max([trial, *(single for single in singles if single.gain.is_accepted)], key=lambda each: each.worth)
+        best = trial if trial.gain.is_accepted and trial.worth > worth else None
+        if best is not None:
+            # it may be one of the numbers alone
+            others = [name for name in self.lacking if current.linear.same(name) is not None and name not in current.names]
+            singles = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in others]
+            best = max([trial, *(single for single in singles if single.gain.is_accepted)], key=lambda each: each.worth)
+        why = "most likely" if best is trial else "less likely" if trial.gain.is_accepted else trial.gain.rule
+        self._note("let all numbers be further off than stated", trial.gain, best is trial, why)
         if best is trial:
             self.fits, self.passed_by = self.rough, current
-        else:
+        elif best is not None:
             self._note(f"add {best.added[0]}", best.gain, True, "it is one of the numbers alone")
-        return best.fitted
+        return None if best is None else best.fitted
 
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
         """Put more effects into a model, in place of those that cannot stand beside them."""
