@@ -54,17 +54,16 @@ def _files(logs: Sequence[Log], holdout: Log, folder: Path) -> tuple[list[Path],
 def _first_advice(
     logs: Sequence[Path], model: Mapping[str, Any], holdout: Path, diagnosis: Mapping[str, Any]
 ) -> dict[str, str]:
-    """The first line that `jaxbl diagnose` prints, after warnings about the log, and the first command that it proposes."""
+    """The answer of `jaxbl diagnose`, and the first command that it proposes."""
     from jaxbl.cli.next_steps import LogCall, after_diagnosis
     from jaxbl.diagnosis.diagnose import read_diagnosis_task
-    from jaxbl.report.diagnose import diagnosis_lines
+    from jaxbl.report.diagnose import describe_diagnosis
 
     task = read_diagnosis_task(list(logs), model, holdout=holdout)
     log_call = LogCall(list(logs), Path("model.toml"), holdout, None, Path("diagnosed"), [])
     log_call = log_call._replace(again=["diagnose", *map(str, log_call.words())])
     steps = after_diagnosis(task, dict(diagnosis), log_call)
-    lines = [line for line in diagnosis_lines(dict(diagnosis)) if line not in diagnosis["warnings"]]
-    return {"first_line": lines[0], "next_step": steps[0].command}
+    return {"first_line": describe_diagnosis(dict(diagnosis)).headline, "next_step": steps[0].command}
 
 
 def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapping[str, Any]:

@@ -34,7 +34,7 @@ from collections import defaultdict
 from jaxbl.workers import start_jax
 
 start_jax()
-import jaxbl.report.sweep
+import jaxbl.report.results
 from jaxbl.cli import main
 from jaxbl.sweeps import engine, run, store, sweep
 
@@ -67,7 +67,7 @@ clock(store.Store, "write_part", "write", time.thread_time)
 clock(store.Store, "has_part", "look")
 clock(run.Run, "finish", "finish")
 clock(sweep, "sweep", "sweep")
-clock(jaxbl.report.sweep, "write_sweep_report", "report")
+clock(jaxbl.report.results, "write_report", "report")
 sys.argv = ["jaxbl", *sys.argv[1:]]
 try:
     main()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         inspect as inspect,
         read_record as read_record,
     )
-    from .report.results import draw as draw, write_report as write_report
+    from .report.results import describe as describe, draw as draw, write_report as write_report
     from .sweeps.compare import Comparison as Comparison, compare as compare
     from .sweeps.status import Status as Status, status as status
     from .sweeps.sweep import (
@@ -52,7 +52,7 @@ _NAMES = {
     "estimation.identify": ("Identification", "identify"),
     "monitoring.watch": ("Watch", "watch"),
     "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
-    "report.results": ("draw", "write_report"),
+    "report.results": ("describe", "draw", "write_report"),
     "sweeps.compare": ("Comparison", "compare"),
     "sweeps.status": ("Status", "status"),
     "sweeps.sweep": ("StudyResult", "dry_run", "open_study", "repair", "share", "submit", "sweep"),

@@ -11,7 +11,6 @@ from .files import make_folder, run_or_read
 from .json_types import JsonObject
 from .lines import format_descriptions
 from .records.files import is_log, log_suffixes
-from .report.diagnose import probability, rms_text
 from .workers import Progress, clear_programs_if_needed, map_jobs, useful_processes
 
 
@@ -26,7 +25,7 @@ class LogJob(NamedTuple):
 
     def absolute(self) -> "LogJob":
         """Return the job with absolute paths, for processes in other folders."""
-        holdout = None if self.holdout is None else self.holdout.absolute()
+        holdout = self.holdout and self.holdout.absolute()
         return LogJob(self.log.absolute(), self.model.absolute(), holdout, self.folder.absolute(), self.overwrite)
 
 
@@ -86,15 +85,13 @@ def run_batch(
 def _diagnose_log(job: LogJob) -> JsonObject:
     """Diagnose a log and return its row of a batch."""
     from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
-    from .report.diagnose import write_diagnosis_report
+    from .report.results import write_report
 
     clear_programs_if_needed()
     try:
         task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
         file = job.folder / "diagnosis.json"
-        return make_batch_row(
-            job.log, run_or_read(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite)
-        )
+        return make_batch_row(job.log, run_or_read(task, file, run_diagnosis, write_report, overwrite=job.overwrite))
     except InputError as error:
         return make_batch_row(job.log, None, str(error))
 
@@ -113,18 +110,13 @@ def make_batch_row(log: Path, summary: JsonObject | None, refused: str = "") -> 
     return row
 
 
-_LONGEST_VERDICT = len("no discrepancy")
-
-
 def format_batch(rows: list[JsonObject]) -> list[str]:
     """Write the rows of a batch as a table for the terminal."""
-    cells = []
-    for row in rows:
-        if row["refused"]:
-            verdict, text = "refused", row["refused"]
-        else:
-            named = f"{row['findings']} ({probability(row['confidence'])})" if row["findings"] else ""
-            gap = " -> ".join(rms_text(row[f"theta_e_{when}"]) for when in ("before", "after"))
-            verdict, text = row["verdict"].replace("_", " "), f"{named}  theta_e {gap} ({rms_text(row['theta_e_floor'])})"
-        cells.append((row["log"], verdict.ljust(_LONGEST_VERDICT), text))
-    return format_descriptions(cells)
+    return format_descriptions(
+        (
+            row["log"],
+            row["verdict"].replace("_", " ") or "refused",
+            f"{row['findings']} ({row['confidence']:.2g})" if row["findings"] else row["refused"],
+        )
+        for row in rows
+    )

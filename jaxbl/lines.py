@@ -32,35 +32,6 @@ class NextStep(NamedTuple):
     answers: str
 
 
-def format_table(rows: Iterable[Sequence[str]], *, numbers: bool = False) -> list[str]:
-    """Align cells in columns. Columns that do not fit into a line follow below, beside the first column again.
-
-    Args:
-        rows: cells, equally many in each row; the first row is the header.
-        numbers: True if all columns but the first are numbers, which are aligned at their ends.
-
-    Example:
-        >>> format_table([("gain", "error"), ("60.0", "0.002")], numbers=True)
-        ['gain  error', '60.0  0.002']
-    """
-    columns = list(zip(*rows, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    lines: list[str] = []
-    waiting = list(range(1, len(columns)))
-    while waiting:
-        block, width = [0], widths[0]
-        while waiting and (len(block) == 1 or width + 2 + widths[waiting[0]] <= TERMINAL_WIDTH):
-            width += 2 + widths[waiting[0]]
-            block.append(waiting.pop(0))
-        for cells in zip(*(columns[i] for i in block), strict=True):
-            padded = (
-                cell.rjust(widths[i]) if numbers and i else cell.ljust(widths[i])
-                for i, cell in zip(block, cells, strict=True)
-            )
-            lines.append("  ".join(padded).rstrip())
-    return lines
-
-
 def format_descriptions(rows: Iterable[Sequence[str]]) -> list[str]:
     """Align cells in columns, of which the last is a text that is wrapped. It begins on a line of its own where the cells
     before it are long."""
@@ -85,15 +56,13 @@ def format_descriptions(rows: Iterable[Sequence[str]]) -> list[str]:
     return lines
 
 
-def format_steps(steps: Sequence[NextStep]) -> list[str]:
-    """Return next steps as lines for the terminal, none if there are no steps. Command lines are never broken."""
-    lines = ["Next:"] if steps else []
-    for step in steps:
-        lines += [
-            f"  {step.command}",
-            *textwrap.wrap(f"    {step.answers}", TERMINAL_WIDTH, subsequent_indent="    "),
-        ]
-    return lines
+def format_duration(seconds: float) -> str:
+    """Write a duration in s, min or h."""
+    if seconds < 100.0:
+        return f"{seconds:.1f} s"
+    if seconds < 6000.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.1f} h"
 
 
 def program_name() -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from .errors import InputError, escape_unprintable
-from .lines import command_line
+from .lines import command_line, format_duration
 from .workers import subscribe
 
 if TYPE_CHECKING:
@@ -249,12 +249,3 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
 def can_ask_user() -> bool:
     """Return True if a user can be asked on a terminal."""
     return sys.stdin is not None and sys.stdin.isatty()
-
-
-def format_duration(seconds: float) -> str:
-    """Write a duration in s, min or h."""
-    if seconds < 100.0:
-        return f"{seconds:.1f} s"
-    if seconds < 6000.0:
-        return f"{seconds / 60.0:.0f} min"
-    return f"{seconds / 3600.0:.1f} h"

@@ -34,7 +34,7 @@ from jaxbl.cli.next_steps import LogCall, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
 from jaxbl.errors import InputError
 from jaxbl.files import lock_folder
-from jaxbl.lines import format_steps, program_name
+from jaxbl.lines import program_name
 from jaxbl.sweeps.engine import Engine
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -93,11 +93,12 @@ def test_a_sweep_and_its_second_call(tmp_path):
         "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
-    assert lines[0].startswith("6 runs. The observers converged in ")
-    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[lines.index("Next:") - 1])
-    assert lines[-1] == "results/study_map/report.html"
+    assert lines[0].startswith("✓ Good: 6 runs: the motor observer converges in ")
+    assert lines[-1] == "results/study_map/report.html" and len(lines) <= 8
+    page = (folder / "report.html").read_text()
+    assert re.search(r"<li>Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.</li>", page)
     second = run_command("sweep", "study.toml", cwd=tmp_path, **cache)
-    assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
+    assert second.stdout.splitlines() == lines
 
 
 def test_interrupted_sweep_says_how_to_go_on(tmp_path):
@@ -312,7 +313,7 @@ def test_shares_and_how_far_they_are(call, tmp_path):
     assert call("status", "a")[1] == lines[:2]
     # who is last writes the report
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2", "--out", "a")
-    assert code == 0 and lines[0].startswith("12 runs.") and lines[-1] == "a/report.html"
+    assert code == 0 and lines[0].startswith("✓ Good: 12 runs: ") and lines[-1] == "a/report.html"
     assert call("status", "a")[1] == ["a: 'small [red]', 4 of 4 parts (100 %) of 12 runs", "  finished"]
     assert len(list_files(tmp_path / "a" / "points")) == 4 and (tmp_path / "a" / "report.html").is_file()
 
@@ -321,7 +322,7 @@ def test_a_sweep_is_explored(call, tmp_path):
     write_study(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
-    assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
+    assert code == 0 and lines[0].startswith("4 runs: ") and lines[-1] == "page/index.html"
     assert {"index.html", "map.js", "plot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
         list_files(Path("page"))
     )
@@ -415,12 +416,12 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
     assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(list_files(folder))
-    assert lines[0].startswith("motor: gains ") and lines[1].startswith("motor: lambda = ")
-    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", lines[-2])
+    assert "λ = " in lines[0] and "α = " in lines[0] and len(lines) <= 8
+    assert re.search(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", (folder / "report.html").read_text())
     assert lines[-1] == "results/study_gains/report.html"
     # the second call computes nothing and says the same
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished search simulates"))
-    assert call("tune", "study.toml")[:2] == (0, [*lines[:-2], lines[-1]])
+    assert call("tune", "study.toml")[:2] == (0, lines)
     # other commands may share the folder, another study may not
     assert call("simulate", "study.toml")[0] == 0
     write_study(tmp_path, tunable_study(margin_exact=1.5), "b.toml")
@@ -456,7 +457,7 @@ def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
     write_study(tmp_path, rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
     code, lines, _ = call("simulate", "study.toml")
     assert code == 1
-    assert any(line.startswith("The run diverged") for line in lines)
+    assert lines[0].startswith("✗ Failed: The run diverges")
     assert (tmp_path / "results" / "study_run" / "summary.json").exists()
 
 
@@ -584,7 +585,7 @@ def test_inspect_writes_a_first_model(call, tmp_path):
     simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
     assert code == 0 and "axis.toml: a first model." in lines
-    assert [command for command, _ in read_steps(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
+    assert "Next: jaxbl identify axis.csv --model axis.toml" in lines
     text = (tmp_path / "axis.toml").read_text()
     assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
     assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
@@ -597,10 +598,10 @@ def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(cal
     code, lines, _ = call("inspect", "axis.csv")
     folder = tmp_path / "results" / "axis_inspected"
     assert code == 0
-    assert lines[0] == "axis.csv: 6000 samples, 6 s every 1 ms, even stamps, one segment"
-    assert lines[1].startswith("As read: motor up to ") and "u up to " in lines[1]
-    assert [line.split()[0] for line in lines[4:7]] == ["theta_e", "theta_s", "u"]
-    assert lines[-1] == "results/axis_inspected/report.html" and len(lines) <= 26
+    assert lines[0].startswith("✓ Good: The log shows inertia, ")
+    assert any(line.split(maxsplit=2)[-1] == "6000 samples every 1 ms, even stamps, 1 segment" for line in lines)
+    assert any(line.startswith("As read: motor up to ") and "u up to " in line for line in lines)
+    assert lines[-1] == "results/axis_inspected/report.html" and len(lines) <= 8
     figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
     assert {"inspection.json", "report.html"} | figures <= set(list_files(folder))
     assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
@@ -643,9 +644,9 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
         pd.DataFrame({"t": t, "x": 1e3 * x, "force": u}).to_csv(tmp_path / name, index=False)
     model = write_study(tmp_path, {"log": {"kind": "element", "theta_e": {"column": "x", "unit": "mm"}, "u": "force"}})
     code, out, _ = call("inspect", "rig.csv", "--model", model, "--out", "seen")
-    assert code == 0 and any(line.startswith("gap") and " yes " in line for line in out)
+    assert code == 0 and out[0].startswith("✓ Good: The log shows ") and "gap" in out[0]
     code, out, err = call("identify", "rig.csv", "--model", model, "--out", "found", "--holdout", "again.csv")
-    assert (code, err) == (0, []) and out[0].startswith("transmission.stiffness = ") and " N/m, 95 %: " in out[0]
+    assert (code, err) == (0, []) and any(line.endswith(" N/m  transmission.stiffness") for line in out)
     parameters = json.loads(Path("found/identification.json").read_text())["parameters"]
     assert json.loads(Path("found/identification.json").read_text())["title"] == "Transmission of rig.csv"
     assert parameters["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
@@ -653,12 +654,10 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
     assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(list_files(Path("found")))
     with pytest.raises(InputError, match=r"study.toml: log.kind: 'element' is a transmission alone, without the drive"):
         call("diagnose", "rig.csv", "--model", model)
-    for extra, message in (
-        (["rig.csv"], "one log is fitted at a time"),
-        (["--profile"], "--profile is for drives"),
-        (["--next-experiment", "next.csv"], "--next-experiment is for drives"),
-    ):
-        with pytest.raises(InputError, match=message):
+    for extra in (["rig.csv"], ["--profile"], ["--next-experiment", "next.csv"]):
+        with pytest.raises(
+            InputError, match="of a transmission on a test rig one log is fitted at a time, without --profile"
+        ):
             call("identify", "rig.csv", *extra, "--model", model)
     pd.DataFrame({"t": t, "x": t, "force": u}).to_csv("rig.csv", index=False)
     with pytest.raises(InputError, match=r"rig.csv: the displacement never turns back"):
@@ -671,7 +670,7 @@ def test_inspect_runs_without_a_word_on_stderr(tmp_path):
         "inspect", str(find_recording("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path
     )
     assert (result.returncode, without_progress(result.stderr)) == (0, "")
-    assert "motion up to" in result.stdout
+    assert "its motion is over" in result.stdout
 
 
 def test_a_refined_sweep_from_the_command_line(call, tmp_path):
@@ -689,9 +688,9 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert all(len(line) <= 80 for line in lines)
     code, first, _ = call("sweep", "study.toml")
     assert code == 0
-    assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
+    assert re.match(r"✓ Good: \d+ runs at \d+ of 289 grid points \([\d.]+ %\): ", first[0])
     _, second, _ = call("sweep", "study.toml")
-    assert second == [line for line in first if not line.startswith("Compiled")]
+    assert second == first
     _, plot_lines, _ = call("plot", "results/study_map")
     assert plot_lines == second
 
@@ -710,7 +709,7 @@ def test_a_log_is_identified(call, tmp_path):
     pd.read_parquet("made/trace.parquet")[["t", "u", "theta_e"]].to_csv("axis.csv", index=False)
     code, lines, _ = call("identify", "axis.csv", "--model", "axis.toml")
     assert code == 0
-    assert lines[0].startswith("drive.motor_inertia = 0.0")
+    assert any(line.endswith(" kg m²  drive.motor_inertia") for line in lines)
     assert lines[-1] == "results/axis_identified/report.html"
     content = json.loads((tmp_path / "results/axis_identified/identification.json").read_text())
     names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
@@ -759,13 +758,13 @@ def test_an_interrupted_identification_says_how_to_start_again(axis_log, call, t
 
 def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis_log, call, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("jaxbl.report.page.html", interrupt)
+        patched.setattr("jaxbl.report.page.format_page", interrupt)
         assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{INTERRUPTED} --out out"])
         assert not (tmp_path / "out").exists()
     assert call(*IDENTIFY, "--out", "out")[0] == 0
     before = {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")}
     write_study(tmp_path, AXIS | {"title": "another"}, "axis.toml")
-    monkeypatch.setattr("jaxbl.report.page.html", interrupt)
+    monkeypatch.setattr("jaxbl.report.page.format_page", interrupt)
     assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{INTERRUPTED} --out out"])
     assert {name: (tmp_path / "out" / name).read_bytes() for name in list_files(tmp_path / "out")} == before
 
@@ -789,6 +788,9 @@ def test_an_interrupt_while_numbers_are_sought(axis_log, tmp_path):
 
 GAP = {"theta_e": 0.1, "torque_motor": 1.0}
 DIAGNOSIS = {
+    "title": "",
+    "history": [],
+    "parameters": {},
     "verdict": "explained",
     "findings": [
         {
@@ -833,15 +835,12 @@ def quick_tasks(monkeypatch):
         tasks.append(task)
         return _Found(task)
 
-    def report(result, folder, steps=()):
-        from jaxbl.report.diagnose import diagnosis_lines
-
+    def report(result, folder, described=None):
         (folder / "report.html").write_text("its page")
         (folder / "diagnosis.json").write_text(json.dumps(result.summary))
-        return diagnosis_lines(result.summary)
 
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", run_task)
-    monkeypatch.setattr("jaxbl.report.diagnose.write_diagnosis_report", report)
+    monkeypatch.setattr("jaxbl.report.results.write_report", report)
     return tasks
 
 
@@ -851,21 +850,19 @@ DIAGNOSE = ["diagnose", "an axis.csv", "--model", "axis.toml"]
 def test_a_log_is_diagnosed_once(axis_log, quick_tasks, call, tmp_path):
     code, lines, _ = call(*DIAGNOSE, "--next-experiment", "next.csv")
     assert code == 0
-    assert lines[0] == (
-        "Explained: the model lacks motor.coulomb_friction; with it, no more is left on data not used for the fit than "
-        "noise and the uncertainty of the model's numbers account for."
-    )
-    assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m; 12 % of the driving torque."
-    assert lines[2].startswith(
-        "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms (noise; most that a complete "
-        "model leaves): theta_e 0.1 -> 0.001 rad (0.001; 0.0012), "
-    )
-    index = lines.index("Next:")
-    assert lines[index - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    assert lines[0].startswith("✓ Good: The model lacks motor.coulomb_friction; with it, it predicts new data as well as")
+    experiment, *figures = lines[2:6]
+    assert experiment.strip().startswith("next experiment  Nothing is tied") and not (tmp_path / "next.csv").exists()
+    assert figures == [
+        "      1 → 0.01 N m  motor: missing torque: rms error on held-out data (noise 0.01)",
+        "   0.1 → 0.001 rad  motor position: rms error on held-out data (noise 0.001)",
+        "  0.05 ± 0.001 N m  motor.coulomb_friction: torque",
+    ]
     run = "jaxbl simulate 'results/an axis_diagnosed/model.toml' --out 'results/an axis_diagnosed_run'"
-    assert [command for command, _ in read_steps(lines)] == [run, "jaxbl explore 'results/an axis_diagnosed'"]
+    assert lines[-2] == f"Next: {run}"
     assert lines[-1] == "results/an axis_diagnosed/report.html"
-    assert call(*DIAGNOSE) == (0, [*lines[: index - 1], *lines[index:]], [])
+    code, others, errors = call(*DIAGNOSE)
+    assert (code, errors, others[:2], others[2:5]) == (0, [], lines[:2], figures) and others[-2:] == lines[-2:]
     assert len(quick_tasks) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
@@ -951,7 +948,9 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     content = json.loads("\n".join(lines))
     assert (code, content["command"], content["exit"]) == (0, "sweep", 0)
     assert content["summary"] == {"title": "small", "runs": 3, "finished": True}
-    assert content["found"][0].startswith("3 runs.") and content["open"] == "out/report.html"
+    assert (
+        content["found"][0].startswith("3 runs: ") and content["verdict"] == "good" and content["open"] == "out/report.html"
+    )
     assert [step["command"].split()[1] for step in content["next"]] == ["explore", "tune", "simulate"]
     assert {tuple(step) for step in content["next"]} == {("command", "answers")}
     assert set(content["files"]) == {
@@ -982,12 +981,9 @@ def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
     assert files == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
 
 
-def read_steps(lines):
-    """Command lines under "Next:", each with its question."""
-    index = lines.index("Next:") + 1
-    rows = lines[index : index + 2 * sum(line.startswith("  jaxbl ") for line in lines[index:])]
-    assert all(line.startswith("  jaxbl ") for line in rows[::2]) and all(len(line) <= 80 for line in rows[1::2])
-    return [(command.strip(), question.strip()) for command, question in zip(rows[::2], rows[1::2], strict=True)]
+def read_steps(content):
+    """Command lines of an outcome as JSON, each with its question."""
+    return [(step["command"], step["answers"]) for step in json.loads("\n".join(content))["next"]]
 
 
 def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
@@ -995,17 +991,16 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
     monkeypatch.setattr(setup, "_find_shipped_study", lambda name: study)
     code, lines, _ = call("demo", "--out", "results/a map")
     assert code == 0 and lines[-1] == "results/a map/report.html"
-    steps = read_steps(lines)
+    steps = read_steps(call("demo", "--out", "results/a map", "--json")[1])
+    assert lines[-2] == f"Next: {steps[0][0]}"
     assert [shlex.split(command)[1] for command, _ in steps] == ["explore", "tune", "simulate", "init"]
     page = unescape(Path("results/a map/report.html").read_text(encoding="utf-8"))
     studied = (
         "Studied: a rigid drive in runs of 0.2 s, sampled every 1 ms, over observer.motor.alpha (2 values, 5 to 9 rad/s²)"
     )
-    assert all(
-        text in page for text in (lines[0], studied, "The question: which gains?", "What to try next", *chain(*steps))
-    )
+    assert all(text in page for text in (studied, "The question: which gains?", *chain(*steps)))
     # another page of the same study says the same
-    assert read_steps(call("plot", "results/a map")[1]) == steps[:-1]
+    assert read_steps(call("plot", "results/a map", "--json")[1]) == steps[:-1]
     for command, _ in steps[:-1]:
         words = shlex.split(command)[1:]
         # else it serves the page until it is ended
@@ -1015,7 +1010,7 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
     with pytest.raises(InputError, match="numbers are missing"):
         call(*shlex.split(steps[-1][0])[1:])
     write_study(tmp_path, name="drive.toml")
-    assert len(read_steps(call("demo", "--out", "results/a map")[1])) == 3
+    assert len(read_steps(call("demo", "--out", "results/a map", "--json")[1])) == 3
 
 
 def test_after_logs_what_is_open_by_what_was_found():
@@ -1027,7 +1022,6 @@ def test_after_logs_what_is_open_by_what_was_found():
         return SimpleNamespace(record=SimpleNamespace(segments=cut), missing=frozenset(missing))
 
     def list_commands(steps):
-        assert all(len(line) <= 80 for line in format_steps(steps) if line.startswith("    "))
         assert steps[-1].command == "jaxbl explore out"
         return [step.command for step in steps[:-1]]
 

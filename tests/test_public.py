@@ -33,6 +33,7 @@ FLOORS = [
     {"json_types"},
     {"errors", "registry", "units"},
     {"lines"},
+    {"result"},
     {"files", "validation", "workers"},
     {"cluster", "drive"},
     {"observer", "records"},

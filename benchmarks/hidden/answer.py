@@ -4,6 +4,7 @@ Each CASE is a folder with log*.csv, holdout*.csv and model.toml; OUT/NAME.json 
 a case that has one is left out. Nothing of the bench is imported, so that an older commit answers the same way.
 """
 
+import importlib
 import json
 import sys
 import time
@@ -17,7 +18,6 @@ def answer_case(folder: Path) -> dict[str, Any]:
     """What `jaxbl.diagnose` says of a case, and its processor time in s; of a failure, which kind of it and its words."""
     import jaxbl
     from jaxbl.errors import InputError
-    from jaxbl.report.diagnose import diagnosis_lines
 
     start, answer = (time.process_time(), time.perf_counter()), {}
     try:
@@ -29,7 +29,11 @@ def answer_case(folder: Path) -> dict[str, Any]:
             {key: finding.get(key) for key in ("effect", "confidence", "parameters", "alternatives")}
             for finding in summary["findings"]
         ]
-        answer |= {"lines": list(diagnosis_lines(summary)), "model": tomllib.loads(diagnosis.model.to_toml())}
+        if hasattr(jaxbl, "describe"):
+            lines = jaxbl.describe(diagnosis).sentences
+        else:
+            lines = importlib.import_module("jaxbl.report.diagnose").diagnosis_lines(summary)
+        answer |= {"lines": list(lines), "model": tomllib.loads(diagnosis.model.to_toml())}
     except InputError as error:
         answer = {"failure": "refused", "error": str(error).replace(f"{folder}/", "")}
     except Exception:

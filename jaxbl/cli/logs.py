@@ -1,7 +1,7 @@
 """Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +10,7 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
+from jaxbl.result import KeyFigure
 from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
@@ -34,6 +35,7 @@ from .outcome import Outcome
 if TYPE_CHECKING:
     from jaxbl.monitoring.watch import Watch, WatchTask
     from jaxbl.records import LogTable
+    from jaxbl.result import Result
 
 ALARM = 3
 """Exit code of a watch with an alarm."""
@@ -51,7 +53,7 @@ def inspect(
         check_new(write, "--write")
     from jaxbl.files import claim_log_folder
     from jaxbl.records import inspect as inspect_log
-    from jaxbl.report.inspect import write_inspection_report
+    from jaxbl.report.results import describe, write_report
 
     table = gear_ratio = nominal = None
     if model is not None:
@@ -59,7 +61,6 @@ def inspect(
 
         table, gear_ratio, nominal = read_log_config(model)
     guesses: list[str] = []
-    steps = [] if write is None else after_proposal(log, write)
     if write is None:
         inspection = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
@@ -69,7 +70,7 @@ def inspect(
         study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, "inspected", out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    lines = write_inspection_report(inspection, folder, steps)
+    card = describe(inspection)
     if write is not None:
         import tomli_w
 
@@ -80,8 +81,10 @@ def inspect(
             *guesses,
         ]
         write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
-        lines += ["", f"{write}: a first model.", *guesses]
-    return Outcome(lines, folder, summary="inspection.json", steps=steps)
+        remarks = [f"{write}: a first model.", *guesses, *card.remarks]
+        card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
+    write_report(inspection, folder, card)
+    return Outcome(card, folder, summary="inspection.json")
 
 
 def identify(
@@ -106,18 +109,16 @@ def identify(
 
     table, gear_ratio, _ = read_log_config(model)
     if table.kind == "element":
-        if len(log) > 1:
-            raise InputError("identify: several logs; of a transmission on a test rig one log is fitted at a time")
-        if profile:
+        if len(log) > 1 or profile or next_experiment is not None:
             raise InputError(
-                "identify: --profile is for drives; a transmission on a test rig has intervals without it; leave it out"
+                "identify: of a transmission on a test rig one log is fitted at a time, without --profile (it has intervals "
+                "anyway) and --next-experiment (which is for drives); leave these out"
             )
-        if next_experiment is not None:
-            raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], "identified", out), overwrite)
     from jaxbl.estimation.identify import read_identification_task, run_identification
     from jaxbl.files import run_or_read
-    from jaxbl.report.identify import identification_lines, write_identification_report
+    from jaxbl.report.identify import describe_identification
+    from jaxbl.report.results import write_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     check_doubts(filter(None, (task.record, task.holdout)), force)
@@ -127,21 +128,25 @@ def identify(
         check_gap_sought(task)
     folder = folder_of(log[0], "identified", out)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-    propose = partial(after_identification, task, log_call=log_call)
+
+    def describe(summary: JsonObject) -> "Result":
+        return replace(describe_identification(summary), next_steps=after_identification(task, summary, log_call))
+
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "identification.json",
             lambda task: run_identification(task, progress),
-            lambda result, folder: write_identification_report(result, folder, propose(result.summary)),
+            lambda result, folder: write_report(result, folder, describe(result.summary)),
             overwrite=overwrite,
         )
-    lines = identification_lines(summary)
+    card = describe(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import write_gap_experiment
 
-        lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary, steps=propose(summary))
+        written = write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
+        card = replace(card, key_figures=[KeyFigure("next experiment", written), *card.key_figures[:3]])
+    return Outcome(card, folder, summary=summary)
 
 
 def _identify_element(
@@ -149,12 +154,13 @@ def _identify_element(
 ) -> Outcome:
     from jaxbl.estimation.element import read_element_task, run_element
     from jaxbl.files import run_or_read
-    from jaxbl.report.element import element_lines, write_element_report
+    from jaxbl.report.element import describe_element
+    from jaxbl.report.results import write_report
 
     task = read_element_task(log, table, gear_ratio, holdout=holdout)
     file = folder / "identification.json"
-    summary = run_or_read(task, file, run_element, write_element_report, overwrite=overwrite)
-    return Outcome(element_lines(summary), folder, summary=summary)
+    summary = run_or_read(task, file, run_element, write_report, overwrite=overwrite)
+    return Outcome(describe_element(summary), folder, summary=summary)
 
 
 def diagnose(
@@ -196,28 +202,33 @@ def diagnose(
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
     from jaxbl.files import run_or_read
-    from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
+    from jaxbl.report.diagnose import describe_diagnosis
+    from jaxbl.report.results import write_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     check_doubts(filter(None, (task.record, task.holdout)), force)
     folder = folder_of(log[0], "diagnosed", out)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-    propose = partial(after_diagnosis, task, log_call=log_call)
+
+    def describe(summary: JsonObject) -> "Result":
+        return replace(describe_diagnosis(summary), next_steps=after_diagnosis(task, summary, log_call))
+
     with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
         summary = run_or_read(
             task,
             folder / "diagnosis.json",
             lambda task: run_diagnosis(task, progress),
-            lambda result, folder: write_diagnosis_report(result, folder, propose(result.summary)),
+            lambda result, folder: write_report(result, folder, describe(result.summary)),
             overwrite=overwrite,
         )
-    lines = diagnosis_lines(summary)
+    card = describe(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
 
         write = write_gap_experiment if "backlash" in summary else write_next_experiment
-        lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary, steps=propose(summary))
+        written = write(folder, summary, task.record, next_experiment, max_torque, max_travel)
+        card = replace(card, key_figures=[KeyFigure("next experiment", written), *card.key_figures[:3]])
+    return Outcome(card, folder, summary=summary)
 
 
 def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:
@@ -269,22 +280,21 @@ def watch(
     workers.start_jax()
     from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.monitoring.watch import read_watch_task
-    from jaxbl.report.watch import watch_lines, write_watch_report
+    from jaxbl.report.results import describe, write_report
 
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
-    steps = []
     if folder is None:
         result = _watch_and_print(context, task, None)
-        lines = watch_lines(result.summary)
+        card = describe(result)
     else:
         with remove_if_empty_on_error(folder), lock_folder(folder):
             _claim_watch(folder, task, overwrite)
             result = _watch_and_print(context, task, folder)
-            steps = after_watch(task, result.summary, model)
-            lines = write_watch_report(result, folder, steps)
+            card = replace(describe(result), next_steps=after_watch(task, result.summary, model))
+            write_report(result, folder, card)
     code = ALARM if result.summary["alarm"] else 0
-    return Outcome(lines, folder, summary=result.summary, code=code, steps=steps, compact=True)
+    return Outcome(card, folder, summary=result.summary, code=code)
 
 
 def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:

@@ -9,9 +9,10 @@ from jaxbl.json_types import JsonObject
 from jaxbl.lines import NextStep, command_line
 
 if TYPE_CHECKING:
+    from jaxbl.config import Config
     from jaxbl.estimation.logs import LogTask
     from jaxbl.monitoring.watch import WatchTask
-    from jaxbl.sweeps.sweep import StudyResult
+    from jaxbl.result import Result
 
 
 def _propose(question: str, *words: object) -> NextStep:
@@ -28,38 +29,27 @@ def after_init(file: Path) -> list[NextStep]:
     ]
 
 
-def after_demo(result: "StudyResult", folder: Path) -> list[NextStep]:
+def after_demo(card: "Result", study: "Config", folder: Path) -> list[NextStep]:
     """Propose commands after a sweep, and a study of the user's own drive."""
-    steps, own_study = after_sweep(result, folder), Path("drive.toml")
+    steps, own_study = after_sweep(card, study, folder), Path("drive.toml")
     if not own_study.exists():
         steps.append(_propose("And my own drive? A study of it, from the numbers of its data sheet.", "init", own_study))
     return steps
 
 
-def after_sweep(result: "StudyResult", folder: Path) -> list[NextStep]:
+def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]:
     """Propose commands for a sweep's folder, and for the study in it."""
-    study = folder / "study.toml"
+    file = folder / "study.toml"
     steps = [_propose("How do other metrics look, over other axes? Maps in the browser.", "explore", folder)]
-    if is_remote(study):
+    if is_remote(file):
         return steps
     gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
-    if gains & {*result.config.axis_paths} and _all_converge_somewhere(result):
+    # where no gains work, none can be chosen
+    if gains & {*study.axis_paths} and card.verdict == "good":
         question = "Which gains have the least error, and are they better than the usual rule?"
-        steps.append(_propose(question, "tune", study, "--out", f"{folder}_gains"))
+        steps.append(_propose(question, "tune", file, "--out", f"{folder}_gains"))
     question = "What happens over time? One run, with the numbers that the study itself has."
-    return [*steps, _propose(question, "simulate", study, "--out", f"{folder}_run")]
-
-
-def _all_converge_somewhere(result: "StudyResult") -> bool:
-    """Return True if each observer converged in at least one run."""
-    metrics_left = {f"{side}.converged" for side in result.config.build().sides}
-    if not metrics_left <= set(result.columns):
-        return False
-    for frame in result.batches(sorted(metrics_left)):
-        metrics_left -= {name for name in metrics_left if bool(frame[name].to_numpy().any())}
-        if not metrics_left:
-            return True
-    return False
+    return [*steps, _propose(question, "simulate", file, "--out", f"{folder}_run")]
 
 
 def after_proposal(log: Path, model: Path) -> list[NextStep]:

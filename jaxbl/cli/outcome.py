@@ -3,7 +3,7 @@
 import functools
 import inspect
 import json as json_format
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -12,55 +12,51 @@ import typer
 from jaxbl.errors import InputError, NoResult, escape_unprintable
 from jaxbl.files import list_paths, read_json
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep, format_steps
+from jaxbl.result import Result, format_result
 from jaxbl.terminal import INTERRUPTED
 
 from .options import flag
 
 QuietOption = Annotated[bool, flag("--quiet", "print neither progress nor what was found, errors alone")]
 JsonOption = Annotated[bool, flag("--json", "print what was found as one JSON object")]
+_COLOURS = {"✓ ": "green", "! ": "yellow", "✗ ": "red", "? ": "yellow"}
+"""Of lines that begin with the symbol of a verdict."""
 
 
 class Outcome(NamedTuple):
     """The outcome of a command.
 
     Attributes:
-        lines: for the terminal.
+        content: what was found, or lines for the terminal where there is no page.
         folder: of the results, if there are any.
         page: file in the folder to open; "" for none.
         summary: the outcome as data, or the name of the file in the folder that holds it.
         code: exit code.
-        steps: commands to try next.
-        compact: True if the JSON object is one line, since lines of JSON came before it.
     """
 
-    lines: list[str]
+    content: Result | list[str]
     folder: Path | None = None
     page: str = "report.html"
     summary: JsonObject | str | None = None
     code: int = 0
-    steps: Sequence[NextStep] = ()
-    compact: bool = False
 
     def text(self) -> list[str]:
-        """Return the lines, the commands to try next, and the file to open."""
+        """Return what was found, and the file to open."""
         opened = [str(self.folder / self.page)] if self.folder is not None and self.page else []
-        return [
-            escape_unprintable(part)
-            for line in [*self.lines, *format_steps(self.steps), *opened]
-            for part in line.split("\n")
-        ]
+        lines = [*self.content, *opened] if isinstance(self.content, list) else format_result(self.content, opened)
+        return [escape_unprintable(part) for line in lines for part in line.split("\n")]
 
     def data(self) -> JsonObject:
         """Return the outcome as plain data, with the files in the folder but for a sweep's parts (there may be millions)."""
-        fields: JsonObject = {"exit": self.code, "found": [line for line in self.lines if line]}
+        fields: JsonObject = {"exit": self.code, "found": self.content}
+        if isinstance(self.content, Result):
+            steps = [step._asdict() for step in self.content.next_steps]
+            fields |= {"verdict": self.content.verdict, "found": self.content.sentences, "next": steps}
         if self.folder is not None:
             files = [file for pattern in ("*.*", "figures/*.*") for file in list_paths(self.folder, pattern)]
             fields["folder"] = str(self.folder)
             fields["open"] = str(self.folder / self.page) if self.page else None
             fields["files"] = [str(file) for file in files if not file.name.startswith(".")]
-        if self.steps:
-            fields["next"] = [step._asdict() for step in self.steps]
         if self.summary is not None:
             folder = self.folder or Path()
             fields["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary
@@ -73,7 +69,6 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*, quiet: bool, json: bool, **arguments: Any) -> None:
         report: JsonObject = {}
-        indent: int | None = 1
         try:
             outcome = command(**arguments)
         except (InputError, NoResult) as error:
@@ -87,17 +82,16 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
             raise
         else:
             if json:
-                report, indent = outcome.data(), None if outcome.compact else 1
+                report = outcome.data()
             elif not quiet:
                 for line in outcome.text():
-                    typer.echo(line)
+                    # colours are left out where it is no terminal
+                    typer.secho(line, fg=_COLOURS.get(line[:2]))
         finally:
             if json and report:
                 from jaxbl.files import to_jsonable
 
-                typer.echo(
-                    json_format.dumps(to_jsonable({"command": command.__name__} | report), indent=indent, ensure_ascii=False)
-                )
+                typer.echo(json_format.dumps(to_jsonable({"command": command.__name__} | report), ensure_ascii=False))
         if outcome.code:
             raise typer.Exit(outcome.code)
 

@@ -22,6 +22,7 @@ from jaxbl.datasheet import (
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
 from jaxbl.lines import format_descriptions
+from jaxbl.result import Result
 from jaxbl.terminal import can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
@@ -80,19 +81,21 @@ def init(
     write_atomic(file, text)
     bounds = {side: item["f_plus"] for side, item in pilot_metrics.items()}
     largest = ", ".join(f"{bound:.3g} {KINDS[name].unit(side, 'rad/s²')} ({side})" for side, bound in bounds.items())
-    lines = [
-        f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
-        describe_expectation(KINDS[name], pilot_metrics),
-        comparison,
-        *([obstacle] if (obstacle := describe_obstacle(pilot_metrics)) else []),
-    ]
+    obstacle = describe_obstacle(pilot_metrics)
+    card = Result(
+        file.stem,
+        "doubtful" if obstacle else "good",
+        f"{file} is a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
+        remarks=[*([obstacle] if obstacle else []), describe_expectation(KINDS[name], pilot_metrics), comparison],
+        next_steps=after_init(file),
+    )
     data = {
         "file": str(file),
         "kind": name,
         "given": {name: item._asdict() for name, item in values.items()},
         "f_plus": bounds,
     }
-    return Outcome(lines, summary=data, steps=after_init(file))
+    return Outcome(card, summary=data)
 
 
 def _check_kind(text: str) -> str:

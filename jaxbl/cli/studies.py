@@ -1,12 +1,12 @@
 """Commands on studies: simulate, sweep, status, tune, verify, plot, explore, compare, repair."""
 
-import dataclasses
 import functools
 import math
 import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,9 +15,8 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.files import FolderInUse, has_file, to_path
-from jaxbl.lines import NextStep, format_descriptions
+from jaxbl.lines import NextStep, format_descriptions, format_duration
 from jaxbl.terminal import (
-    format_duration,
     is_quiet,
     name_config_in_errors,
     run_until_interrupted,
@@ -43,6 +42,7 @@ from .outcome import Outcome
 
 if TYPE_CHECKING:
     from jaxbl.config import Config
+    from jaxbl.result import Result
     from jaxbl.sweeps.programs import Backend
     from jaxbl.sweeps.status import Status
     from jaxbl.sweeps.sweep import StudyResult
@@ -60,7 +60,7 @@ def simulate(
     workers.start_jax()
     from jaxbl.config import read_config
     from jaxbl.files import lock_folder, remove_if_empty_on_error
-    from jaxbl.report.simulate import write_trial_report
+    from jaxbl.report.results import write_report
     from jaxbl.sweeps.store import claim_folder
     from jaxbl.sweeps.trial import run
 
@@ -69,8 +69,8 @@ def simulate(
     with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
         claim_folder(folder, study, "simulate", overwrite=overwrite)
         trial = run(study, seed=seed, every=every)
-        lines = write_trial_report(trial, folder)
-    return Outcome(lines, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
+        card = write_report(trial, folder)
+    return Outcome(card, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
 
 
 def sweep(
@@ -165,16 +165,14 @@ def _describe_study(study: "Status") -> list[str]:
         lines.append(f"  {study.damaged} damaged files are kept in {study.folder / 'damaged'}")
     if study.finished and study.complete:
         return [*lines, "  finished"]
-    rate, remaining = study.parts_per_second, study.remaining_seconds
-    speed = f", {60.0 * rate:.3g} parts a minute" if rate else ""
+    remaining = study.remaining_seconds
     if study.complete:
         lines.append("  all parts are there; 'jaxbl sweep' on it reads them and writes the report")
     elif study.held_by:
-        lines.append(
-            f"  {study.held_by} is at work{speed}{'' if remaining is None else f', {format_duration(remaining)} left'}"
-        )
+        left = "" if remaining is None else f", {format_duration(remaining)} left"
+        lines.append(f"  {study.held_by} is at work{left}")
     else:
-        lines.append(f"  no process is at work in it{speed and f' (it went at{speed[1:]})'}; 'jaxbl sweep' goes on")
+        lines.append("  no process is at work in it; 'jaxbl sweep' goes on")
     return lines
 
 
@@ -262,30 +260,22 @@ def compute(
     backend: "Backend | None",
     run: Callable[..., Any],
     command: str,
-    steps: Callable[[Any, Path], Sequence[NextStep]] | None = None,
+    steps: Callable[["Result", "Config", Path], Sequence[NextStep]] = lambda *_: (),
 ) -> Outcome:
     """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took.
 
-    `steps` says what to try next, of the result and the folder.
+    `steps` says what to try next, by what was found, the study and the folder.
     """
     folder = folder_of(config, _FOLDERS[command], out)
     with run_with_progress(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
-    from jaxbl.fused import SCAN_MESSAGE
-
     with show_task(context, "drawing"):
         # what draws is loaded when there is something to be drawn
-        from jaxbl.report.results import writer
+        from jaxbl.report.results import describe, write_report
 
-        next_steps = [] if steps is None else steps(result, folder)
-        lines = writer(result)(result, folder, *([next_steps] if next_steps else []))
-    cost = getattr(result, "cost", None)
-    if cost and cost["lanes"]:
-        compiling, computing = format_duration(cost["compile_seconds"]), format_duration(cost["run_seconds"])
-        lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    lines += (SCAN_MESSAGE % reason for reason in result.fallback_reasons)
-    lines += (f"Damaged, and computed anew: {reason}" for reason in getattr(result, "damaged", ()))
-    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _study_size(result), steps=next_steps)
+        card = describe(result)
+        card = write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
+    return Outcome(card, folder, summary=_SUMMARIES.get(command) or _study_size(result))
 
 
 def plot(
@@ -297,7 +287,7 @@ def plot(
     workers.start_jax()
     from jaxbl.config import read_config
     from jaxbl.files import make_folder
-    from jaxbl.report.sweep import write_sweep_report
+    from jaxbl.report.results import describe, write_report
     from jaxbl.sweeps.store import Store, identity
     from jaxbl.sweeps.sweep import open_study
 
@@ -307,10 +297,11 @@ def plot(
         study = read_config(config)
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
-        result = dataclasses.replace(result, config=study)
+        result = replace(result, config=study)
     with show_task(context, "drawing"):
-        steps = after_sweep(result, where)
-        return Outcome(write_sweep_report(result, where, steps), where, summary=_study_size(result), steps=steps)
+        card = describe(result)
+        card = write_report(result, where, replace(card, next_steps=after_sweep(card, result.config, where)))
+    return Outcome(card, where, summary=_study_size(result))
 
 
 def explore(
@@ -361,7 +352,7 @@ def compare(
     """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
     workers.start_jax()
     from jaxbl.files import is_empty, make_folder, remove_if_empty_on_error
-    from jaxbl.report.compare import write_comparison
+    from jaxbl.report.results import write_report
     from jaxbl.sweeps.compare import compare as run_compare
     from jaxbl.sweeps.sweep import open_study
 
@@ -371,8 +362,8 @@ def compare(
     if not is_empty(folder) and not (folder / "comparison.json").exists():
         raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
     with remove_if_empty_on_error(folder), show_task(context, "comparing"):
-        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
-    return Outcome(lines, folder, "comparison.json", "comparison.json")
+        card = write_report(run_compare(*studies), folder)
+    return Outcome(card, folder, summary="comparison.json")
 
 
 def repair(folder: FolderArgument) -> Outcome:

@@ -71,8 +71,8 @@ def write_next_experiment(
     path: Path,
     torque: float | None = None,
     travel: float | None = None,
-) -> list[str]:
-    """Write the input as CSV with columns t (s) and u (N m). Returns lines for the terminal.
+) -> str:
+    """Write the input as CSV with columns t (s) and u (N m). Returns a sentence on it.
 
     Args:
         folder: results of the diagnosis.
@@ -86,11 +86,11 @@ def write_next_experiment(
     """
     pair = tied(summary)
     if pair is None:
-        return ["Nothing is tied: no experiment is needed to part effects, and none was written."]
+        return "Nothing is tied: no experiment is needed to part effects, and none was written."
     found = next_experiment(summary, read_config(folder / "model.toml"), record, torque, travel)
     if found is None:
-        return [f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."]
-    return [f"To part {pair[0]} from {pair[1]}: {_written(found, record, path)}"]
+        return f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."
+    return f"To part {pair[0]} from {pair[1]}: {_written(found, record, path)}"
 
 
 def check_gap_sought(task: LogTask) -> None:
@@ -121,27 +121,27 @@ def write_gap_experiment(
     path: Path,
     torque: float | None = None,
     travel: float | None = None,
-) -> list[str]:
-    """Write the move that would show a gap to the motor alone, where a log does not. Returns lines for the terminal.
+) -> str:
+    """Write the move that would show a gap to the motor alone, where a log does not. Returns a sentence on it.
 
     It is the input on which the model without a gap differs most from one with the largest gap that the log leaves open, or
     with the nominal one if that is smaller. Arguments as of :func:`write_next_experiment`; `summary` has `backlash`.
     """
     said = summary["backlash"]
     if said is None:
-        return [
+        return (
             "No gap is sought: the model has one, or [uncertainty] exact says that it has none; no experiment was written."
-        ]
+        )
     if said["shown"]:
-        return ["No gap is in doubt: no experiment is needed to show one, and none was written."]
+        return "No gap is in doubt: no experiment is needed to show one, and none was written."
     half, model = float(min(said["at_most"], said["nominal"] or np.inf)), read_config(folder / "model.toml")
     with jax.enable_x64(True):
         models = [on_record(each, record) for each in (model, with_gap(model, said["path"], half))]
         found = _parting(models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0)
     what = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
     if found is None:
-        return [f"No input stays within the torque and travel allowed that would show {what}: --max-torque, --max-travel."]
-    return [f"To show {what}: {_written(found, record, path)}"]
+        return f"No input stays within the torque and travel allowed that would show {what}: --max-torque, --max-travel."
+    return f"To show {what}: {_written(found, record, path)}"
 
 
 def with_gap(model: Config, path: str, half: float) -> Config:

@@ -1,10 +1,13 @@
 """What `jaxbl bench` leaves: table, `bench.json`, a bar chart, and throughput against lanes."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+import pandas as pd
+
 from jaxbl.files import write_json
-from jaxbl.lines import Lines, format_table
+from jaxbl.lines import Lines
 from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
 from .figures import BLUE, GREEN, VERMILION, Drawn, style, subplots
@@ -62,6 +65,11 @@ def _curve(result: BenchResult) -> Drawn:
     )
 
 
+def _align(rows: Iterable[Sequence[str]]) -> Lines:
+    """Cells in columns that end below one another."""
+    return pd.DataFrame(rows).to_string(header=False, index=False).split("\n")
+
+
 def _table(result: BenchResult, precision: str) -> list[list[str]]:
     """Header and rows of the table of one precision, as text."""
     rows = [[precision, "lanes", "best", "median", "of C++", "first", "off by"]]
@@ -83,12 +91,12 @@ def throughput_lines(result: BenchResult) -> Lines:
         "Lane-steps/s, best and median of the calls; time of the first call; deviation of the results.",
     ]
     for precision in PRECISIONS:
-        lines += ["", *format_table(_table(result, precision), numbers=True)]
+        lines += ["", *_align(_table(result, precision))]
     if result.study:
         study = result.study[0]
         size = f"{study['lanes']} lanes of {study['steps']} samples, {study['precision']}"
         lines += ["", f"A small study from nothing, {size}:"]
-        lines += format_table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
+        lines += _align([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study])
     if result.studies:
         lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
     lines += [

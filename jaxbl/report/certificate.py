@@ -5,9 +5,9 @@ from pathlib import Path
 
 from jaxbl.files import json_with_checksum, remove, write_atomic
 from jaxbl.json_types import JsonObject
+from jaxbl.result import ResultTable
 
 from .figures import BLUE, VERMILION, Drawn, legend_below, style, subplots
-from .page import PageTable
 
 ASSUMPTIONS = (
     "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
@@ -90,7 +90,7 @@ def _lines(side: str, proof: JsonObject, passed_over: int) -> list[str]:
     return lines
 
 
-def certificate_tables(summary: JsonObject) -> list[PageTable]:
+def certificate_tables(summary: JsonObject) -> list[ResultTable]:
     """The certificates' numbers and assumptions, if there are any."""
     certificates = _proven(summary)
     if not certificates:
@@ -107,8 +107,8 @@ def certificate_tables(summary: JsonObject) -> list[PageTable]:
         for proof in certificates.values()
     ]  # fmt: skip
     columns, rows = ["", *certificates], list(zip(names, *sides, strict=True))
-    table = PageTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
-    return [table, PageTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
+    table = ResultTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
+    return [table, ResultTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
 
 
 @style()

@@ -1,11 +1,11 @@
-"""What `jaxbl compare` leaves: a text of 80 columns, `comparison.json`, and a figure of where metrics moved most."""
+"""The comparison of two sweeps: which metrics changed, `comparison.json`, and a figure of where they moved most."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
 
 import math
-import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,53 +15,75 @@ from matplotlib.colors import LogNorm, Normalize
 
 from jaxbl.config import Config, is_boolean
 from jaxbl.files import json_with_checksum, write_atomic
-from jaxbl.lines import TERMINAL_WIDTH, Lines, format_table
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
 from .figures import COLOURS, MISSING, Axes, Drawn, Figure, Patch, colour_bar, legend_below, style, subplots, with_unit
 from .maps import axis_label, color_norm, hatch_failures, is_log, set_up_map
-from .page import save_all
 
-_FIGURE = "comparison"
 _PANELS = 3
 _LISTED = 12
-"""Rows of a list in the text; `comparison.json` has all."""
+"""Names in a sentence; `comparison.json` has all."""
 
 
-def write_comparison(comparison: Comparison, config: Config, folder: Path) -> Lines:
-    """Write `comparison.json` and a figure into a folder that exists; `config` is the first study's.
-
-    Returns the lines for the terminal.
-    """
+def write_comparison(comparison: Comparison, folder: Path) -> str:
+    """Write `comparison.json`. Returns the first study's TOML."""
     # of an earlier comparison
-    (folder / "figures" / f"{_FIGURE}.png").unlink(missing_ok=True)
-    saved = save_all(draw_comparison(comparison, config), folder)
+    (folder / "figures" / "comparison.png").unlink(missing_ok=True)
     write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
-    return [*comparison_lines(comparison), *(_wrap(f"{path}: {caption}", "  ") for path, caption in saved)]
+    return comparison.first_config.to_toml()
 
 
-def comparison_lines(comparison: Comparison) -> Lines:
-    """The comparison as text, no line over 80 columns but for what is longer in itself."""
+def describe_comparison(comparison: Comparison) -> Result:
+    """Say which metrics changed by more than noise, whether for the better, and what changed in the config."""
     common, first, second = comparison.points
-    lines = [f"first:  {comparison.names[0]}", f"second: {comparison.names[1]}"]
-    lines += [
-        _wrap(f"{name} is not finished: {there} of {total} runs are compared.")
+    names, beyond = comparison.names, _noise_name(comparison)
+    # what says how well an observer does comes first
+    changed = sorted(
+        (change for change in comparison.metrics if change.count or change.is_sure), key=lambda change: not change.better
+    )
+    judged = [_split(change) for change in changed if change.better]
+    better, worse = (sum(counts) for counts in zip(*judged, strict=True)) if judged else (0, 0)
+    verdict, headline = "good", f"No metric differs by more than {beyond} at {common} common points."
+    if not common:
+        verdict, headline = "no answer", "No point is in both studies: no metric is compared."
+    elif changed:
+        verdict = "good" if better and not worse else "failed" if worse and not better else "doubtful"
+        differ = f"{len(changed)} of {len(comparison.metrics)} metrics differ by more than {beyond}"
+        headline = f"{differ}, {changed[0].metric} most."
+    remarks = [
+        f"{name} is not finished: {there} of {total} runs are compared."
         for name, (there, total) in comparison.unfinished.items()
     ]
-    lines += ["", "Config:" if comparison.config else "Config: no difference that decides a number."]
-    changes = [f"  {key}: {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.config.items()]
-    lines += [_wrap(change, "    ") for change in changes[:_LISTED]]
-    if len(changes) > _LISTED:
-        lines.append(f"  and {len(changes) - _LISTED} more, in comparison.json")
+    if not comparison.config:
+        remarks.append("The configs differ in nothing that decides a number.")
     if comparison.made_by:
-        changes_ = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
-        lines.append(_wrap(f"Computed by: {changes_}"))
+        changes = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
+        remarks.append(f"Computed by: {changes}.")
     alone = f"; {first} in the first alone, {second} in the second alone" if first or second else ""
-    lines += ["", f"Points: {common} in both{alone}."]
-    if not common:
-        return [*lines, "No point is in both: no metric is compared."]
-    return [*lines, _wrap(_noise(comparison)), *_metric_lines(comparison)]
+    remarks += [
+        f"Points: {common} in both{alone}.",
+        *([_noise(comparison)] if common else []),
+        *_where(comparison, changed[:1]),
+    ]
+    for i, study in enumerate(names):
+        gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
+        if gone:
+            remarks.append(f"A number in {study} alone: {', '.join(gone)}.")
+    same = [change.metric for change in comparison.metrics if change not in changed]
+    details = [f"No difference beyond {beyond}: {', '.join(same)}."] if 0 < len(same) <= _LISTED else []
+    figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
+    rows = [[key, _value(old), _value(new)] for key, (old, new) in comparison.config.items()]
+    tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)
+    if changed:
+        head = ["metric", "points", "better", "worse", "factor from first to second (99 %)"]
+        rows = [
+            [change.metric, change.count, *(_split(change) if change.better else (None, None)), _factor(change)]
+            for change in changed
+        ]
+        tables.append(ResultTable("Metrics that differ", head, rows))
+    return Result(f"{names[0]} and {names[1]}", verdict, headline, figures, remarks, details, tables)
 
 
 def _noise(comparison: Comparison) -> str:
@@ -80,57 +102,34 @@ def _noise(comparison: Comparison) -> str:
     )
 
 
-def _metric_lines(comparison: Comparison) -> Lines:
-    """Say what became of the metrics, those that changed most first."""
-    changed = [change for change in comparison.metrics if change.count or change.is_sure]
-    lines, numbers = [], []
-    for change in changed:
-        moved = change.moved
-        if not is_boolean(change.metric):
-            numbers.append(change)
-            continue
-        unsure = "" if math.isnan(moved.low) else f" ({_share(moved.low)} to {_share(moved.high)})"
-        line = f"{change.metric}: {_share(moved.value)} of the runs{unsure}; {change.up} points gained, "
-        lines.append(_wrap(f"{line}{change.count - change.up} lost (of {change.points}).", "  "))
-    # what says how well an observer does comes first
-    numbers.sort(key=lambda change: not change.better)
-    if numbers and numbers[0].most is not None:
-        lines += ["", *_changed_most(comparison, numbers[0])]
-    if numbers:
-        head = "metric", "points", "better", "worse", "factor (99 %)"
-        lines += ["", *format_table([head, *map(_row, numbers[: 2 * _LISTED])])]
-        if len(numbers) > 2 * _LISTED:
-            lines.append(f"and {len(numbers) - 2 * _LISTED} more, in comparison.json")
-    for i, study in enumerate(comparison.names):
-        gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
-        if gone:
-            lines.append(_wrap(f"A number in {study} alone: {', '.join(gone)}."))
-    same = [change.metric for change in comparison.metrics if change not in changed]
-    if same:
-        line = f"No difference beyond {_noise_name(comparison)} in {len(same)} of {len(comparison.metrics)} metrics"
-        names = f": {', '.join(same)}" if len(same) <= _LISTED else ""
-        lines += ["", _wrap(f"{line}{names}.")]
+def _most(comparison: Comparison, change: MetricChange) -> str:
+    """The largest change of a metric, and the point where it is."""
+    assert change.most is not None
+    place = ", ".join(f"{path} = {_value(change.most[path])}" for path in comparison.axes)
+    ends = f"{change.most['first']:.3g} -> {change.most['second']:.3g} {find_metric(change.metric).unit}".rstrip()
+    return f"Largest change of {change.metric}: {ends}{f' at {place}' if place else ''}."
+
+
+def _where(comparison: Comparison, changes: Sequence[MetricChange]) -> list[str]:
+    """Say where the metric that changed most did so."""
+    lines = [_most(comparison, change) for change in changes if change.most is not None]
+    lines += (
+        f"The points at which {change.metric} differs lie at {', '.join(_span(*item) for item in change.where.items())}."
+        for change in changes
+        if change.where
+    )
     return lines
 
 
-def _changed_most(comparison: Comparison, change: MetricChange) -> Lines:
-    """The metric that changed most, and where."""
-    assert change.most is not None
-    place = ", ".join(f"{path} = {_value(change.most[path])}" for path in comparison.axes)
-    beyond = "rounding" if change.differs is None else "noise"
+def _span(path: str, ends: Sequence[Any]) -> str:
+    return f"{path} {_value(ends[0])} to {_value(ends[1])}" if isinstance(ends[0], float) else f"{path} {', '.join(ends)}"
+
+
+def _ways(change: MetricChange) -> str:
+    """At how many points a metric changed, and how."""
     better, worse = _split(change)
-    way = f"better at {better}, worse at {worse}" if change.better else f"larger at {better}, smaller at {worse}"
-    unit = find_metric(change.metric).unit
-    line = (
-        f"Changed most: {change.metric}, beyond {beyond} at {change.count} of {change.points} points, "
-        f"{way}. Largest change: {change.most['first']:.3g} -> {change.most['second']:.3g} {unit}"
-    ).rstrip()
-    lines = [_wrap(f"{line}, at {place}." if place else f"{line}.", "  ")]
-    spans = [
-        f"{path} {_value(span[0])} to {_value(span[1])}" if isinstance(span[0], float) else f"{path} {', '.join(span)}"
-        for path, span in change.where.items()
-    ]
-    return [*lines, _wrap(f"These points lie at {', '.join(spans)}.", "  ")] if spans else lines
+    ways = ("better", "worse") if change.better else ("larger", "smaller")
+    return f"{ways[0]} at {better}, {ways[1]} at {worse} of {change.points} points"
 
 
 def _split(change: MetricChange) -> tuple[int, int]:
@@ -139,22 +138,20 @@ def _split(change: MetricChange) -> tuple[int, int]:
     return (down, up) if change.better and change.better != "more" else (up, down)
 
 
-def _row(change: MetricChange) -> tuple[str, ...]:
-    better, worse = _split(change) if change.better else ("–", "–")
-    moved = change.moved
-    factor = f"{moved.value:.3g}" if math.isfinite(moved.value) else "–"
-    if not math.isnan(moved.low):
-        factor += f" ({moved.low:.3g} to {moved.high:.3g})"
-    # numbers end below one another, factors begin so
-    return change.metric, f"{change.count:>6}", f"{better:>6}", f"{worse:>5}", factor
+def _factor(change: MetricChange) -> str:
+    """The mean change with its interval: a factor, or a difference of the share of runs."""
+    ends = [end for end in change.moved if not math.isnan(end)]
+    if is_boolean(change.metric):
+        value, *interval = (f"{100 * end:+.2f} %" for end in ends)
+    elif not math.isfinite(change.moved.value):
+        return "–"
+    else:
+        value, *interval = (f"× {end:.3g}" for end in ends)
+    return f"{value} ({' to '.join(interval)})" if interval else value
 
 
 def _noise_name(comparison: Comparison) -> str:
     return "noise" if comparison.knows_noise else "rounding"
-
-
-def _share(value: float) -> str:
-    return f"{100 * value:+.2f} %"
 
 
 def _value(value: Any) -> str:
@@ -163,19 +160,15 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _wrap(text: str, indent: str = "") -> str:
-    return textwrap.fill(text, TERMINAL_WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-
-
 @style()
-def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
+def draw_comparison(comparison: Comparison) -> list[Drawn]:
     """Show where the metrics that changed most did so: a map over the last two axes, or lines over one; nothing where none
     did, or no axis has several numbers."""
     changes = sorted((change for change in comparison.metrics if change.count), key=lambda change: not change.better)
     changes = changes[:_PANELS]
     if not changes:
         return []
-    frames = [comparison.frame(change.metric) for change in changes]
+    config, frames = comparison.first_config, [comparison.frame(change.metric) for change in changes]
     varied = [path for path in comparison.axes if frames[0][path].nunique() > 1]
     # of axes that advance together one is enough
     labels = {path: path for path in varied} | {axis.path: axis.zip or axis.path for axis in config.axes}
@@ -205,7 +198,7 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
     else:
         panels[-1].legend()
         caption = f"Both studies over {axes[0]}{averaged}; where there are points, they differ by more than {beyond}."
-    return [Drawn(_FIGURE, figure, caption)]
+    return [Drawn("comparison", figure, caption)]
 
 
 def _map(figure: Figure, ax: Axes, config: Config, metric: MetricChange, frame: pd.DataFrame, axes: list[str]) -> None:

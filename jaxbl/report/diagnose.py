@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines, NextStep
+from jaxbl.lines import DOUBT, Lines
+from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import (
     BLACK,
@@ -32,7 +33,7 @@ from .figures import (
     write_inside,
 )
 from .motor_alone_figures import draw_motor_alone
-from .page import PageTable, write_results
+from .numbers import format_number, lead_with_doubt, write_fit
 from .residuals import draw_residuals, plot_torque
 
 _BEFORE, _AFTER = VERMILION, BLUE
@@ -42,31 +43,47 @@ _CHANNELS = {
 }  # fmt: skip
 
 
-def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
-    """Write `diagnosis.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
+def write_diagnosis(result: Diagnosis, folder: Path) -> str:
+    """Write `diagnosis.json`, `model.toml` and `trace.parquet`. Returns the TOML of the extended model."""
+    return write_fit(result, folder, "diagnosis")
 
-    They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
-    terminal.
-    """
-    summary = found.summary
+
+def describe_diagnosis(summary: JsonObject) -> Result:
+    """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
+    verdict, headline = _verdict(summary)
     tables = [table for table in (_finding_table(summary), _history_table(summary)) if table.rows]
     tables += [_gap_table(summary["gap"]), _number_table(summary)]
-    lead, remarks = _headline(summary), _remarks(summary)
-    title = found.config.title or f"Diagnosis of {found.record.path.name}"
-    return write_results(found, folder, "diagnosis", title, lead, draw_diagnosis(found), tables, remarks, steps)
-
-
-def diagnosis_lines(summary: JsonObject) -> Lines:
-    """The lines for the terminal, from a `diagnosis.json`."""
-    return [*_headline(summary), *_remarks(summary)]
+    title = summary["title"] or f"Diagnosis of {Path(summary['file']).name}"
+    details = [*_gap_lines(summary["gap"]), *_remarks(summary)]
+    return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), _reasons(summary), details, tables))
 
 
 _FAR = 10.0
 """Torque over what [log] u says, from which on a unit is rather wrong."""
 
 
-def _headline(summary: JsonObject) -> Lines:
-    doubts, lines = [], [verdict_sentence(summary)]
+def _key_figures(summary: JsonObject) -> list[KeyFigure]:
+    """Errors of torque and position on held-out data, and the least certain effect with its first number."""
+    gap, figures = summary["gap"], []
+    before, after, noise = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
+    for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
+        if there := [name for name in channels if name in before]:
+            name = max(there, key=lambda name: _ratio(before[name], noise[name]))
+            change = f"{rms_text(before[name])} → {rms_text(after[name])} {gap['units'][name]}"
+            figures.append(
+                KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise[name])})")
+            )
+    if summary["findings"]:
+        finding = min(summary["findings"], key=lambda finding: finding["confidence"])
+        leaf, number = next(iter(finding["parameters"].items()))
+        figures.append(KeyFigure(format_number(number), f"{finding['effect']}: {leaf}"))
+        figures.append(KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"))
+    return figures
+
+
+def _reasons(summary: JsonObject) -> Lines:
+    """Say what stands against the answer, and what each effect is like."""
+    doubts, lines = [], []
     for finding in summary["findings"]:
         numbers, others = finding["parameters"], finding["alternatives"]
         gain = 1.0 + numbers["relative"]["value"] if "relative" in numbers else 1.0
@@ -74,16 +91,16 @@ def _headline(summary: JsonObject) -> Lines:
             doubts.append(
                 f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
             )
+        texts = ", ".join(f"{leaf} = {format_number(number)}" for leaf, number in numbers.items())
         lines.append(
-            f"{finding['effect']} (confidence {probability(finding['confidence'])}): "
-            f"{', '.join(map(_number, numbers.items()))}; "
+            f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
             f"{finding.get('in_log') or _percent(finding['share']) + ' of the driving torque'}."
         )
         if others:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
-            lines.append(f"  Not ruled out by this log: {names}.")
-    lines = [*_contradiction_lines(summary), *summary["warnings"], *doubts, *lines]
-    return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
+            lines.append(f"Not ruled out by this log in place of {finding['effect']}: {names}.")
+    lines = [*_contradiction_lines(summary), *summary["warnings"], *doubts, *_record_lines(summary), *lines]
+    return [*lines, *_failed_checks(summary), *_table_lines(summary)]
 
 
 def _contradiction_lines(summary: JsonObject) -> Lines:
@@ -94,73 +111,85 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
         values = [f"{by['value']:.3g} ± {by['standard_error']:.1g}{unit} by {by['log']}" for by in number["logs"]]
         numbers.append(f"{number['parameter']} is {' and '.join(values)}")
     sentence = (
-        f"The logs contradict each other: {'; '.join(numbers)}. One model cannot hold for both: was the load, the "
-        "controller (a feedforward that u does not contain) or a unit another one?"
+        f"By the logs {'; '.join(numbers)}. Was the load, the controller (a feedforward that u does not contain) or a unit "
+        "another one?"
     )
     return [sentence] if numbers else []
 
 
-_NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
+_AS_WELL = "predicts new data as well as noise and the stated uncertainties allow"
 _FURTHER_OFF = "The numbers are further off than stated"
 
 
-def verdict_sentence(summary: JsonObject) -> str:
-    """The verdict in one sentence."""
-    names, verdict, off = _names(summary), summary["verdict"], summary.get("numbers_off")
-    them = "it" if len(summary["findings"]) == 1 else "them"
+def _verdict(summary: JsonObject) -> tuple[str, str]:
+    """The verdict and the answer in one sentence."""
+    names, verdict = _names(summary), summary["verdict"]
+    if summary["contradictions"]:
+        return "no answer", "The logs contradict each other: one model cannot hold for all of them."
+    if summary.get("numbers_off"):
+        word, answer = _verdict(summary | {"numbers_off": 0})
+        with_fitted = f"no effect is needed. With fitted ones the model {_AS_WELL}."
+        return word, f"{_FURTHER_OFF}{f'; {with_fitted}' if verdict == 'no_discrepancy' else f'. {answer}'}"
     if verdict == "no_discrepancy":
-        return (
-            f"{_FURTHER_OFF}; no effect is needed. With fitted ones {_NO_MORE}." if off else f"No discrepancy: {_NO_MORE}."
-        )
-    if off:
-        return f"{_FURTHER_OFF}. {verdict_sentence(summary | {'numbers_off': 0})}"
+        return "good", f"Nothing is missing: the model {_AS_WELL}."
     if verdict == "explained":
-        return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
+        return "good", f"The model lacks {names}; with {_them(summary)}, it {_AS_WELL}."
     if verdict == "not_tested":
-        return _not_tested(summary)
-    where = "; ".join(side["sentence"] for side in summary.get("where_after", summary["where"]).values())
+        lead = f"By the log the model lacks {names}" if names else "The log shows nothing that the model lacks"
+        return "doubtful", f"{lead}, but the held-out data cannot test that."
     alone, test = summary.get("backlash"), summary["gap"]["test"]
-    complete = not test["failed"] and not test["remainder"]
-    gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
-    if not names and gap and complete:
-        return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
     if not names:
-        return f"Unknown: no known effect explains what is missing: {where}."
+        gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
+        if gap and not test["failed"] and not test["remainder"]:
+            return "no answer", "A gap might explain what is missing, but this log does not show it."
+        return "no answer", "Something is missing that none of the known effects explains."
     if test["worse"]:
         return (
-            f"Contradicted: by the log the model lacks {names}; data not used for the fit are predicted worse with {them}."
+            "failed",
+            f"By the log the model lacks {names}, but it predicts the held-out data worse with {_them(summary)}.",
         )
-    share = _share(summary["explained_share"])
-    remainder = ", but not in a way that can be right" if complete else f". The rest is none of the known effects: {where}"
-    what = "missing torque" if "backlash" not in summary else "squared prediction error of the motor beyond noise"
-    return (
-        f"Partly explained: the model lacks {names}; with {them}, {share} of the {what} is explained on data not "
-        f"used for the fit{remainder}."
+    quantity = "missing torque" if "backlash" not in summary else "motor's squared prediction error beyond noise"
+    return "doubtful", (
+        f"The model lacks {names}, but that is not all: on held-out data {_share(summary['explained_share'])} of the "
+        f"{quantity} is explained."
     )
 
 
-def _not_tested(summary: JsonObject) -> str:
-    """What the proof could not test, and what to record."""
-    gap, names = summary["gap"], _names(summary)
+def _them(summary: JsonObject) -> str:
+    return "it" if len(summary["findings"]) == 1 else "them"
+
+
+def _record_lines(summary: JsonObject) -> Lines:
+    """Say where something is left, or what to record where the proof could not test the model."""
+    if summary["verdict"] == "unknown_effect":
+        where = summary.get("where_after", summary["where"])
+        return [f"What is left: {'; '.join(side['sentence'] for side in where.values())}."]
+    return [_what_to_record(summary)] if summary["verdict"] == "not_tested" else []
+
+
+def _what_to_record(summary: JsonObject) -> str:
+    gap = summary["gap"]
     units = gap["units"]
-    lead = f"by the log the model lacks {names}" if names else "the log shows nothing that the model lacks"
     effects = {name: torque for name, torque in gap["test"]["untested"].items() if torque}
     torques = [
         f"{name} is {rms_text(torque['torque'])} {units['torque_motor']} rms there, {rms_text(torque['on_log'])} on the log"
         for name, torque in effects.items()
     ]
-    lead = f"Not tested: {lead}; data not used for the fit cannot show it"
+    lead = (
+        "The held-out data would pass without it, too"
+        if effects
+        else "Even a complete model may leave as much as moves there"
+    )
+    lead += f" ({'; '.join(torques)})." if torques else "."
     # it acts there, but less than a complete model may leave
     if effects and all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
-        more = "Hold out a motion in which it is a larger part of the torque, or one that is read with less noise"
-        return f"{lead} (a model without it would pass, too; {'; '.join(torques)}). {more}."
-    why = "a model without it would pass, too" if torques else "even a complete model may leave as much as moves there"
+        return f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
         for name, reach in gap["range"].items()
     )
-    return f"{lead} ({'; '.join([why, *torques])}). Hold out a log that reaches as far: {reached}."
+    return f"{lead} Hold out a log that reaches as far: {reached}."
 
 
 def _percent(share: float) -> str:
@@ -209,7 +238,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _reasons(summary: JsonObject) -> Lines:
+def _failed_checks(summary: JsonObject) -> Lines:
     """Say why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
@@ -225,8 +254,8 @@ def _reasons(summary: JsonObject) -> Lines:
         number = summary["parameters"][path]
         change = f" by {number['value'] / number['nominal'] - 1.0:+.0%}" if number["nominal"] else ""
         lines.append(
-            f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
-            "other. Noise of the torque channel does it, or too small a relative."
+            f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]; this number and the effects found may "
+            "offset each other. Check the noise of u, or raise [uncertainty] relative."
         )
     return [*lines, f"{CHECKS['little']}."] if test["little"] else lines
 
@@ -239,13 +268,6 @@ def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     for name in sorted(gap["test"]["failed"], key=lambda name: _ratio(*tested[name]), reverse=True):
         best.setdefault(name.split()[0], name)
     return [(name, *tested[name]) for name in best.values()]
-
-
-def _number(item: tuple[str, JsonObject]) -> str:
-    leaf, number = item
-    unit = f" {number['unit']}" if number.get("unit") else ""
-    error = f" ± {number['standard_error']:.2g}" if number["standard_error"] else ""
-    return f"{leaf} = {number['value']:.5g}{error}{unit}"
 
 
 def probability(value: float) -> str:
@@ -281,9 +303,6 @@ def _remarks(summary: JsonObject) -> Lines:
     lines, where, gap = [], summary["where"], summary["gap"]
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"Residual of the model as given: {side['sentence']}." for side in where.values()]
-    observed = "; ".join(filter(None, (_by_observer(name, side, gap["units"]) for name, side in where.items())))
-    if observed:
-        lines.append(f"By the observers' equivalent control: {observed}.")
     remaining = [(name, torque) for name, torque in summary["rest"].items() if (torque["evidence"] or 0.0) > 0.0]
     for name, torque in sorted(remaining, key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
@@ -310,29 +329,13 @@ def _ratio(error: float | None, other: float | None) -> float:
     return np.inf if error is None or other is None else error / max(other, np.finfo(float).tiny)
 
 
-def _by_observer(side: str, where: JsonObject, units: Mapping[str, str]) -> str:
-    """Say what a side's observer has of the residual; "" where there is none or it does not converge."""
-    observed = where.get("observed")
-    if not observed or not observed["converged"]:
-        return ""
-    size, noise, unit = observed["rms"], rms_text(observed["noise"]), units[f"torque_{side}"]
-    if size < _BEYOND * observed["noise"]:
-        return f"{side} side, no more than its noise ({noise} {unit} rms)"
-    return (
-        f"{side} side, {rms_text(size)} {unit} rms (its noise {noise}), correlation {observed['correlation']:.2f} with the "
-        "smoother's"
-    )
-
-
-_BEYOND = 1.5
-"""Ratio of an observer's residual to its noise up to which it counts as noise: above 1, as that noise is an estimate."""
 _FREE = {
     "time": "a torque over time", "drift": "a drifting friction", "position": "a torque over position",
     "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a presliding friction",
 }  # fmt: skip
 
 
-def _finding_table(summary: JsonObject) -> PageTable:
+def _finding_table(summary: JsonObject) -> ResultTable:
     rows: list[list[object]] = []
     for name, finding, is_found in _candidates(summary):
         lead = [name, probability(finding["confidence"])]
@@ -341,7 +344,7 @@ def _finding_table(summary: JsonObject) -> PageTable:
             continue
         for leaf, number in finding["parameters"].items():
             rows.append([*lead, leaf, number["value"], number["standard_error"] or None, number["unit"]])
-    return PageTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)
+    return ResultTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)
 
 
 def _candidates(summary: JsonObject) -> list[tuple[str, JsonObject, bool]]:
@@ -353,17 +356,17 @@ def _candidates(summary: JsonObject) -> list[tuple[str, JsonObject, bool]]:
     return candidates
 
 
-def _history_table(summary: JsonObject) -> PageTable:
+def _history_table(summary: JsonObject) -> ResultTable:
     """Every model that was tried, in order."""
     rows = [
         [number, step["tried"], step["nats"], step["standard_errors"], "kept" if step["kept"] else "dropped", step["why"]]
         for number, step in enumerate(summary["history"], 1)
     ]
     head = ["step", "tried", "gain on the log (nats)", "by blocks of the log (standard errors)", "", "why"]
-    return PageTable("How the name was found", head, rows)
+    return ResultTable("How the name was found", head, rows)
 
 
-def _gap_table(gap: JsonObject) -> PageTable:
+def _gap_table(gap: JsonObject) -> ResultTable:
     control, units = gap["controls"].get("wrong"), gap["units"]
     rows: list[list[Any]] = [
         [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
@@ -383,7 +386,7 @@ def _gap_table(gap: JsonObject) -> PageTable:
         "complete model at most",
         *([control["effect"]] if control else []),
     ]
-    return PageTable("Held-out data, rms", head, rows)
+    return ResultTable("Held-out data, rms", head, rows)
 
 
 def _limits(gap: JsonObject) -> dict[str, float | None]:
@@ -391,21 +394,21 @@ def _limits(gap: JsonObject) -> dict[str, float | None]:
     return {name: error["limit"] for name, error in gap["expected"].items()}
 
 
-def _number_table(summary: JsonObject) -> PageTable:
+def _number_table(summary: JsonObject) -> ResultTable:
     keys = "nominal", "value", "standard_error", "unit"
     rows = [[path, *(number[key] for key in keys)] for path, number in summary["parameters"].items()]
-    return PageTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
+    return ResultTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
 
 
 @style()
 def draw_diagnosis(diagnosis: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
-        return [_verdict(diagnosis.summary), *draw_motor_alone(diagnosis)]
+        return [_draw_gap(diagnosis.summary), *draw_motor_alone(diagnosis)]
     unit = diagnosis.record.unit_of("motor.torque", "N m")
     residuals = draw_residuals(diagnosis.residuals, diagnosis.coordinates, diagnosis.located, unit, diagnosis.observed)
     tables = [_tables(diagnosis)] if "torque_tables" in diagnosis.summary else []
-    return [_verdict(diagnosis.summary), _over_time(diagnosis), *tables, *residuals]
+    return [_over_time(diagnosis), _draw_gap(diagnosis.summary), *tables, *residuals]
 
 
 def _tables(found: Diagnosis) -> Drawn:
@@ -432,7 +435,7 @@ def _tables(found: Diagnosis) -> Drawn:
     return Drawn("torque_tables", figure, caption)
 
 
-def _verdict(summary: JsonObject) -> Drawn:
+def _draw_gap(summary: JsonObject) -> Drawn:
     """Each channel's error over its noise, before and after, with the control; and the probability of each effect."""
     gap, candidates = summary["gap"], _candidates(summary)
     height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.9, 0.42 * len(candidates) + 1.9)
@@ -440,7 +443,7 @@ def _verdict(summary: JsonObject) -> Drawn:
     _gap_panel(left, gap)
     _chances_panel(right, candidates)
     caption = (
-        f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
+        f"{_verdict(summary)[1]} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
         "as given to the model with the missing effects. Black line: noise; bars: the most that noise, the uncertainty of "
         "the numbers and torques too small to be named leave of a complete model. Control, which must do worse: "
         "another effect at its best. Right: probability of each effect, and of those "

@@ -7,34 +7,31 @@ import tomli_w
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
+from jaxbl.result import Result, ResultTable
 
 from .figures import BLUE, FAINT, ORANGE, Drawn, legend, outline, stacked, style, subplots
-from .page import NUMBER_COLUMNS, PageTable, number_line, number_row, write_results
+from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, write_fit
 
 _POINTS = 6000
 """Points of a cloud: a page is about 1000 pixels wide."""
 
 
-def write_element_report(result: ElementIdentification, folder: Path) -> Lines:
-    """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
-
-    Returns the lines for the terminal.
-    """
-    summary = result.summary
-    rows = [[*number_row(path, number), number["unit"]] for path, number in summary["parameters"].items()]
-    tables = [PageTable("Numbers", [*NUMBER_COLUMNS, "unit"], rows)]
+def write_element(result: ElementIdentification, folder: Path) -> str:
+    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(result.tables)
-    title, lead, drawn, remarks = summary["title"], _headline(summary), draw_element(result), _remarks(summary)
-    return write_results(result, folder, "identification", title, lead, drawn, tables, remarks, model=model)
+    return write_fit(result, folder, "identification", model)
 
 
-def element_lines(summary: JsonObject) -> Lines:
-    """The lines for the terminal, from an `identification.json`."""
-    return [*_headline(summary), *_remarks(summary)]
-
-
-def _headline(summary: JsonObject) -> Lines:
-    return [*summary["warnings"], *(number_line(*item) for item in summary["parameters"].items())]
+def describe_element(summary: JsonObject) -> Result:
+    """Say how well the transmission explains the torque, and its numbers, from an `identification.json`."""
+    parameters, torque = summary["parameters"], summary["torque"]["element"]
+    headline = (
+        f"{' and '.join(summary['method']['element']['terms'])} explain the torque but for {_size(torque, torque['unit'])}."
+    )
+    rows = [[*number_row(path, number), number["unit"]] for path, number in parameters.items()]
+    tables = [ResultTable("Numbers", [*NUMBER_COLUMNS, "unit"], rows)]
+    figures, remarks = number_figures(parameters), [*summary["warnings"], *_remarks(summary)]
+    return lead_with_doubt(Result(summary["title"], "good", headline, figures, remarks, summary["notes"], tables))
 
 
 def _remarks(summary: JsonObject) -> Lines:
@@ -45,14 +42,14 @@ def _remarks(summary: JsonObject) -> Lines:
         lines.append(
             f"Without {term} the torque error on parts of the log left out is {(1 + gain) ** 0.5:.3g} times as large."
         )
-    lines.append(f"Torque error: {_size(torque, unit)}; {element['reversals']} reversals.")
+    lines.append(f"{element['reversals']} reversals.")
     if "holdout" in summary:
         name, error = Path(summary["holdout"]["file"]).name, summary["holdout"]["torque"]
         result = "the displacement never turns back, or hardly moves"
         if error["rms"] is not None:
             result = f"torque error {_size(error, unit)}"
         lines.append(f"On {name}: {result}.")
-    return [*lines, *summary["notes"]]
+    return lines
 
 
 def _size(error: JsonObject, unit: str) -> str:

@@ -1,40 +1,49 @@
 """What `jaxbl identify` leaves to be read: numbers with intervals, and what the log shows of motion, torque and gap."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.search import is_noise
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines, NextStep
+from jaxbl.lines import DOUBT, Lines
+from jaxbl.result import Result, ResultTable
 
 from .figures import SIDES
-from .identify_figures import draw_identification
-from .page import NUMBER_COLUMNS, PageTable, number_line, number_row, write_results
+from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, write_fit
 
 
-def write_identification_report(result: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
-    """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
+def write_identification(result: Identification, folder: Path) -> str:
+    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the model's TOML."""
+    return write_fit(result, folder, "identification")
 
-    They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
-    terminal.
-    """
-    summary, method = result.summary, result.summary["method"]
+
+def describe_identification(summary: JsonObject) -> Result:
+    """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
+    method, parameters = summary["method"], summary["parameters"]
+    numbers = {
+        path: number for path, number in parameters.items() if None not in (number["value"], number["standard_error"])
+    }
+    complete = all(is_complete for is_complete, _ in _residuals(summary))
+    size = "; ".join(f"{side}: {_size(residual)}" for side, residual in summary["residual"].items())
+    verdict, headline = "good", f"The model explains the log: no more than noise is left of the positions ({size})."
+    if not numbers:
+        verdict, headline = "no answer", "This log identifies none of the model's numbers."
+    elif not complete:
+        verdict, headline = "doubtful", f"The model does not explain the log: more than noise is left ({size})."
     tables = [_parameter_table(summary)]
     if "regression" in method:
         tables.append(_regression_table(method["regression"]))
     if method["recursive"]:
         rows = [[name, *(sides[side] for side in SIDES)] for name, sides in method["recursive"].items()]
         columns = ["", *(f"by the {side}" for side in SIDES)]
-        tables.append(PageTable("Recursive identification, at the end of the log", columns, rows))
-    lead, remarks = _headline(summary), _remarks(summary)
-    title = result.config.title or f"Identification from {result.record.path.name}"
-    return write_results(result, folder, "identification", title, lead, draw_identification(result), tables, remarks, steps)
-
-
-def identification_lines(summary: JsonObject) -> Lines:
-    """The lines for the terminal, from an `identification.json`."""
-    return [*_headline(summary), *_remarks(summary)]
+        tables.append(ResultTable("Recursive identification, at the end of the log", columns, rows))
+    remarks = [*summary["warnings"], *_far_off(parameters), *_backlash(summary)]
+    if lacks := (summary.get("rejected") or {}).get("lacks"):
+        remarks.append(_lacking(**lacks))
+    remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
+    title = summary["title"] or f"Identification from {Path(summary['file']).name}"
+    figures = number_figures(numbers)
+    return lead_with_doubt(Result(title, verdict, headline, figures, remarks, _remarks(summary), tables))
 
 
 _FAR = 10.0
@@ -42,24 +51,16 @@ _FAR = 10.0
 know them within a factor of two."""
 
 
-def _headline(summary: JsonObject) -> Lines:
-    far, numbers, rejected = [], [], summary.get("rejected") or {}
-    condition = ", if only a disturbance is missing" if rejected else ""
-    for path, number in summary["parameters"].items():
+def _far_off(parameters: JsonObject) -> Lines:
+    """Say which inertias and stiffnesses cannot be what was given."""
+    far = []
+    for path, number in parameters.items():
         nominal, value = number.get("nominal"), number["value"]
         if path.endswith(("inertia", ".stiffness")) and nominal and value is not None:
             ratio = value / nominal
             if not 1.0 / _FAR < ratio < _FAR:
                 far.append(f"{path} is {ratio:.3g} times its nominal value")
-        unknown = None in (value, number["standard_error"])
-        numbers.append(f"{path}: not identifiable from this log." if unknown else number_line(path, number, condition))
-    doubts = [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
-    # intervals do not count what a model lacks: that it does is said before them
-    incomplete = [line for complete, line in _residuals(summary) if not complete]
-    lines = [*summary["warnings"], *doubts, *incomplete, *_backlash(summary)]
-    if rejected.get("lacks"):
-        lines.append(_lacking(**rejected["lacks"]))
-    return [*lines, *numbers]
+    return [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
 
 
 def _lacking(equation: str, channel: str, share: float) -> str:
@@ -94,7 +95,7 @@ def _remarks(summary: JsonObject) -> Lines:
         lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
     if summary["held"]:
         lines.append(f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.")
-    lines += (line for complete, line in _residuals(summary) if complete)
+    lines += (line for _, line in _residuals(summary))
     fit = summary["method"]["trajectory"]
     lines.append(
         "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
@@ -158,17 +159,17 @@ def _on_holdout(holdout: JsonObject) -> Lines:
     return lines
 
 
-def _parameter_table(summary: JsonObject) -> PageTable:
+def _parameter_table(summary: JsonObject) -> ResultTable:
     parameters, columns, rows = summary["parameters"], [*NUMBER_COLUMNS, "unit", "nominal"], []
     title = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
     has_profile = any("profile_interval" in number for number in parameters.values())
     for path, number in parameters.items():
         profile = number.get("profile_interval", [None, None]) if has_profile else []
         rows.append([*number_row(path, number), number.get("unit", ""), number.get("nominal"), *profile])
-    return PageTable(title, columns + ["by profile from", "to"] * has_profile, rows)
+    return ResultTable(title, columns + ["by profile from", "to"] * has_profile, rows)
 
 
-def _regression_table(regression: JsonObject) -> PageTable:
+def _regression_table(regression: JsonObject) -> ResultTable:
     motion = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
     title = f"Least squares on the equations of motion, {motion}, up to {regression['bandwidth']:.3g} Hz"
-    return PageTable(title, NUMBER_COLUMNS, [number_row(*item) for item in regression["parameters"].items()])
+    return ResultTable(title, NUMBER_COLUMNS, [number_row(*item) for item in regression["parameters"].items()])

@@ -57,8 +57,8 @@ def draw_identification(result: Identification) -> list[Drawn]:
     log = LogSignals(result)
     if "backlash" in result.summary:
         return [_intervals(result), *draw_motor_alone(result), _residuals(log)]
-    drawn = [_intervals(result), _residuals(log), _velocities(log)]
-    drawn += [_torque(log), _hysteresis(log), _limit_cycle(log)] if log.geared else [_resistance(log), _friction(log)]
+    first, *more = [_hysteresis, _torque, _limit_cycle] if log.geared else [_friction, _resistance]
+    drawn = [first(log), _intervals(result), _residuals(log), *(draw(log) for draw in more), _velocities(log)]
     return [*drawn, _path(log)] if result.summary["method"]["recursive"] else drawn
 
 
@@ -101,7 +101,7 @@ def _intervals(result: Identification) -> Drawn:
     names = list(dict.fromkeys([*fitted, *result.summary["held"]]))
     figure, (ax,) = subplots(9.0, 1.1 + 0.4 * len(names))
     beside: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
-    inside, intervals = [0.0], []
+    inside = [0.0]
     for i, number in enumerate(fitted.values()):
         value, nominal, (low, high) = number["value"], number["nominal"], _reach(number)
         half, size = 0.5 * abs(high - low), abs(nominal) or abs(value) or 1.0
@@ -109,7 +109,6 @@ def _intervals(result: Identification) -> Drawn:
         ax.plot([low, high], [i, i], color=BLUE, lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=BLUE, ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=BLUE, ms=5)
-        intervals.append((low, high))
         inside += [max(low, middle - 100.0), min(high, middle + 100.0)]
         ax.annotate(_with_error(value, half, number.get("unit", "")), (1.01, i), **beside)
     for i in range(len(fitted), len(names)):
@@ -117,18 +116,14 @@ def _intervals(result: Identification) -> Drawn:
         ax.annotate("held at nominal: not seen in this log", (1.01, i), color="#555555", **beside)
     ax.axvline(0.0, color="black", lw=0.8, zorder=0)
     room = 0.06 * (max(inside) - min(inside)) or 1.0
-    left, right = min(inside) - room, max(inside) + room
-    for i, (low, high) in enumerate(intervals):
-        for goes_on, end, arrow in ((low < left, left, "<"), (high > right, right, ">")):
-            if goes_on:
-                ax.plot(end, i, arrow, color=BLUE, ms=8, clip_on=False, zorder=5)
     ax.set_yticks(range(len(names)), names)
-    ax.set(xlabel="difference from the nominal value (% of it)", xlim=(left, right), ylim=(len(names) - 0.5, -0.5))
+    ax.set(xlabel="difference from the nominal value (% of it)", xlim=(min(inside) - room, max(inside) + room))
+    ax.set_ylim(len(names) - 0.5, -0.5)
     return Drawn(
         "intervals",
         figure,
         "Fitted parameters as differences from their nominal values (the line at 0), with 95 % intervals that allow for "
-        "correlated residuals; an arrow: the interval goes on. On the right: value, half width of the interval, and its "
+        "correlated residuals. On the right: value, half width of the interval, and its "
         "share of the value.",
     )
 

@@ -7,11 +7,11 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import to_jsonable, write_json
-from jaxbl.lines import Lines, NextStep, format_descriptions, format_table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
 from jaxbl.records.time_stamps import GAP_PERIODS
+from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import (
     BLACK,
@@ -29,12 +29,10 @@ from .figures import (
     style,
     subplots,
 )
-from .page import PageTable, write_report
+from .numbers import lead_with_doubt
 
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
-_LINES, _REMARKS = 25, 3
-"""Lines that a terminal shows, about; and lines of remarks that are printed beyond that, too."""
 _CHANNELS = {
     "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
     "transmitted": ("transmitted", GREEN),
@@ -42,34 +40,47 @@ _CHANNELS = {
 """Label and colour of each channel."""
 
 
-def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
-    """Write `inspection.json`, figures and report into a folder that exists; the page says what to try next (`steps`).
-
-    Returns the lines for the terminal.
-    """
-    record = inspection.record
+def write_inspection(inspection: Inspection, folder: Path) -> str:
+    """Write `inspection.json`. Returns the `[log]` table as TOML."""
     write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
-    head, *rows = _channel_table(record)
-    tables = [
-        PageTable("What the log can identify", ["quantity", "", "why"], _judgements(inspection)),
-        PageTable("Channels", head, rows),
+    return tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
+
+
+def describe_inspection(inspection: Inspection) -> Result:
+    """Say what the log can identify, and what is wrong with it."""
+    record, by_answer = inspection.record, {}
+    for judged in inspection.identifiability:
+        by_answer.setdefault(judged.answer, []).append(judged.quantity)
+    parts = [
+        f"{lead} {', '.join(by_answer[answer])}"
+        for answer, lead in (("yes", "shows"), ("weak", "hardly shows"), ("no", "does not show"))
+        if answer in by_answer
     ]
-    log = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
-    lead = [*record.warnings, _headline(record), inspection.describe_sizes()]
-    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, log, record.notes, steps)
-    return summary(inspection)
+    verdict = "good" if "yes" in by_answer else "doubtful" if by_answer.keys() - {"no"} else "no answer"
+    (head, *rows), sampling = _channel_table(record), record.statistics.sampling
+    stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
+    count = len(record.segments)
+    span = float(sum(np.ptp(record.time[part]) for part in record.segments)) + count * record.sample_period
+    samples = f"{len(record.time)} samples every {1e3 * record.sample_period:.5g} ms, {stamps}"
+    figures = [KeyFigure(f"{span:.4g} s", f"{samples}, {count} segment{'s' * (count > 1)}")]
+    figures += [
+        KeyFigure(
+            f"{channel.noise:.2g} {channel.unit}",
+            f"noise of {name}, rms; its motion is over {channel.largest - channel.least:.3g}",
+        )
+        for name, channel in record.statistics.channels.items()
+        if name.startswith("theta")
+    ]
+    tables = [
+        ResultTable("What the log can identify", ["quantity", "", "why"], _judgements(inspection)),
+        ResultTable("Channels", head, rows),
+    ]
+    remarks, headline = [*record.warnings, inspection.describe_sizes()], f"The log {'; it '.join(parts)}."
+    return lead_with_doubt(Result(record.path.name, verdict, headline, figures, remarks, record.notes, tables))
 
 
 def _judgements(inspection: Inspection) -> list[tuple[str, str, str]]:
     return [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
-
-
-def _headline(record: Record) -> str:
-    sampling, count = record.statistics.sampling, len(record.segments)
-    span = float(sum(np.ptp(record.time[part]) for part in record.segments)) + count * record.sample_period
-    stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
-    parts = "one segment" if count == 1 else f"{count} segments"
-    return f"{len(record.time)} samples, {span:.4g} s every {1e3 * record.sample_period:.5g} ms, {stamps}, {parts}"
 
 
 def _channel_table(record: Record) -> list[tuple[str, ...]]:
@@ -83,20 +94,6 @@ def _channel_table(record: Record) -> list[tuple[str, ...]]:
             f"{100 * c.saturated:.2g} %" if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
         ))  # fmt: skip
     return rows
-
-
-def summary(inspection: Inspection) -> Lines:
-    """The log: channels and what can be identified, in tables of 80 columns, and as many remarks as there is room for."""
-    record = inspection.record
-    lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.describe_sizes(), ""]
-    columns = zip(*_channel_table(record), strict=True)
-    lines += format_table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
-    lines += ["", *format_descriptions([("identifies", "", ""), *_judgements(inspection)])]
-    room = max(_LINES - len(lines) - 1, _REMARKS)
-    notes = list(record.notes)
-    if len(notes) > room:
-        notes = [*notes[: room - 1], f"... and {len(notes) - room + 1} more remarks in the report"]
-    return [*lines, "", *notes] if notes else lines
 
 
 @style()

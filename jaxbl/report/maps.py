@@ -7,6 +7,7 @@
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -81,13 +82,13 @@ def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
     return [FigureTable(kind="heatmap", x=x, y=y, value=value, facet=facet)]
 
 
-@style()
-def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:
-    """All figures of a study, in memory that does not grow with its number of runs (of a refined study, with its points).
+laws_of = lru_cache(maxsize=1)(accuracy_laws)
+"""Laws of a study, found once for its sentences, its figures and its file."""
 
-    Args:
-        result: the study.
-        laws: those of its figures, where they are known already.
+
+@style()
+def draw(result: StudyResult) -> list[Drawn]:
+    """All figures of a study, in memory that does not grow with its number of runs (of a refined study, with its points).
 
     Raises:
         InputError: a figure names an axis or a metric that the study does not have.
@@ -97,12 +98,11 @@ def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:
     check_figures(config, figures, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
     drawn: list[Drawn] = []
-    laws = accuracy_laws(result, figures) if laws is None else laws
     runs = sum(map(len, result.batches(["seed"]))) if figures else 0
     for i, spec in enumerate(figures):
         dots = _dots(result, spec)
         if spec.theory is not None:
-            figure, caption = _laws(config, spec, [law for law in laws if law.figure == i])
+            figure, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
         elif spec.kind == "heatmap":
             figure, caption = _heatmap(config, _rows(result, spec, points, dots), spec, points)
         else:

@@ -19,11 +19,11 @@ from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MISSING, SIDE_COLOURS, Axes, Drawn, Line2D, Patch, legend_below, style, subplots
 from .maps import axis_label, set_up_map
-from .page import PageTable, write_report
 from .tune import error_label, for_title
 
 _KIND_COLOURS = (
@@ -218,15 +218,35 @@ def _map(config: Config, summary: JsonObject, side: str) -> Drawn:
     )
 
 
-def write_choice_report(choice: ObserverChoice, folder: Path) -> Lines:
-    """Write `tuning.json`, of a single point `gains.toml`, figures and report into a folder that exists. Returns lines for
-    the terminal."""
+def write_choice(choice: ObserverChoice, folder: Path) -> str:
+    """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
     summary = choice.summary
     if (gains := observer_toml(summary)) is not None:
         write_atomic(folder / "gains.toml", gains)
     write_json(folder / "tuning.json", summary, allow_nan=False)
-    config, lead = choice.config, choice_headline(summary)
-    return write_report(folder, "Observers", lead, draw_choice(choice), _tables(config, summary), config, summary["remarks"])
+    return choice.config.to_toml()
+
+
+def describe_choice(choice: ObserverChoice) -> Result:
+    """Say which kind of observer is best, and by how much."""
+    config, summary = choice.config, choice.summary
+    points, kind = summary["points"], summary.get("for_both_sides")
+    figures = []
+    for side in points[0]["sides"]:
+        best = Counter(point["sides"][side]["best"] for point in points)
+        del best[None]
+        for name, count in best.most_common(1):
+            share = f"best at {count} of {len(points)} points" if len(points) > 1 else "best"
+            figures.append(KeyFigure(name, f"{side}: {share} ({summary['objective']} error, {_where(summary)})"))
+    verdict, headline = "good", f"Take {kind}: gains.toml has its gains."
+    if not figures:
+        verdict, headline = "failed", "All kinds of observers diverge, or are too slow."
+    elif kind is None:
+        headline = "Which observer is best depends on the point; the map shows where."
+        if len(points) == 1:
+            verdict, headline = "doubtful", "No kind converges on both sides."
+    title, remarks = config.title or "Observers", choice_headline(summary)
+    return Result(title, verdict, headline, figures, remarks, summary["remarks"], _tables(config, summary))
 
 
 def observer_toml(summary: JsonObject) -> str | None:
@@ -313,7 +333,7 @@ def _map_lines(side: str, summary: JsonObject) -> Lines:
     return [*lines, f"{side}, times the best one's error: {', '.join(spans)}."]
 
 
-def _tables(config: Config, summary: JsonObject) -> list[PageTable]:
+def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
     points, kinds = summary["points"], summary["observers"]
     tables = []
     if len(points) == 1:
@@ -324,7 +344,7 @@ def _tables(config: Config, summary: JsonObject) -> list[PageTable]:
                 for kind, numbers in result["kinds"].items()
             ]  # fmt: skip
             columns = ["observer", error_label(summary), "worst run", "times the best", "from", "to", "gains"]
-            tables.append(PageTable(f"{side}, {_where(summary)}", columns, rows))
+            tables.append(ResultTable(f"{side}, {_where(summary)}", columns, rows))
         return tables
     axes = summary["axes"]
     for side in points[0]["sides"]:
@@ -335,5 +355,5 @@ def _tables(config: Config, summary: JsonObject) -> list[PageTable]:
             values, tied = (point["values"][path] for path in axes), ", ".join(result["not_told_apart"])
             rows.append([*values, result["best"] or "none", tied, *ratios])
         columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
-        tables.append(PageTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
+        tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

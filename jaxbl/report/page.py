@@ -15,70 +15,21 @@ from html import escape
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import tomli_w
 
-from jaxbl.files import catch_write_errors, json_with_checksum, write_atomic
-from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, NextStep
+from jaxbl.files import catch_write_errors, write_atomic
+from jaxbl.result import VERDICTS, Result, ResultTable
 
 from .figures import Drawn, save
 from .picture import Picture, picture
 
-if TYPE_CHECKING:
-    from jaxbl.config import Config
-    from jaxbl.diagnosis.diagnose import Diagnosis
-    from jaxbl.estimation.element import ElementIdentification
-    from jaxbl.estimation.identify import Identification
 
-
-class PageTable(NamedTuple):
-    """A table of a report: heading, column names, rows of cells."""
-
-    heading: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[object]]
-
-
-def number_line(path: str, number: JsonObject, condition: str = "") -> str:
-    """A number that was found, in a sentence: value, standard error, unit, interval, and on what condition that holds."""
-    low, high = number["interval"]
-    unit = f" {number['unit']}" if number.get("unit") else ""
-    reach = "for noise alone" if low is None else f"95 %: {low:.5g} to {high:.5g}{condition}"
-    return f"{path} = {number['value']:.5g} ± {number['standard_error']:.2g}{unit}, {reach}."
-
-
-NUMBER_COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
-
-
-def number_row(path: str, number: JsonObject) -> list[object]:
-    """Cells of a number that was found, below `NUMBER_COLUMNS`."""
-    return [path, number["value"], number["standard_error"], *number["interval"]]
-
-
-def write_report(
-    folder: Path,
-    title: str,
-    lead: Sequence[str],
-    drawn: Sequence[Drawn],
-    tables: Sequence[PageTable],
-    config: "Config | str",
-    remarks: Sequence[str] = (),
-    steps: Sequence[NextStep] = (),
-) -> Lines:
-    """Write figures into `figures/`, and `report.html` with what was found (`lead`), remarks, and what to try next.
-
-    A study's own title takes the place of `title`. Returns lead and remarks, the lines for the terminal.
-    """
-    if not isinstance(config, str):
-        title, config = config.title or title, config.to_toml()
+def write_page(folder: Path, result: Result, drawn: Sequence[Drawn], config: str) -> None:
+    """Write figures into `figures/`, and `report.html` with the result, the figures and the study's TOML."""
     save_all(drawn, folder)
-    page = html(title, lead, remarks, [(figure.name, picture(figure)) for figure in drawn], tables, config, steps)
-    write_atomic(folder / "report.html", page)
-    return [*lead, *remarks]
+    pictures = [(figure.name, picture(figure)) for figure in drawn]
+    write_atomic(folder / "report.html", format_page(result, pictures, config))
 
 
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
@@ -87,89 +38,52 @@ def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
         return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
 
 
-def write_results(
-    result: "Identification | Diagnosis | ElementIdentification",
-    folder: Path,
-    name: str,
-    title: str,
-    lead: Sequence[str],
-    drawn: Sequence[Drawn],
-    tables: Sequence[PageTable],
-    remarks: Sequence[str],
-    steps: Sequence[NextStep] = (),
-    model: str = "",
-) -> Lines:
-    """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
-
-    The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
-    for the terminal.
-    """
-    with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
-        draft = Path(place)
-        result.trace.to_parquet(draft / "trace.parquet", index=False)
-        # that of a transmission alone is given
-        model = model or format_model(result, draft / "trace.parquet")  # pyright: ignore[reportArgumentType]
-        (draft / "model.toml").write_text(model, encoding="utf-8")
-        lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
-        write_atomic(draft / f"{name}.json", json_with_checksum(result.summary))
-        for file in sorted(draft.rglob("*"), key=lambda file: file.name == f"{name}.json"):
-            if file.is_file():
-                target = folder / file.relative_to(draft)
-                target.parent.mkdir(exist_ok=True)
-                file.replace(target)
-    return lines
-
-
-def format_model(result: "Identification | Diagnosis", trace: Path) -> str:
-    """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
-    from jaxbl.estimation.logs import run_of
-    from jaxbl.gains.machine_study import complete_study
-
-    data, record = result.model.to_dict(), result.record
-    if result.replays:
-        data["run"] |= run_of(result.model, record) | {"duration": float(f"{record.time[-1] + record.sample_period:.9g}")}
-        data["excitation"] = {"kind": "recorded", "file": str(trace.resolve()), "time_column": "t", "torque_column": "u"}
-    data = complete_study(data, record, result.config)
-    if result.replays:
-        data["excitation"]["file"] = trace.name
-    return tomli_w.dumps(data)
-
-
+_WIDE = 700
+"""Pixels beyond which a figure has the whole width of the page; others stand in two columns."""
 _PARTS = "page.css", "shared.js", "page.js"
 
 
-def html(
-    title: str,
-    lead: Sequence[str],
-    remarks: Sequence[str],
-    pictures: Sequence[tuple[str, Picture]],
-    tables: Sequence[PageTable],
-    config: str,
-    steps: Sequence[NextStep] = (),
-) -> str:
-    """The whole page. Figures have names; the first line of the lead is the answer."""
+def format_page(result: Result, pictures: Sequence[tuple[str, Picture]], config: str) -> str:
+    """The whole page: the card with the first figure, then remarks, figures, tables, and what is folded away."""
     style, *scripts = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
     script = "\n".join(scripts)
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
-    parts = [f'<p class="lead{"" if i else " answer"}">{escape(line)}</p>' for i, line in enumerate(lead)]
-    if remarks:
-        parts += ["<h2>Remarks</h2><ul>", *(f"<li>{escape(line)}</li>" for line in remarks), "</ul>"]
-    if steps:
-        pairs = (f"<dt>{escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>" for step in steps)
-        parts += ["<h2>What to try next</h2><dl>", *pairs, "</dl>"]
-    if pictures:
-        parts += ["<h2>Figures</h2>", *(_figure(name, picture) for name, picture in pictures)]
-    parts += map(_table, tables)
-    parts.append(f"<h2>Config</h2><details><summary>study.toml</summary><pre>{escape(config)}</pre></details>")
+    first, *more = (_figure(*named) for named in pictures) if pictures else ("",)
+    parts = [_card(result, first), _list(result.remarks)]
+    if more:
+        parts.append(f'<div class="figures">{"".join(more)}</div>')
+    parts += map(_table, result.tables)
+    if result.details:
+        parts.append(_fold(f"Remarks ({len(result.details)})", _list(result.details)))
+    parts.append(_fold("Config", f"<pre>{escape(config)}</pre>"))
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="{policy}">
-<title>{escape(title)}</title><style>{style}</style></head>
-<body><main><h1>{escape(title)}</h1>
-{chr(10).join(parts)}
+<title>{escape(result.title)}</title><style>{style}</style></head>
+<body><main><h1>{escape(result.title)}</h1>
+{chr(10).join(filter(None, parts))}
 </main><footer>{escape(_origin())}</footer><script>{script}</script></body></html>
 """
+
+
+def _card(result: Result, figure: str) -> str:
+    """The head of the page: verdict, answer, key figures, the commands to go on with, and the first figure."""
+    verdict = f'<p class="verdict {result.verdict.split()[0]}">{VERDICTS[result.verdict]} {result.verdict.capitalize()}</p>'
+    keys = "".join(f"<div><b>{escape(value)}</b> {escape(meaning)}</div>" for value, meaning in result.key_figures)
+    steps = "".join(
+        f"<dt>{escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>" for step in result.next_steps
+    )
+    texts = [verdict, f'<p class="answer">{escape(result.headline)}</p>', f'<div class="keys">{keys}</div>' if keys else ""]
+    return f'<section class="card"><div>{"".join(texts)}{f"<dl>{steps}</dl>" if steps else ""}</div>{figure}</section>'
+
+
+def _list(sentences: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in sentences)}</ul>" if sentences else ""
+
+
+def _fold(summary: str, content: str) -> str:
+    return f"<details><summary>{summary}</summary>{content}</details>"
 
 
 def _figure(name: str, picture: Picture) -> str:
@@ -178,14 +92,15 @@ def _figure(name: str, picture: Picture) -> str:
     panels = json.dumps(picture.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     image = f'<img src="{picture.source}" alt="{escape(picture.described)}" width="{width}" height="{height}">'
     label = "figure: arrow keys read values, plus and minus zoom, 0 shows the whole"
+    wide = ' class="wide"' if width > _WIDE else ""
     return (
-        f'<figure data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '
+        f'<figure{wide} data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '
         f'style="width:{width}px">{image}</div><figcaption>{escape(picture.caption)}</figcaption>'
         f'<script type="application/json">{panels}</script></figure>'
     )
 
 
-def _table(table: PageTable) -> str:
+def _table(table: ResultTable) -> str:
     heading = escape(table.heading)
     head = "".join(f'<th scope="col">{escape(column)}</th>' if column else "<td></td>" for column in table.columns)
     body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)

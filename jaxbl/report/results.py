@@ -1,51 +1,83 @@
-"""Figures and report of any result: what Python calls, and a notebook shows."""
+"""Result, figures and report of what Python calls and commands return."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.estimation.identify import Identification
 from jaxbl.files import catch_write_errors, to_path
+from jaxbl.fused import SCAN_MESSAGE
 from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
+from jaxbl.lines import format_duration
 from jaxbl.monitoring.watch import Watch
 from jaxbl.records import Inspection
+from jaxbl.result import Result
+from jaxbl.sweeps.compare import Comparison
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.sweeps.trial import Trial
 from jaxbl.validation import suggest_word
 
-from .diagnose import draw_diagnosis, write_diagnosis_report
-from .element import draw_element, write_element_report
+from .compare import describe_comparison, draw_comparison, write_comparison
+from .diagnose import describe_diagnosis, draw_diagnosis, write_diagnosis
+from .element import describe_element, draw_element, write_element
 from .figures import Drawn, lay_out
-from .identify import write_identification_report
+from .identify import describe_identification, write_identification
 from .identify_figures import draw_identification
-from .inspect import draw_inspection, write_inspection_report
+from .inspect import describe_inspection, draw_inspection, write_inspection
 from .maps import draw as draw_study
-from .observer_choice import draw_choice, write_choice_report
+from .observer_choice import describe_choice, draw_choice, write_choice
+from .page import write_page
 from .picture import picture
-from .simulate import draw_trial, write_trial_report
-from .sweep import write_sweep_report
-from .tune import draw_tuning, write_tune_report
-from .verify import draw_verdict, write_verify_report
-from .watch import draw_watch, write_watch_report
+from .simulate import describe_trial, draw_trial, write_trial
+from .sweep import describe_sweep, write_sweep
+from .tune import describe_tuning, draw_tuning, write_tuning
+from .verify import describe_verdict, draw_verdict, write_verdict
+from .watch import describe_watch, draw_watch, write_watch
 
-_Functions = tuple[Callable[[Any], list[Drawn]], Callable[..., list[str]]]
-_KINDS: dict[type, _Functions] = {
-    Trial: (draw_trial, write_trial_report),
-    StudyResult: (draw_study, write_sweep_report),
-    Tuning: (draw_tuning, write_tune_report),
-    ObserverChoice: (draw_choice, write_choice_report),
-    Verdict: (draw_verdict, write_verify_report),
-    Inspection: (draw_inspection, write_inspection_report),
-    Identification: (draw_identification, write_identification_report),
-    ElementIdentification: (draw_element, write_element_report),
-    Diagnosis: (draw_diagnosis, write_diagnosis_report),
-    Watch: (draw_watch, write_watch_report),
+
+class _Kind(NamedTuple):
+    """Functions of one kind of result.
+
+    Attributes:
+        describe: says what was found.
+        draw: draws the figures; the first is the one beside the answer.
+        write: writes the files beside the page into a folder, and returns the study or model that the page shows, as TOML.
+        last: the file that says that the results are complete, where they appear in the folder together.
+    """
+
+    describe: Callable[[Any], Result]
+    draw: Callable[[Any], list[Drawn]]
+    write: Callable[[Any, Path], str]
+    last: str = ""
+
+
+def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
+    return lambda found: describe(found.summary)
+
+
+_KINDS = {
+    Trial: _Kind(describe_trial, draw_trial, write_trial),
+    StudyResult: _Kind(describe_sweep, draw_study, write_sweep),
+    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning),
+    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice),
+    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict),
+    Comparison: _Kind(describe_comparison, draw_comparison, write_comparison),
+    Inspection: _Kind(describe_inspection, draw_inspection, write_inspection),
+    Identification: _Kind(
+        _of_summary(describe_identification), draw_identification, write_identification, "identification.json"
+    ),
+    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, "identification.json"),
+    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, "diagnosis.json"),
+    Watch: _Kind(describe_watch, draw_watch, write_watch),
 }
 
 
@@ -69,42 +101,79 @@ def draw(result: Any, *names: str) -> Drawings:
     """Figures of a result, as its report has them; a notebook shows them.
 
     Args:
-        result: what :func:`jaxbl.run`, :func:`jaxbl.sweep`, :func:`jaxbl.tune`, :func:`jaxbl.verify`, :func:`jaxbl.inspect`,
-            :func:`jaxbl.identify`, :func:`jaxbl.identify_element`, :func:`jaxbl.diagnose` or :func:`jaxbl.watch` returned.
+        result: what :func:`jaxbl.run`, :func:`jaxbl.sweep`, :func:`jaxbl.tune`, :func:`jaxbl.verify`, :func:`jaxbl.compare`,
+            :func:`jaxbl.inspect`, :func:`jaxbl.identify`, :func:`jaxbl.identify_element`, :func:`jaxbl.diagnose` or
+            :func:`jaxbl.watch` returned.
         names: those wanted, by the names of their files; left out, all.
 
     Raises:
         InputError: no result of these, or no figure of that name.
     """
-    drawn = {figure.name: figure for figure in _functions_for(result)[0](result)}
+    drawn = {figure.name: figure for figure in _kind_of(result).draw(result)}
     if unknown := [name for name in names if name not in drawn]:
         raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], drawn)}")
     return Drawings(drawn[name] for name in names or drawn)
 
 
-def write_report(result: Any, folder: str | Path) -> list[str]:
-    """Write figures, `report.html` and the files that the command leaves beside them. Returns the lines that it prints.
+def describe(result: Any) -> Result:
+    """Verdict, answer, key figures, remarks and tables of a result, as its report has them.
+
+    Args:
+        result: as of :func:`jaxbl.draw`.
+
+    Raises:
+        InputError: no result of these.
+    """
+    described, cost = _kind_of(result).describe(result), getattr(result, "cost", None)
+    details = [*described.details]
+    if cost and cost["lanes"]:
+        compiling, computing = format_duration(cost["compile_seconds"]), format_duration(cost["run_seconds"])
+        details.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
+    details += (SCAN_MESSAGE % reason for reason in getattr(result, "fallback_reasons", ()))
+    details += (f"Damaged, and computed anew: {reason}" for reason in getattr(result, "damaged", ()))
+    return replace(described, details=details)
+
+
+def write_report(result: Any, folder: str | Path, described: Result | None = None) -> Result:
+    """Write figures, `report.html` and the files that the command leaves beside them. Returns what the page says.
 
     Args:
         result: as of :func:`jaxbl.draw`.
         folder: made if it is not there; files of the same names are replaced.
+        described: what the page says; left out, what :func:`jaxbl.describe` returns.
 
     Raises:
         InputError: no result of these.
         NoResult: the files cannot be written.
     """
-    write, place = writer(result), to_path(folder)
+    kind, described, place = _kind_of(result), described or describe(result), to_path(folder)
     with catch_write_errors(place):
         place.mkdir(parents=True, exist_ok=True)
-    return write(result, place)
+    with _draft_of(place, kind.last) as draft:
+        config = kind.write(result, draft)
+        write_page(draft, described, kind.draw(result), config)
+    return described
 
 
-def writer(result: Any) -> Callable[..., list[str]]:
-    """The function that writes the report of a result into a folder that exists. Raises `InputError`."""
-    return _functions_for(result)[1]
+@contextmanager
+def _draft_of(folder: Path, last: str) -> Iterator[Path]:
+    """Yield the folder itself, or where there is a `last` file one whose files appear there once all are written."""
+    if not last:
+        yield folder
+        return
+    with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
+        draft = Path(place)
+        yield draft
+        # it is younger than the page that belongs to it
+        (draft / last).touch()
+        for file in sorted(draft.rglob("*"), key=lambda file: file.name == last):
+            if file.is_file():
+                target = folder / file.relative_to(draft)
+                target.parent.mkdir(exist_ok=True)
+                file.replace(target)
 
 
-def _functions_for(result: Any) -> _Functions:
+def _kind_of(result: Any) -> _Kind:
     for kind, functions in _KINDS.items():
         if isinstance(result, kind):
             return functions

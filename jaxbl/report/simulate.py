@@ -7,6 +7,8 @@ from pandas import DataFrame
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.files import write_json, write_table
+from jaxbl.json_types import JsonObject
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
@@ -26,36 +28,67 @@ from .figures import (
     with_unit,
 )
 from .gain_plane import conditions_line, draw_gain_plane
-from .page import PageTable, write_report
 
 _TRUE, _OBSERVED = BLACK, VERMILION
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
 
 
-def write_trial_report(trial: Trial, folder: Path) -> list[str]:
-    """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
+def write_trial(trial: Trial, folder: Path) -> str:
+    """Write trace and summary of a run. Returns the study's TOML."""
     # the summary first: it is what makes the folder this study's
     write_json(folder / "summary.json", trial.summary)
     write_table(folder / "trace.parquet", trial.trace)
-    summary, metrics = trial.summary, trial.summary["metrics"]
+    return trial.config.to_toml()
+
+
+def describe_trial(trial: Trial) -> Result:
+    """Say whether the observers converged, and how large their errors are."""
+    summary, metrics, limits = trial.summary, trial.summary["metrics"], trial.config.run
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
+    failed = [side for side in sides if not metrics[f"{side}.converged"]]
+    verdict, headline = "failed", "The run diverges: a number overflows."
+    if metrics["finite"] and failed:
+        who = (
+            f"The {failed[0]} observer does not converge"
+            if sides != failed or len(sides) == 1
+            else "Neither observer converges"
+        )
+        headline = f"{who}: an error exceeds its tolerance in the last quarter of the run."
+    elif metrics["finite"]:
+        times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
+        verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
+    key_figures = []
+    for side in sides:
+        ratio = 1.0 if side == "motor" else trial.config.drive.gear_ratio
+        tolerance = f"{limits.velocity_tolerance / ratio:.3g}"
+        key_figures += [
+            _size(metrics, side, "velocity", "rad/s", f" (the largest may be {tolerance})"),
+            _size(metrics, side, "torque", "N m"),
+        ]
     rows = [
         [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
         for name, metric in SIDE_METRICS.items()
         if f"motor.{name}" in metrics
     ]
-    tables = [PageTable("Metrics", ["", *sides, "unit", "meaning"], rows)]
-    lead = []
+    tables, remarks = [ResultTable("Metrics", ["", *sides, "unit", "meaning"], rows)], []
     if identified := summary["identified"]:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
-        tables.insert(0, PageTable("Identified", ["", "true", *sides], rows))
+        tables.insert(0, ResultTable("Identified", ["", "true", *sides], rows))
         for name, true, *values in rows:
             texts = ("undetermined" if value is None else f"{value:.4g}" for value in values)
             pairs = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
-            lead.append(f"{name}: {pairs}; true {true:.4g}")
-    lead += [conditions_line(side, gains, "the true bound along this run") for side, gains in summary["conditions"].items()]
-    return write_report(folder, "Run", lead, draw_trial(trial), tables, trial.config, summary["remarks"])
+            remarks.append(f"{name}: {pairs}; true {true:.4g}")
+    judged = summary["conditions"].items()
+    remarks += [conditions_line(side, gains, "the true bound along this run") for side, gains in judged]
+    title = trial.config.title or "Run"
+    return Result(title, verdict, headline, key_figures, remarks, summary["remarks"], tables)
+
+
+def _size(metrics: JsonObject, side: str, quantity: str, unit: str, more: str = "") -> KeyFigure:
+    """The error of an estimate."""
+    error = metrics[f"{side}.{quantity}_rmse"]
+    return KeyFigure("diverges" if error is None else f"{error:.3g} {unit}", f"{side}: {quantity} error, rms{more}")
 
 
 @style()
@@ -63,9 +96,9 @@ def draw_trial(trial: Trial) -> list[Drawn]:
     """All figures of a run."""
     trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
     sides = [side for side in SIDES if f"{side}.position" in trace]
-    drawn = [_input(trace)]
+    drawn = [_torque(trace, sides)]
     drawn += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
-    drawn.append(_torque(trace, sides))
+    drawn.append(_input(trace))
     judged = trial.summary["conditions"]
     drawn += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     drawn += [error_plane(trial.trace, side, gains) for side, gains in judged.items()]

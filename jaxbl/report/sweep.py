@@ -4,7 +4,8 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -13,47 +14,66 @@ import pandas as pd
 
 from jaxbl.config import Config
 from jaxbl.files import write_json
-from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
-from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains, describe_margins
-from jaxbl.lines import Lines, NextStep
+from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
+from jaxbl.lines import Lines
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Distinct, Groups, Rows, spread
 from .figures import SIDES
-from .maps import best_gains, draw, slope_text, unit_of, worst_runs
-from .page import PageTable, write_report
+from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
 
 
-def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
-    """Write figures, `report.html`, and `laws.json` if figures ask for laws, into a study's folder.
+def write_sweep(result: StudyResult, folder: Path) -> str:
+    """Write `laws.json` if figures ask for laws. Returns the study's TOML."""
+    if laws := laws_of(result):
+        write_json(folder / "laws.json", [law.to_dict() for law in laws])
+    else:
+        (folder / "laws.json").unlink(missing_ok=True)
+    return result.config.to_toml()
 
-    Args:
-        result: the study.
-        folder: that exists.
-        steps: what the page says of what to try next.
 
-    Returns:
-        The lines for the terminal.
-    """
-    config, laws = result.config, accuracy_laws(result)
-    drawn = draw(result, laws)
-    survey = _Survey(result)
+def describe_sweep(result: StudyResult) -> Result:
+    """Say where the observers work, and which gains are best, with tables of axes, metrics and laws."""
+    survey, laws = _Survey(result), laws_of(result)
     axes = [
         [path, len(values), *((values.min(), values.max()) if pd.api.types.is_numeric_dtype(values) else "––")]
         for path, values in survey.values.items()
     ]
-    tables = [PageTable("Axes", ["path", "values", "least", "largest"], axes), _metric_table(result)]
-    if laws:
-        write_json(folder / "laws.json", [law.to_dict() for law in laws])
-        tables.insert(0, _law_table(laws))
-    else:
-        (folder / "laws.json").unlink(missing_ok=True)
-    answer, *more = lead = [*headline(result, survey), *_law_lines(laws)]
-    lines = [answer, _describe_study(config, survey), *more]
-    write_report(folder, "Study", lines, drawn, tables, config, config.notes, steps)
-    return lead
+    tables = [_law_table(laws)] * bool(laws)
+    tables += [ResultTable("Axes", ["path", "values", "least", "largest"], axes), _metric_table(result)]
+    answer = answer_sweep(result, survey)
+    return replace(answer, remarks=[*answer.remarks, *_law_lines(laws)], tables=tables)
+
+
+def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result:
+    """Say where the observers work, and which gains are best."""
+    config, survey, remarks = result.config, survey or _Survey(result), []
+    finished = result.is_finished(survey.runs)
+    if not finished:
+        remarks.append(f"The study is not finished: it has {result.runs} runs so far. Go on with 'jaxbl sweep'.")
+    if survey.diverged:
+        remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
+    remarks += (line for side, (best, _) in survey.best.items() for line in _best_lines(side, best))
+    works = survey.diverged < survey.runs and all(survey.converged.values())
+    works = works and all(best is not None for best, _ in survey.best.values())
+    verdict = "doubtful" if not finished else "good" if works else "failed"
+    figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
+    details = [_describe_study(config, survey), *config.notes]
+    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, details)
+
+
+def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iterator[KeyFigure]:
+    """The best gains of a side with their error, and how far they may change."""
+    if best is not None:
+        row = runs.reset_index().iloc[best.index]
+        place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
+        yield KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})")
+        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
+        yield KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}")
 
 
 _DRIVES = {"two_inertia": "a drive of two inertias", "rigid": "a rigid drive"}
@@ -115,39 +135,27 @@ class _Survey:
                 self.best[side] = best_gains(runs), runs
 
 
-def headline(result: StudyResult, survey: _Survey | None = None) -> Lines:
-    """Say what a study found, in sentences."""
-    survey = survey or _Survey(result)
-    count, runs, so_far = f"{survey.runs} runs.", "them", ""
+def _headline(result: StudyResult, survey: _Survey) -> str:
+    """Say in how many runs the observers converge."""
+    count, among = f"{survey.runs} runs", ""
     if result.config.sweep.refine is not None:
         points = len(Points(result.config))
         simulated = survey.runs // result.config.sweep.seeds
-        count = f"{simulated} of {points} grid points simulated ({100 * simulated / points:.2g} %), {count}"
-        runs, so_far = "those on the coarse grid", " so far"
-    if survey.sides:
-        even = survey.even or math.nan
-        shares = ", ".join(f"{100 * survey.converged[side] / even:.1f} % ({side})" for side in survey.sides)
-        count += f" The observers converged in {shares} of {runs}."
-    lines = [count]
-    if not result.is_finished(survey.runs):
-        lines.append(f"The study is not finished: it has {result.runs} runs{so_far}. Go on with 'jaxbl sweep'.")
-    if survey.diverged:
-        lines.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
-    return [*lines, *(f"{side}: {_best_line(*best)}" for side, best in survey.best.items())]
+        count = f"{count} at {simulated} of {points} grid points ({100 * simulated / points:.2g} %)"
+        among = " on the coarse grid"
+    even = survey.even or math.nan
+    shares = [f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %" for side in survey.sides]
+    return f"{count}: {' and '.join(shares)}{among}." if shares else f"{count}."
 
 
-def _best_line(best: BestGains | None, runs: pd.DataFrame) -> str:
-    """The best gains of a side, their margin, and how many others are as good."""
+def _best_lines(side: str, best: BestGains | None) -> Lines:
+    """Say what is wrong with the best gains of a side."""
     if best is None:
-        return "no gains converged in all runs with α above f⁺."
-    row = runs.reset_index().iloc[best.index]
-    place = ", ".join(f"{name} = {row[name]:.3g}" for name in runs.index.names)
-    ends = (f" Its {gain} is the {way.replace('er', 'est')} of its axis." for gain, way in best.ends.items())
-    return (
-        f"best gains {place}: velocity error {row['error']:.3g} rad/s rms, the worst of their runs (least: "
-        f"{best.least_error:.3g}). {describe_margins(best.margins)} {best.nearly_as_good} of {len(runs)} gains are as good "
-        f"within {100 * NEARLY_AS_GOOD:g} %.{''.join(ends)}"
-    )
+        return [f"{side}: no gains converged in all runs with α above f⁺."]
+    return [
+        f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
+        for gain, way in best.ends.items()
+    ]
 
 
 def _law_lines(laws: list[Law]) -> Lines:
@@ -176,7 +184,7 @@ def _place(law: Law) -> str:
     return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
 
 
-def _law_table(laws: list[Law]) -> PageTable:
+def _law_table(laws: list[Law]) -> ResultTable:
     rows = []
     for law in laws:
         line, slope, halves, ends = f"{law.value} over {law.x}", "no law", "–", "–"
@@ -187,10 +195,10 @@ def _law_table(laws: list[Law]) -> PageTable:
         slope, halves, ends = (text.replace(" ", "\u00a0") for text in (slope, halves, ends))
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _explain_ends(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
-    return PageTable("Accuracy laws", columns, rows)
+    return ResultTable("Accuracy laws", columns, rows)
 
 
-def _metric_table(result: StudyResult) -> PageTable:
+def _metric_table(result: StudyResult) -> ResultTable:
     metrics = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
     metrics = {column: metric for column, metric in metrics.items() if column in result.columns}
     rows = Rows(result, metrics)
@@ -207,4 +215,4 @@ def _metric_table(result: StudyResult) -> PageTable:
         [column, *(None if np.isnan(value) else value for value in row), metric.unit, metric.doc]
         for (column, metric), row in zip(metrics.items(), quantiles, strict=True)
     ]
-    return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)
+    return ResultTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)

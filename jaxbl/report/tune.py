@@ -9,13 +9,14 @@ from matplotlib.patches import Patch, Rectangle
 from pandas import DataFrame
 
 from jaxbl.files import write_atomic, write_json
-from jaxbl.gains.best_gains import NEARLY_AS_GOOD, describe_margins
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines, doubts_among
 from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
@@ -43,7 +44,7 @@ from .figures import (
 )
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import Cells, cell_edges, color_norm, condition_curves, flat_remark, hatch_failures, outline_effects, set_up_map
-from .page import PageTable, write_report
+from .numbers import lead_with_doubt
 
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
@@ -190,7 +191,6 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
             "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
             "chatter is not above the error. "
         )
-    caption += f"What limits the gains: {_limits_text(limits)}"
     return Drawn(f"limits_{side}", figure, caption)
 
 
@@ -212,28 +212,6 @@ def _short(way: JsonObject) -> str:
 def _size(change: float) -> str:
     """A relative change in few characters."""
     return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{100.0 * change:+.2g} %"
-
-
-def _limits_text(limits: JsonObject) -> str:
-    """Say what limits gains towards smaller and larger values (`limits` of a side), in sentences."""
-    binding = [
-        f"{name} = {constraint['limit']:g} (here {constraint['value']:.4g})" if "limit" in constraint else name
-        for name, constraint in limits["constraints"].items()
-        if constraint["binds"]
-    ]
-    if binding:
-        lines = [f"{' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
-    elif limits["range_ends"]:
-        lines = ["no constraint binds beside the optimum, but the range searched ends there."]
-    else:
-        lines = ["no constraint binds beside the optimum, which lies inside of the range searched."]
-    for gain, symbol, unit, *_ in _PLANES:
-        ways = limits["towards"][gain]
-        text = "; ".join(f"{way} {symbol}: {_way(symbol, unit, limit)}" for way, limit in ways.items())
-        lines.append(f"{text[0].upper()}{text[1:]}.")
-        if [limit["by"] for limit in ways.values()] == ["slow", "chatter"]:
-            lines.append(f"So for {symbol} the slow part of the error balances its chatter.")
-    return " ".join(lines)
 
 
 def _way(symbol: str, unit: str, way: JsonObject) -> str:
@@ -321,22 +299,74 @@ def _bars(ax: Axes, key: str, rows: list[JsonObject]) -> None:
     ax.grid(axis="y", visible=False)
 
 
-def write_tune_report(tuning: Tuning, folder: Path) -> Lines:
-    """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
+def write_tuning(tuning: Tuning, folder: Path) -> str:
+    """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
     summary = tuning.summary
-    certified = certificate_lines(summary)
-    lead = [*certified, *tune_headline(summary)] if is_refuted(summary) else [*tune_headline(summary), *certified]
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_certificates(summary, folder)
     write_json(folder / "tuning.json", summary, allow_nan=False)
+    return tuning.config.to_toml()
+
+
+def describe_tuning(tuning: Tuning) -> Result:
+    """Say which gains to take, whether they matter, and what limits them."""
+    summary = tuning.summary
+    chosen = "; ".join(
+        f"λ = {gains['lambda']:.4g} √rad/s, α = {gains['alpha']:.4g} rad/s² ({side})"
+        for side, gains in summary["gains"].items()
+    )
+    matter = {verdict["gains_matter"] for verdict in summary["verdict"].values()}
+    verdict, headline = "good", f"Take {chosen}."
+    if matter == {"no"}:
+        headline = f"The gains hardly matter here; take {chosen}."
+    elif "range" in matter:
+        verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
+    certified = certificate_lines(summary)
+    if beaten := _better_gains(summary):
+        verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
+    remarks = [*doubts_among(summary["remarks"]), *_reasons(summary)]
+    if is_refuted(summary):
+        verdict, headline = "failed", "The search found an error above what was proven."
+    details = [line for line in summary["remarks"] if line not in remarks]
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
         _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
         _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
-        *_pareto_tables(summary),
     ]
-    return write_report(folder, "Gains", lead, draw_tuning(tuning), tables, tuning.config, summary["remarks"])
+    title = tuning.config.title or "Gains"
+    remarks = [*certified, *remarks] if is_refuted(summary) else [*remarks, *certified]
+    return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
+
+
+def _better_gains(summary: JsonObject) -> list[str]:
+    """Gains with the margins asked for that err less on the held-out runs than the tuned ones, by more than a little."""
+    metric, factors = f"{summary['objective']}_rmse", summary["holdout"]["factors"]
+    return [
+        f"{row['side']}: {describe_gains(row['name'])}"
+        for row in summary["holdout"]["rows"]
+        if (factor := factors[row["side"]].get(row["name"], {}).get(metric)) is not None
+        and (factor["worst"] or 1.0) < 1.0 / (1.0 + NEARLY_AS_GOOD)
+        and all((row[f"margin_{key}"] or 0.0) >= margin for key, margin in summary["margins"].items())
+    ]
+
+
+def _key_figures(summary: JsonObject) -> list[KeyFigure]:
+    """The error of each side's gains beside that of the others, and how far the gains may change."""
+    metric, figures = f"{summary['objective']}_rmse", []
+    for side, verdict in summary["verdict"].items():
+        worst, factors = summary["achieved"][side][metric], summary["holdout"]["factors"][side]
+        factors_text = [
+            f"{factor[metric]['worst']:.3g} times as much with {describe_gains(name)}"
+            for name, factor in factors.items()
+            if "why_none" not in factor and factor[metric]["worst"] is not None
+        ]
+        besides = f" ({factors_text[0]})" if factors_text else ""
+        meaning = f"{side}: worst {summary['objective']} error, rms{besides}"
+        figures.append(KeyFigure(f"{worst:.3g} {SIDE_METRICS[metric].unit}", meaning))
+        reach = min(verdict["margins"].values())
+        figures.append(KeyFigure(f"× {reach:.3g}", f"{side}: change of the gains until they fail or err twice as much"))
+    return figures
 
 
 def gains_toml(summary: JsonObject) -> str:
@@ -383,42 +413,16 @@ def _where(summary: JsonObject) -> str:
     return "on the study's excitation with other noise" if runs["same_excitation"] else other
 
 
-def tune_headline(summary: JsonObject) -> Lines:
-    """Say whether gains matter, the chosen ones, and their errors on the held-out runs."""
-    metric = f"{summary['objective']}_rmse"
-    unit = SIDE_METRICS[metric].unit
-    lines = doubts_among(summary["remarks"])
-    lines += [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
-    for side, gains in summary["gains"].items():
-        achieved, verdict = summary["achieved"][side], summary["verdict"][side]
-        lines.append(
-            f"{side}: lambda = {gains['lambda']:.4g} √rad/s, alpha = {gains['alpha']:.4g} rad/s² "
-            f"({gains['lambda_ratio']:.3g} √f⁺, {gains['alpha_ratio']:.3g} f⁺): {summary['objective']} error "
-            f"{achieved[metric]:.3g} {unit} rms, converged after {achieved['convergence_time']:.3g} s, the worst of "
-            f"{_runs_behind(summary)}. {describe_margins(verdict['margins'])} "
-            f"{verdict['nearly_as_good']} of {verdict['tried']} gains are as good within {100 * NEARLY_AS_GOOD:g} %."
-        )
-    limits = {side: limit for side, limit in summary["limits"].items() if summary["verdict"][side]["gains_matter"] != "no"}
-    lines += [f"{side}, what limits the gains: {_limits_text(limit)}" for side, limit in limits.items()]
-    if any(way["by"] for limit in limits.values() for ways in limit["towards"].values() for way in ways.values()):
-        lines[-1] += " (Chatter is what changes from sample to sample, the slow part is the rest.)"
-    lines += [conditions_line(side, gains, "the largest of all runs") for side, gains in summary["conditions"].items()]
-    rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
-    for side, compared in summary["holdout"]["factors"].items():
-        parts = []
-        for name, factors in compared.items():
-            gains, row = describe_gains(name), rows[name, side]
-            if "why_none" in factors:
-                parts.append(f"{gains} converge in {100 * row['converged']:.3g} % of the runs")
-            else:
-                error, time = factors[metric]["worst"], row["convergence_time"]["worst"]
-                times = "as much" if error is None or f"{error:.3g}" == "1" else f"{error:.3g} times as much"
-                parts.append(f"{times} with {gains} (converged after {time:.3g} s)")
-        error, time = (rows["tuned", side][key]["worst"] for key in (metric, "convergence_time"))
-        size = "none: runs diverge" if error is None else f"{error:.3g} {unit} rms"
-        after = "not converged in all runs" if time is None else f"converged after {time:.3g} s"
-        lines.append(f"{side}, {_where(summary)}: worst {summary['objective']} error {size} ({after}); {'; '.join(parts)}.")
-    return lines
+def _reasons(summary: JsonObject) -> Lines:
+    """Say whether gains matter, what binds, and how far the gains are from where the exact condition fails."""
+    lines = [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
+    for side, limits in summary["limits"].items():
+        if binding := [name for name, constraint in limits["constraints"].items() if constraint["binds"]]:
+            lines.append(f"{side}: a smaller error is forbidden by {' and '.join(binding)}.")
+        elif limits["range_ends"]:
+            keys = " and ".join(f"tune.{end.split()[1]}_ratio" for end in limits["range_ends"])
+            lines.append(f"{side}: the error still falls, or stays level, where the searched range ends; widen {keys}.")
+    return lines + [conditions_line(side, gains, "the largest of all runs") for side, gains in summary["conditions"].items()]
 
 
 def describe_verdict(verdict: JsonObject) -> str:
@@ -439,19 +443,18 @@ _MARGINS = {"margin α": "margin_alpha", "margin exact": "margin_exact", "ρ": "
 """Columns of tables, and keys of their values."""
 
 
-def _gains_table(summary: JsonObject) -> PageTable:
-    keys = "velocity_rmse", "torque_rmse", "convergence_time", *_MARGINS.values()
+def _gains_table(summary: JsonObject) -> ResultTable:
+    """Each gain, and what speaks against a smaller and a larger one."""
     rows = [
-        [side, *gains.values(), summary["f_plus"][side], *(summary["achieved"][side][key] for key in keys),
-         100 * max(summary["resolution"][side].values())]
+        [f"{side}: {symbol} ({unit})", gains[gain], gains[f"{gain}_ratio"],
+         *(_way(symbol, unit, limit) for limit in summary["limits"][side]["towards"][gain].values())]
         for side, gains in summary["gains"].items()
+        for gain, symbol, unit, *_ in _PLANES
     ]  # fmt: skip
-    columns = ["side", "λ (√rad/s)", "α (rad/s²)", "λ/√f⁺", "α/f⁺", "f⁺ (rad/s²)", "velocity error (rad/s)",
-               "torque error (N m)", "convergence (s)", *_MARGINS, "last step (%)"]  # fmt: skip
-    return PageTable("Chosen gains, worst of all runs", columns, rows)
+    return ResultTable("Gains", ["gain", "value", "over f⁺, λ over √f⁺", "a smaller one", "a larger one"], rows)
 
 
-def _comparison_table(heading: str, gains: list[JsonObject]) -> PageTable:
+def _comparison_table(heading: str, gains: list[JsonObject]) -> ResultTable:
     rows = [
         [*(row[key] for key in ("side", "name", "lambda", "alpha")), 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
@@ -460,14 +463,4 @@ def _comparison_table(heading: str, gains: list[JsonObject]) -> PageTable:
     ]  # fmt: skip
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", *_MARGINS]  # fmt: skip
-    return PageTable(heading, columns, rows)
-
-
-def _pareto_tables(summary: JsonObject) -> list[PageTable]:
-    unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
-    columns = ["λ", "α", "λ/√f⁺", "α/f⁺", "convergence time (s)", f"{summary['objective']} error ({unit})"]
-    heading = "No gains beat these in both convergence time and error"
-    return [
-        PageTable(f"{heading}: {side}", columns, [list(row.values()) for row in rows])
-        for side, rows in summary["pareto"].items()
-    ]
+    return ResultTable(heading, columns, rows)

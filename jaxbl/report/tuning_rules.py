@@ -8,10 +8,10 @@ from jaxbl.gains.rules import RULES, allows_gains
 from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.result import ResultTable
 
 from .figures import COLOURS, FAINT, MISSING, Axes, Drawn, Line2D, Patch, decades, style, subplots
 from .maps import least_lambdas
-from .page import PageTable
 
 _ALPHA, _LAMBDA = (0.3, 20.0), (0.15, 25.0)
 """Ends of the plane, alpha / f⁺ and lambda / √f⁺."""
@@ -123,7 +123,7 @@ def _wrong(rule: JsonObject) -> str:
     return f"{gains}: simulated under the worst disturbance, each peak of the error is {rho:.3g} times the last."
 
 
-def rule_table(rules: list[JsonObject]) -> PageTable:
+def rule_table(rules: list[JsonObject]) -> ResultTable:
     """All rules, with what was read of each."""
     rows = []
     for rule in rules:
@@ -140,4 +140,4 @@ def rule_table(rules: list[JsonObject]) -> PageTable:
             rule["source"],
         ])  # fmt: skip
     columns = ["rule", "asks for", "sufficient", "least λ / exact", "covers", "wrong cells", "counterexample", "source"]
-    return PageTable("Public tuning rules, judged by the exact condition", columns, rows)
+    return ResultTable("Public tuning rules, judged by the exact condition", columns, rows)

@@ -1,7 +1,7 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
 import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -11,11 +11,12 @@ import tomli_w
 
 from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, NextStep, doubts_among
+from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
+from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import SIDE_COLOURS, SIDES, VERMILION, Drawn, legend, limits, outline, stacked, stretches, style
-from .page import PageTable, write_report
+from .numbers import lead_with_doubt
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
@@ -24,11 +25,34 @@ _LABELS = {
 }  # fmt: skip
 
 
-def write_watch_report(watch: Watch, folder: Path, steps: Sequence[NextStep] = ()) -> Lines:
-    """Write `watch.csv`, `watch.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
-    summary, task = watch.summary, watch.task
+def write_watch(watch: Watch, folder: Path) -> str:
+    """Write `watch.csv` and `watch.json`. Returns the study's TOML."""
     with open_draft(folder / VALUES) as draft:
         watch.values.to_csv(draft, index=False)
+    write_atomic(folder / SUMMARY, json_with_checksum(watch.summary))
+    return tomli_w.dumps(watch.task.config.to_dict())
+
+
+def describe_watch(watch: Watch) -> Result:
+    """Say whether the gap has grown beyond its limit, and how large gap and stiffness are."""
+    summary, task = watch.summary, watch.task
+    last, limit, alarm = (summary[key] for key in ("last", "alarm_gap", "alarm"))
+    units, count = summary["units"]["motor"], summary["values"]
+    verdict, headline = "good", f"Watched: the numbers were determined at {summary['determined']} of {count} times."
+    if limit is not None and alarm is not None:
+        verdict = "failed"
+        headline = (
+            f"ALARM from {alarm['t']:.1f} s on: the half gap is beyond {limit:g} {units['half_gap']}, "
+            f"{alarm['half_gap']:.4g} ({alarm['half_gap_from']:.4g} to {alarm['half_gap_to']:.4g}) then."
+        )
+    elif last is None:
+        verdict = "no answer"
+        headline = (
+            f"Nothing was determined ({count} values): too little motion, too few ways through the gap, or less than "
+            f"the window of {summary['window']:g} s."
+        )
+    elif limit is not None:
+        headline = f"No alarm: at none of {count} values was the half gap surely beyond {limit:g} {units['half_gap']}."
     ends = [summary[end] or {} for end in ("first", "last")]
     rows = [
         [f"{side}: {label}", *(values.get(f"{side}.{name}{kind}") for values in ends for kind in ("", "_error")),
@@ -37,11 +61,28 @@ def write_watch_report(watch: Watch, folder: Path, steps: Sequence[NextStep] = (
         if f"{side}.{name}" in watch.values
     ]  # fmt: skip
     columns = ["number", "first value", "standard error", "last value", "standard error", "unit"]
-    tables, config = [PageTable("Numbers", columns, rows)], tomli_w.dumps(task.config.to_dict())
-    title, lead = task.config.title or f"Watch of {Path(task.name).name}", watch_lines(summary)
-    lines = write_report(folder, title, lead, draw_watch(watch), tables, config, summary["notes"], steps)
-    write_atomic(folder / SUMMARY, json_with_checksum(summary))
-    return lines
+    figures = [
+        KeyFigure(
+            f"{end[name]:.4g} {units[name]}",
+            f"{_LABELS[name]} at {end['t']:.1f} s (95 %: {end[f'{name}_from']:.4g} to {end[f'{name}_to']:.4g})",
+        )
+        for name in ("half_gap", "stiffness")
+        if last is not None and name in last
+        for end in (summary["first"], last)
+    ]
+    remarks = doubts_among(summary["notes"])
+    if summary["contradictions"]:
+        # before figures that it puts in doubt
+        remarks.append(
+            f"{DOUBT}motor and load give different gaps or stiffnesses at {summary['contradictions']} of {count} values: an "
+            "inertia or a gain of the model is wrong, or something acts on one side that it lacks. The smaller gap counts."
+        )
+    if summary["left_out"]:
+        remarks.append(f"Of the stream: {describe_counts(summary['left_out'])}.")
+    title = task.config.title or f"Watch of {Path(task.name).name}"
+    tables = [ResultTable("Numbers", columns, rows)]
+    result = Result(title, verdict, headline, figures, remarks, summary["notes"], tables)
+    return result if alarm else lead_with_doubt(result)
 
 
 @contextmanager
@@ -60,47 +101,6 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
         mode = "a"
 
     yield add
-
-
-def watch_lines(summary: JsonObject) -> Lines:
-    """The lines for the terminal, from a `watch.json`."""
-    first, last, limit, alarm = (summary[key] for key in ("first", "last", "alarm_gap", "alarm"))
-    units, count = summary["units"]["motor"], summary["values"]
-    lines = doubts_among(summary["notes"])
-    if limit is not None and alarm is not None:
-        lines.append(
-            f"ALARM from {alarm['t']:.1f} s on: the half gap is beyond {limit:g} {units['half_gap']}, "
-            f"{alarm['half_gap']:.4g} ({alarm['half_gap_from']:.4g} to {alarm['half_gap_to']:.4g}) then."
-        )
-    elif limit is not None and last is not None:
-        lines.append(f"No alarm: at none of {count} values was the half gap surely beyond {limit:g} {units['half_gap']}.")
-    if last is None:
-        lines.append(
-            f"Nothing was determined ({count} values): too little motion, too few ways through the gap, or less than the "
-            f"window of {summary['window']:g} s."
-        )
-        return [*lines, *_left_out(summary)]
-    for name in ("half_gap", "stiffness"):
-        if name in last:
-            numbers = ", ".join(
-                f"{end[name]:.4g} {units[name]} ({end[f'{name}_from']:.4g} to {end[f'{name}_to']:.4g}) at {end['t']:.1f} s"
-                for end in ([first, last] if first["t"] < last["t"] else [last])
-            )
-            lines.append(f"{_LABELS[name].capitalize()}: {numbers}; 95 % intervals in brackets.")
-    if summary["determined"] < count:
-        lines.append(f"Not determined at {count - summary['determined']} of {count} values.")
-    if summary["contradictions"]:
-        # before figures that it puts in doubt
-        lines.insert(
-            0,
-            f"Motor and load give different gaps or stiffnesses at {summary['contradictions']} of {count} values: an "
-            "inertia or a gain of the model is wrong, or something acts on one side that it lacks. The smaller gap counts.",
-        )
-    return [*lines, *_left_out(summary)]
-
-
-def _left_out(summary: JsonObject) -> Lines:
-    return [f"Of the stream: {describe_counts(summary['left_out'])}."] if summary["left_out"] else []
 
 
 @style()

@@ -134,7 +134,12 @@ class Comparison:
     paired: bool
     unfinished: dict[str, tuple[int, int]]
     metrics: tuple[MetricChange, ...]
-    _studies: "tuple[_MatchedStudy, _MatchedStudy] | None" = dataclasses.field(repr=False, default=None)
+    _studies: "tuple[_MatchedStudy, _MatchedStudy]" = dataclasses.field(repr=False)
+
+    @property
+    def first_config(self) -> Config:
+        """The first study."""
+        return self._studies[0].study.config
 
     @property
     def knows_noise(self) -> bool:
@@ -158,7 +163,6 @@ class Comparison:
         The columns are the axes, `first` and `second` (means over the seeds compared), and `differs`, which is True for
         points that differ by more than noise, or by more than rounding if the noise is not known.
         """
-        assert self._studies is not None
         matched = _MatchedMetric(metric, *self._studies, self.paired)
         axis_values = self._studies[0].axis_values.reset_index(drop=True)
         first, second = matched.means
@@ -191,7 +195,10 @@ def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -
         for name, rows in zip(names, matched, strict=True)
         if not rows.study.is_finished(rows.row_count)
     }
-    configs = [_flatten_tables(_config_without(study.config, _IGNORED_KEYS)) for study in studies]
+    configs = [
+        _flatten_tables({key: table for key, table in study.config.to_dict().items() if key not in _IGNORED_KEYS})
+        for study in studies
+    ]
     return Comparison(
         names=names,
         config=_differing_keys(*configs),
@@ -217,16 +224,12 @@ def _study_names(first: Any, second: Any) -> tuple[str, str]:
     return (names[0], names[1]) if names[0] != names[1] else (f"{names[0]} (first)", f"{names[1]} (second)")
 
 
-def _compare_versions(first: StudyResult, second: StudyResult) -> dict[str, tuple[Any, Any]]:
+def _compare_versions(*studies: StudyResult) -> dict[str, tuple[Any, Any]]:
     """Backend and versions that differ, if both studies are stored."""
-    if not (isinstance(first.source, Store) and isinstance(second.source, Store)):
+    manifests = [study.source.manifest for study in studies if isinstance(study.source, Store)]
+    if len(manifests) < 2:
         return {}
-    manifests = first.source.manifest, second.source.manifest
     return _differing_keys(*({"backend": manifest["backend"], **manifest["versions"]} for manifest in manifests))
-
-
-def _config_without(config: Config, keys: tuple[str, ...]) -> JsonObject:
-    return {key: table for key, table in config.to_dict().items() if key not in keys}
 
 
 def _flatten_tables(tree: Any, prefix: str = "") -> JsonObject:
@@ -310,7 +313,7 @@ def _match_points(
 def _read_keys(study: StudyResult, paths: list[str]) -> pd.DataFrame:
     """Values at all paths, and seeds, of a study's rows; its config has the value of a path that is none of its axes."""
     axis_paths = [axis.path for axis in study.config.axes]
-    leaves = _flatten_tables(_config_without(study.config, ("axes",)))
+    leaves = _flatten_tables(study.config.to_dict())
     constants = {path: leaves.get(path, math.nan) for path in paths if path not in axis_paths}
     return study.read([*axis_paths, "seed"]).assign(**constants).reset_index(drop=True)
 

@@ -36,7 +36,7 @@ _MAX_GRID_NUMBERS = 2e8
 """Largest number of values of a dataset that is mostly empty: 1.6 GB."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class StudyResult:
     """Points of a study with their metrics.
 

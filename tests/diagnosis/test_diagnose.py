@@ -26,7 +26,8 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.logs import SealedRecord
 from jaxbl.files import read_json
 from jaxbl.records import read_record
-from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
+from jaxbl.report.diagnose import describe_diagnosis
+from jaxbl.report.results import write_report
 
 FIRST_PART, LAST_PART = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)
 
@@ -163,29 +164,29 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
 
 
 def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, tmp_path):
-    lines = write_diagnosis_report(diagnosis, tmp_path)
+    result = write_report(diagnosis, tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
-    assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
-    assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
+    assert result.verdict == "good" and result.headline.startswith("The model lacks motor.coulomb_friction; with it, it ")
+    assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in result.remarks)
     model = read_config(tmp_path / "model.toml")
     assert [effect.kind for effect in model.effects] == ["motor.coulomb_friction"]
     summary = read_json(tmp_path / "diagnosis.json")
-    assert summary == diagnosis.summary and diagnosis_lines(summary) == lines
+    assert summary == diagnosis.summary and describe_diagnosis(summary) == result
     assert model.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 
 
 @needs_chromium
 def test_the_page_in_a_browser(diagnosis, tmp_path):
-    write_diagnosis_report(diagnosis, tmp_path)
+    write_report(diagnosis, tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
         check_figures(page, len(list((tmp_path / "figures").iterdir())))
-        assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
+        assert page.locator(".answer").inner_text().startswith("The model lacks motor.coulomb_friction;")
 
 
 def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, diagnosis, tmp_path):
     """The model is read as written, with the record of the first log for its excitation."""
-    write_diagnosis_report(diagnosis, tmp_path)
+    write_report(diagnosis, tmp_path)
     second = diagnose(logs / "other.csv", tmp_path / "model.toml")
     assert second.config.excitation.kind == "recorded"
     assert second.summary["verdict"] == "no_discrepancy" and second.summary["findings"] == []
@@ -299,9 +300,9 @@ def test_a_proof_that_does_not_move_tests_nothing(logs):
     summary = run_diagnosis(dataclasses.replace(task, holdout=SealedRecord(quiet))).summary
     assert [finding["effect"] for finding in summary["findings"]] == ["motor.coulomb_friction"]
     assert summary["verdict"] == "not_tested"
-    (line, *_) = diagnosis_lines(summary)
-    assert line.startswith("Not tested: by the log the model lacks motor.coulomb_friction; data not used for the fit cannot")
-    assert "Hold out a log that reaches as far: motor position " in line
+    result = describe_diagnosis(summary)
+    assert result.headline == "By the log the model lacks motor.coulomb_friction, but the held-out data cannot test that."
+    assert any("Hold out a log that reaches as far: motor position " in line for line in result.remarks)
 
 
 def test_the_history_leads_from_log_to_name(diagnosis):
@@ -318,8 +319,8 @@ def test_the_history_leads_from_log_to_name(diagnosis):
 def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     record = read_record(logs / "axis.csv")
     assert tied({"findings": []}) is None
-    lines = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
-    assert lines[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    line = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
+    assert line.startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
     rival = {"effect": "motor.quadratic_drag", "drive": nominal_study()["drive"], "effects": other}
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
@@ -331,8 +332,8 @@ def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     less = next_experiment(summary, diagnosis.model, record, torque=0.1 * largest, travel=0.5)
     assert less is not None and less.apart < best.apart and np.max(np.abs(less.torque)) <= 0.1 * largest + 1e-12
     assert next_experiment(summary, diagnosis.model, record, travel=1e-9) is None
-    write_diagnosis_report(diagnosis, tmp_path)
-    (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
+    write_report(diagnosis, tmp_path)
+    line = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
     assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
     columns = np.genfromtxt(tmp_path / "new" / "next.csv", delimiter=",", names=True)
     np.testing.assert_allclose(columns["u"], best.torque, atol=1e-8)

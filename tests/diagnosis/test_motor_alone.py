@@ -15,7 +15,8 @@ from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosi
 from jaxbl.diagnosis.motor_alone import sought
 from jaxbl.diagnosis.next_experiment import with_gap
 from jaxbl.drive.effects import DELAY_SAMPLES
-from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
+from jaxbl.report.diagnose import describe_diagnosis
+from jaxbl.report.results import write_report
 
 STUDY = {
     "title": "motor alone",
@@ -37,8 +38,8 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     assert numbers["motor.coulomb_friction"]["torque"]["value"] == pytest.approx(0.1, rel=0.05)
     before, after = (diagnosis.summary["gap"][f"holdout_rmse_{name}"]["theta_e"] for name in ("before", "after"))
     assert after < 0.01 * before
-    lines = write_diagnosis_report(diagnosis, tmp_path)
-    assert lines[0].startswith("No load position")
+    lines = write_report(diagnosis, tmp_path).sentences
+    assert any(line.startswith("No load position") for line in lines)
     assert any("predicted one sample ahead" in line for line in lines)
     assert json.loads((tmp_path / "diagnosis.json").read_text())["backlash"]["shown"]
     assert {file.name for file in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
@@ -96,7 +97,7 @@ def test_one_crossing_shows_a_gap(tmp_path):
     assert summary["backlash"]["crossings"] == 1
     (finding,) = summary["findings"]
     assert finding["parameters"]["half_gap"]["value"] == summary["backlash"]["half_gap"] == pytest.approx(0.08, rel=1e-3)
-    assert not any("No gap is shown" in line for line in diagnosis_lines(summary))
+    assert not any("No gap is shown" in line for line in describe_diagnosis(summary).sentences)
 
 
 def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
@@ -105,10 +106,8 @@ def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
     monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
     summary = diagnose(path, EXACT_STUDY).summary
     assert (summary["verdict"], summary["findings"]) == ("unknown_effect", [])
-    lines = diagnosis_lines(summary)
-    assert any(
-        line.startswith("Unknown: a gap might explain what is missing, but this log does not show it") for line in lines
-    )
+    lines = describe_diagnosis(summary).sentences
+    assert lines[0] == "A gap might explain what is missing, but this log does not show it."
     assert "No gap is shown: it may be of any size. model.toml has the one that fits best." in lines
 
 

@@ -34,7 +34,7 @@ def test_a_move_that_shows_a_gap_is_for_the_motor_alone_and_a_model_with_one():
 
 
 def test_a_diagnosis_that_seeks_no_gap_writes_no_experiment(tmp_path):
-    (line,) = write_gap_experiment(tmp_path, {"backlash": None}, SimpleNamespace(), tmp_path / "next.csv")  # type: ignore[arg-type]
+    line = write_gap_experiment(tmp_path, {"backlash": None}, SimpleNamespace(), tmp_path / "next.csv")  # type: ignore[arg-type]
     assert line.startswith("No gap is sought: the model has one")
 
 

@@ -19,7 +19,8 @@ from jaxbl.estimation.identify import identify
 from jaxbl.estimation.logs import default_paths
 from jaxbl.estimation.search import ParameterSearch
 from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.report.identify import identification_lines, write_identification_report
+from jaxbl.report.identify import describe_identification
+from jaxbl.report.results import write_report
 from jaxbl.simulate import plant_trajectory
 
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
@@ -125,14 +126,15 @@ def test_model_runs_with_the_numbers_found(identification, tmp_path):
 
 
 def test_report_has_every_number_and_figure(identification, tmp_path):
-    lines = write_identification_report(identification, tmp_path)
-    assert lines[0].startswith("drive.motor_inertia = 0.04999")
-    assert any("times the noise: noise alone." in line for line in lines[1:])
+    result = write_report(identification, tmp_path)
+    assert result.verdict == "good" and result.headline.startswith("The model explains the log: no more than noise is left")
+    assert any(value.startswith("0.04999") and path == "drive.motor_inertia" for value, path in result.key_figures)
+    assert any("times the noise: noise alone." in line for line in result.details)
     # what a model lacks is said before numbers whose intervals do not count it
-    lacking = identification_lines(
+    lacking = describe_identification(
         identification.summary | {"residual": {"motor": {"rms": 2e-4, "noise": 1e-4, "unit": "rad"}}}
     )
-    assert lacking[0] == "motor: position residual 0.0002 rad rms, 2 times the noise: the model is incomplete."
+    assert lacking.verdict == "doubtful" and "(motor: 0.0002 rad rms, 2 times the noise)" in lacking.headline
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
@@ -213,7 +215,7 @@ def test_numbers_are_tried_out_on_another_log(full_identification):
 
 
 def test_model_replays_the_log_where_the_study_has_no_excitation(full_identification, tmp_path):
-    lines = "\n".join(write_identification_report(full_identification, tmp_path))
+    lines = "\n".join(write_report(full_identification, tmp_path).sentences)
     assert "On log1.csv, motor: position residual over 0.5 s" in lines
     assert "motor observer: lambda = " in lines
     assert "(transmission)" in lines

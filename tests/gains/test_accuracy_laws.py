@@ -11,7 +11,7 @@ import jaxbl
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import LEAST_POINTS, accuracy_laws, fit_power_law
-from jaxbl.report.sweep import write_sweep_report
+from jaxbl.report.results import write_report
 from jaxbl.sweeps.sweep import sweep
 
 PERIOD, WORDS = "run.sample_period", "observer.discretisation"
@@ -300,7 +300,7 @@ def test_slopes_of_a_real_sweep_are_theory_s(swept_laws):
 
 
 def test_report_of_laws(swept_laws, tmp_path):
-    lines = write_sweep_report(swept_laws, tmp_path)
+    lines = write_report(swept_laws, tmp_path).remarks
     assert "Accuracy laws: 7 of 8 have a slope within 0.1 of theory." in lines
     assert any("motor.position_rmse over run.sample_period (implicit, encoders.noise = 0): no power law" in x for x in lines)
     laws = json.loads((tmp_path / "laws.json").read_text())

@@ -19,7 +19,7 @@ from jaxbl.gains import adversary, certificate
 from jaxbl.gains.certificate import certify
 from jaxbl.gains.tune import tune
 from jaxbl.report.certificate import certificate_lines, certificate_tables
-from jaxbl.report.tune import write_tune_report
+from jaxbl.report.results import write_report
 
 GAINS = 2.2, 9.2
 BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "runs": 1}
@@ -221,7 +221,7 @@ def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, tuned_st
     assert arguments["f_plus"] == max(tuned.summary["f_plus"]["motor"], tuned.summary["achieved"]["motor"]["f_plus"])
     assert (arguments["velocity_error"], arguments["position_error"], arguments["period"]) == (0.1, arguments["noise"], 1e-3)
     assert certificate_data == certify(gains["lambda"], gains["alpha"], **arguments, runs=1)
-    lines = write_tune_report(tuned, tmp_path)
+    lines = write_report(tuned, tmp_path).remarks
     assert any(line.startswith("motor, promised: a velocity error of at most ") for line in lines)
     assert any("not more than the" in line for line in lines)
     stored = json.loads((tmp_path / "certificate.json").read_text())
@@ -276,7 +276,7 @@ def test_limits_that_no_gains_keep_are_said_to_be_missed(tuned_study):
 def test_without_a_proof_there_is_no_file(tmp_path):
     tuned = tune(study(f_plus=1e4))
     (tmp_path / "certificate.json").write_text("{}")
-    lines = write_tune_report(tuned, tmp_path)
+    lines = write_report(tuned, tmp_path).remarks
     assert any(line.startswith("motor: no certificate: alpha = ") for line in lines)
     assert not (tmp_path / "certificate.json").exists()
 
@@ -289,7 +289,9 @@ def test_what_is_refuted_is_said_first(tmp_path, tuned_study):
         "search": certificate_data["search"] | {"violations": 3},
     }
     tuned = dataclasses.replace(tuned_study, summary=tuned_study.summary | {"certificates": {"motor": certificate_data}})
-    assert write_tune_report(tuned, tmp_path)[0] == "motor: no certificate: refused: 3 of 9."
+    result = write_report(tuned, tmp_path)
+    assert (result.verdict, result.headline) == ("failed", "The search found an error above what was proven.")
+    assert result.remarks[0] == "motor: no certificate: refused: 3 of 9."
     assert not (tmp_path / "certificate.json").exists()
 
 

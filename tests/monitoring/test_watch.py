@@ -2,6 +2,7 @@
 grow, and datagrams; as a command, with bad input, and interrupted."""
 
 import json
+import re
 import signal
 import socket
 import threading
@@ -237,18 +238,18 @@ def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
     task = read_watch_task(log, logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
     result = run_watch(task, ended=end_after_looks(8))
     assert (result.summary["values"], result.summary["determined"], result.summary["alarm"]) == (12, 0, None)
-    assert jaxbl.write_report(result, tmp_path)[0].startswith("Nothing was determined (12 values)")
+    assert jaxbl.write_report(result, tmp_path).headline.startswith("Nothing was determined (12 values)")
 
 
 def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path, capsys):
     words = ("watch", logs / "grown.csv", "--model", logs / "axis.toml", "--alarm-gap", LIMIT, *OPTIONS)
     assert run_command(*words, "--out", tmp_path / "out") == 3
     output = capsys.readouterr().out.splitlines()
-    lines = [line for line in output if line.lstrip()[:1].isdigit()]
+    lines = [line for line in output if re.match(r" *\d+\.\d s ", line)]
     assert len(lines) == 24
     assert all(len(line) <= 100 for line in lines)
     assert sum(line.endswith("ALARM") for line in lines) > 5
-    assert any(line.startswith("ALARM from ") for line in output)
+    assert any(line.startswith("✗ Failed: ALARM from ") for line in output)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "figures",
         "report.html",
@@ -298,7 +299,7 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
     assert [line.split(" s ")[0].strip() for line in lines] == [f"{4.0 + 0.5 * i:.1f}" for i in range(12)]
     assert len(values) == 13
     assert ("ALARM from 4.0 s on" in final_output) == alarm
-    assert "Half gap: 0.0" in final_output
+    assert "  half gap at 4.0 s (95 %: 0.0" in final_output
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
     assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten

@@ -13,7 +13,7 @@ from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_st
 from jaxbl.report import aggregates
 from jaxbl.report.aggregates import Column, Groups, spread
 from jaxbl.report.maps import draw
-from jaxbl.report.sweep import write_sweep_report
+from jaxbl.report.results import write_report
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.run import open_or_create_store
 from jaxbl.sweeps.sweep import open_study
@@ -124,7 +124,7 @@ def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
     lines = []
     for folder in (full, parts):
         folder.mkdir()
-        lines.append(write_sweep_report(result, folder))
+        lines.append(write_report(result, folder))
         monkeypatch.setattr(aggregates, "MOST_VALUES", 64)
         monkeypatch.setattr(aggregates, "_MOST_KEPT", 0)
     assert lines[0] == lines[1]

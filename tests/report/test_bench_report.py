@@ -39,7 +39,7 @@ def test_files_and_figures(bench_result, tmp_path):
 def test_the_table_says_who_where_and_how_far_from_the_ceiling(bench_result):
     lines = throughput_lines(bench_result)
     assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
-    fused_line = next(line for line in lines if line.startswith(FUSED_NAME))
+    fused_line = next(line for line in lines if line.strip().startswith(FUSED_NAME))
     assert lines[3].split() == ["float32", "lanes", "best", "median", "of", "C++", "first", "off", "by"]
     assert fused_line.split()[4:] == ["1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
     # those of both precisions below one another, within a terminal

@@ -11,8 +11,8 @@ from test_page import Page
 
 from jaxbl.gains.tune import tune
 from jaxbl.report.figures import save
-from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names, write_choice_report
-from jaxbl.report.results import draw
+from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names
+from jaxbl.report.results import draw, write_report
 
 # points differ in values of lanes alone
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -41,8 +41,8 @@ def mapped_choice():
 @pytest.fixture(scope="module", params=["point_choice", "mapped_choice"])
 def report_folder(request, tmp_path_factory):
     path = tmp_path_factory.mktemp(request.param)
-    lines = write_choice_report(request.getfixturevalue(request.param), path)
-    (path / "lines").write_text("\n".join(lines), encoding="utf-8")
+    result = write_report(request.getfixturevalue(request.param), path)
+    (path / "lines").write_text("\n".join([result.headline, *result.remarks, *result.details]), encoding="utf-8")
     return path
 
 

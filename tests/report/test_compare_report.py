@@ -45,12 +45,12 @@ def test_command_writes_text_json_and_figure(studies_folder, run_command):
     words = ["compare", str(studies_folder / "before"), str(studies_folder / "after"), "--out", str(studies_folder / "both")]
     code, output = run_command(*words)
     assert code == 0, output
-    assert "excitation.amplitude: 0.1 -> 0.4" in output
-    assert all(len(line) <= 80 for line in output.splitlines() if "/" not in line)
-    head = next(i for i, line in enumerate(output.splitlines()) if line.split()[:2] == ["metric", "points"])
-    assert "motor.f_plus_acceleration" in "".join(output.splitlines()[head:])
-    assert "Points: 6 in both; 0 in the first alone, 4 in the second alone." in output
-    assert "Noise: by differences seed by seed, 4 seeds" in output
+    lines = output.splitlines()
+    assert len(lines) <= 8 and all(len(line) <= 100 for line in lines[:-1])
+    assert "metrics differ by more than noise" in output and "Points: 6 in both; 0 in the first alone" in output
+    page = (studies_folder / "both" / "report.html").read_text()
+    for text in ("excitation.amplitude", "motor.f_plus_acceleration", "Noise: by differences seed by seed, 4 seeds"):
+        assert text in page
     data = json.loads((studies_folder / "both" / "comparison.json").read_text())
     assert data["config"]["excitation.amplitude"] == [0.1, 0.4]
     assert data["points"] == {"both": 6, "first_only": 0, "second_only": 4}
@@ -64,8 +64,8 @@ def test_command_writes_text_json_and_figure(studies_folder, run_command):
         "compare", str(studies_folder / "before"), str(studies_folder / "before"), "--out", str(studies_folder / "both")
     )
     assert code == 0, output
-    assert "Config: no difference that decides a number." in output
-    assert "metric  " not in output
+    assert output.startswith("✓ Good: No metric differs by more than noise at 6 common points.")
+    assert "The configs differ in nothing that decides a number." in output
     assert not (studies_folder / "both" / "figures" / "comparison.png").exists()
 
 

@@ -10,7 +10,9 @@ from test_page import Page
 
 from jaxbl.records import inspect
 from jaxbl.report.figures import save
-from jaxbl.report.inspect import draw_inspection, summary, write_inspection_report
+from jaxbl.report.inspect import draw_inspection
+from jaxbl.report.results import describe, write_report
+from jaxbl.result import format_result
 
 UNEVEN_TIMES = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
 BOTH_ENCODERS = ["channels", "spectra", "torque_over_velocity", "twist"]
@@ -50,7 +52,7 @@ def test_a_gap_is_not_drawn_over(tmp_path):
     assert [len(ax.lines) for ax in channels.figure.axes] == [2, 2, 2, 2]
 
 
-def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
+def test_the_card_fits_a_terminal_whatever_is_wrong(tmp_path):
     frame = simulate_log(UNEVEN_TIMES, noise=1e-3).drop(index=range(1000, 1400))
     limit = 0.5 * frame["u"].max()
     frame["u"] = frame["u"].clip(-limit, limit)
@@ -61,21 +63,20 @@ def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
     frame.loc[200:202, "t"] = frame.loc[200, "t"]
     frame.to_parquet(tmp_path / "log.parquet")
     inspection = inspect(tmp_path / "log.parquet", {"theta_s": {"skew": 1.0}, "transmitted": "sensor", "stop": 2.9e3})
-    lines = summary(inspection)
-    # three sentences, both tables, and three lines of remarks
-    ends = [i for i, line in enumerate(lines) if not line]
-    assert ends[0] == 3 and len(lines) - ends[2] == 4
-    assert lines[-1].startswith("... and ") and lines[-1].endswith(" more remarks in the report")
-    assert all(len(line) <= 80 for line in lines[ends[0] : ends[2]])
-    assert lines[ends[0] + 1].split() == ["channel", "unit", "least", "largest", "noise", "bandwidth", "saturated", "jumps"]
+    result = describe(inspection)
+    lines = format_result(result, ["report.html"])
+    assert len(lines) <= 8 and all(len(line) <= 100 for line in lines)
+    assert result.verdict == "doubtful" and len(result.details) > 3
+    assert result.tables[1].columns == (
+        "channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew"
+    )  # fmt: skip
 
 
 def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
     (tmp_path / "out").mkdir()
     simulate_log(gap=0.1).rename(columns={"theta_e": "a<b"}).to_parquet(tmp_path / "log.parquet")
     inspection = inspect(tmp_path / "log.parquet", {"theta_e": "a<b"}, gear_ratio=GEAR_RATIO)
-    lines = write_inspection_report(inspection, tmp_path / "out")
-    assert lines == summary(inspection)
+    assert write_report(inspection, tmp_path / "out").sentences == describe(inspection).sentences
     page = (tmp_path / "out" / "report.html").read_text()
     Page(page)
     assert page.count("<img") == 4
@@ -88,7 +89,7 @@ def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
 @needs_chromium
 def test_the_page_in_a_browser(tmp_path):
     simulate_log(gap=0.1).to_parquet(tmp_path / "log.parquet")
-    write_inspection_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
+    write_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
         check_figures(page, 4)
 
@@ -99,4 +100,5 @@ def test_a_real_log_with_two_encoders(tmp_path):
     assert twist.name == "twist" and len(twist.figure.axes) == 1
     labels = [text.get_text() for text in twist.figure.axes[0].get_legend().get_texts()]
     assert labels == ["load on its first side", "on the other"]
-    assert summary(inspection)[0] == "outputEncoderData.txt: 42000 samples, 126 s every 3 ms, even stamps, one segment"
+    figure = describe(inspection).key_figures[0]
+    assert figure == ("126 s", "42000 samples every 3 ms, even stamps, 1 segment")

@@ -13,7 +13,7 @@ from jaxbl.observer.conditions import least_lambda_seeber_horn
 from jaxbl.report.checks import check_figures
 from jaxbl.report.figures import save
 from jaxbl.report.maps import draw
-from jaxbl.report.sweep import write_sweep_report
+from jaxbl.report.results import write_report
 
 RMSE = "motor.velocity_rmse"
 GAINS = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
@@ -363,8 +363,8 @@ def test_default_figure_and_report_of_some_metrics(tmp_path, metrics):
     result = make_result(rigid_study(axes=GAINS, sweep={"metrics": metrics}))
     (drawing,) = draw(result)
     assert drawing.name == f"heatmap_motor_{metrics[0]}"
-    (line,) = write_sweep_report(result, tmp_path)
-    assert ("converged in 100.0 % (motor)" in line) == ("converged" in metrics)
+    headline = write_report(result, tmp_path).headline
+    assert ("the motor observer converges in 100.0 %" in headline) == ("converged" in metrics)
 
 
 def test_figures_of_a_study_without_axes():

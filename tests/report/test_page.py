@@ -1,5 +1,6 @@
 """The HTML page: well-formed, complete, and nothing of the user's text taken for markup."""
 
+import dataclasses
 import json
 import os
 from html import unescape
@@ -13,10 +14,10 @@ from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, sm
 
 from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
-from jaxbl.report.page import PageTable, html
+from jaxbl.report.page import format_page
 from jaxbl.report.picture import Picture
-from jaxbl.report.simulate import write_trial_report
-from jaxbl.report.sweep import write_sweep_report
+from jaxbl.report.results import describe, write_report
+from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.trial import run
 
 VOID = {"meta", "img"}
@@ -50,18 +51,21 @@ HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 
 def test_everything_is_escaped_and_in_its_place():
     picture = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
-    table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(
-        HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, picture)], [table], f'title = "{HOSTILE}"', [NextStep(HOSTILE, HOSTILE)]
+    table = ResultTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
+    result = Result(
+        HOSTILE, "good", HOSTILE, [KeyFigure(HOSTILE, HOSTILE)], [HOSTILE], [HOSTILE], [table], [NextStep(HOSTILE, HOSTILE)]
     )
+    text = format_page(result, [(HOSTILE, picture)], f'title = "{HOSTILE}"')
     page = Page(text)
     # values of the figure, and the page's own
     assert page.tags.count("script") == 2
-    assert "b" not in page.tags
+    # of the key figure alone
+    assert page.tags.count("b") == 1
     image = {"src": "data:image/svg+xml;base64,PHN2Zz4=", "alt": HOSTILE, "width": "96", "height": "48"}
     assert page.images == [image]
-    # title twice, lead, remark, step and its question, caption, table's heading, head and cell, config
-    assert page.text.count(HOSTILE) == 11
+    # title twice, answer, key figure and its meaning, remark, detail, step and its question, caption, table's heading, head
+    # and cell, config
+    assert page.text.count(HOSTILE) == 14
     values = text.partition('<script type="application/json">')[2].partition("</script>")[0]
     assert json.loads(values) == [{"title": HOSTILE}]
     for cell in ("1.235", "–", "yes", "nan", ">3<"):
@@ -80,7 +84,7 @@ def test_everything_is_escaped_and_in_its_place():
 )
 def test_a_page_names_the_command_that_made_it(words, ending, monkeypatch):
     monkeypatch.setattr("sys.argv", words)
-    text = unescape(html("title", [], [], [], [], ""))
+    text = unescape(format_page(Result("title", "good", "answer"), [], ""))
     assert "Made by jaxbl" in text and (ending in text if ending else ", with: " not in text)
 
 
@@ -97,22 +101,28 @@ def test_page_of_a_sweep(tmp_path):
         motor__converged=lambda frame: frame[ALPHA] > 2.0,
         motor__margin_alpha=lambda frame: frame[ALPHA],
     )
-    lead = write_sweep_report(result, tmp_path)
-    assert lead == [
-        "40 runs. The observers converged in 80.0 % (motor) of them.",
-        "motor: best gains observer.motor.alpha = 2.66, observer.motor.lambda = 2.71: velocity error 2.66 rad/s rms, the "
-        "worst of their runs (least: 2.66). Margin 2.66 (alpha over f⁺ 2.66, to gains that fail 2.66, to twice the error "
-        "2.66). 4 of 20 gains are as good within 5 %.",
+    found = write_report(result, tmp_path)
+    assert (found.verdict, found.headline) == ("good", "40 runs: the motor observer converges in 80.0 %.")
+    assert found.key_figures == [
+        ("2.66 rad/s", "motor: velocity error of the best gains, rms (alpha = 2.66, lambda = 2.71)"),
+        ("× 2.66", "motor: change of these gains to fail or err twice as much; 4 of 20 gains are as good within 5 %"),
     ]
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == len(list((tmp_path / "figures").iterdir())) == 1
-    for text in (*lead, "a <b> c", "first remark", "observer.discretisation", "motor.convergence_time_bound"):
+    for text in (
+        found.headline,
+        *found.remarks,
+        "a <b> c",
+        "first remark",
+        "observer.discretisation",
+        "motor.convergence_time_bound",
+    ):
         assert text in page.text
 
 
 def test_page_of_a_run_and_its_files(tmp_path):
     trial = run(small_study({"title": HOSTILE, "notes": [HOSTILE], "identifier.start": 10.0}))
-    lines = write_trial_report(trial, tmp_path)
+    lines = write_report(trial, tmp_path).sentences
     assert "stiffness: undetermined (motor), undetermined (load); true 1" in lines
     assert sorted(path.name for path in tmp_path.iterdir()) == ["figures", "report.html", "summary.json", "trace.parquet"]
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
@@ -120,8 +130,8 @@ def test_page_of_a_run_and_its_files(tmp_path):
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == 13
     assert (tmp_path / "report.html").stat().st_size < 5e6
-    assert "b" not in page.tags and HOSTILE in lines
-    for text in (*lines, "half_gap", "rms velocity error"):
+    assert HOSTILE in lines and HOSTILE in page.text
+    for text in (lines[0], *lines[-2:], "half_gap", "rms velocity error"):
         assert text in page.text
 
 
@@ -131,7 +141,7 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     axes = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
     result = make_result(rigid_study(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
     long = NextStep(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
-    write_sweep_report(result, tmp_path, [long])
+    write_report(result, tmp_path, dataclasses.replace(describe(result), next_steps=[long]))
     with open_pages(tmp_path / "report.html", color_scheme="dark") as (page,):
         check_figures(page, 1)
         view, values = page.locator(".view"), page.locator(".values")
@@ -184,8 +194,9 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
         "x" * 5000,
     ]
     picture = Picture(b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>', (9, 9), names[1], names[2] * 2, [])
-    table = PageTable(names[1], names, [names, names])
-    text = html(names[2], names, names, [(names[0], picture)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
+    tables = [ResultTable(names[1], names, [names, names]), ResultTable("none", ["a"], [])]
+    result = Result(names[2], "doubtful", names[0], [KeyFigure(names[1], names[0])], names, names, tables)
+    text = format_page(result, [(names[0], picture)] * 2, "\n".join(names))
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
     with open_pages(tmp_path / "page.html") as (page,):
         check_figures(page, 2)
@@ -218,7 +229,7 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
     }
     for name, (data, columns) in studies.items():
         (tmp_path / name).mkdir()
-        write_sweep_report(make_result(rigid_study(**data), **columns), tmp_path / name)
+        write_report(make_result(rigid_study(**data), **columns), tmp_path / name)
     with open_pages(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
         for page in pages:
             check_figures(page, 1)
@@ -231,7 +242,7 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
 
 def test_names_that_are_no_utf8_can_be_written_and_read(tmp_path):
     name = os.fsdecode(b"a\xff.csv")
-    write_atomic(tmp_path / "page.html", html(name, [name], [], [], [], ""))
+    write_atomic(tmp_path / "page.html", format_page(Result(name, "good", name), [], ""))
     assert "<h1>a\\udcff.csv</h1>" in (tmp_path / "page.html").read_text(encoding="utf-8")
     write_atomic(tmp_path / "file.json", json.dumps({"file": name}, ensure_ascii=False))
     assert json.loads((tmp_path / "file.json").read_text(encoding="utf-8")) == {"file": name}

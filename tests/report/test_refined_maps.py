@@ -11,7 +11,7 @@ from jaxbl.config import read_config
 from jaxbl.report.figures import save
 from jaxbl.report.maps import draw
 from jaxbl.report.refined_maps import Filling
-from jaxbl.report.sweep import headline
+from jaxbl.report.results import describe
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.refine import refine_boundary
@@ -140,9 +140,9 @@ def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
     points = Points(result.config)
     coarse = converges_in_disc(pd.DataFrame(points.columns(points.coarse_points(np.arange(25))))).mean()
     simulated = len(result.frame) // seeds
-    assert headline(result)[0] == (
-        f"{simulated} of 1089 grid points simulated ({100 * simulated / 1089:.2g} %), {len(result.frame)} runs. "
-        f"The observers converged in {100 * coarse:.1f} % (motor) of those on the coarse grid."
+    assert describe(result).headline == (
+        f"{len(result.frame)} runs at {simulated} of 1089 grid points ({100 * simulated / 1089:.2g} %): the motor observer "
+        f"converges in {100 * coarse:.1f} % on the coarse grid."
     )
 
 

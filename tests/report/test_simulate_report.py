@@ -7,21 +7,21 @@ from jaxbl.report.figures import save
 from jaxbl.report.simulate import draw_trial
 from jaxbl.sweeps.trial import run
 
-AT_REST = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "error_plane_motor",
+AT_REST = ["torque", "motor_velocity", "motor_position", "load_velocity", "load_position", "input", "error_plane_motor",
            "error_plane_load", "dead_zone", "hysteresis", "limit_cycle"]  # fmt: skip
 BOTH_SIDES = [*AT_REST[:6], "gain_conditions_motor", "gain_conditions_load", *AT_REST[6:]]
 CASES = {
     "sigmoid": (small_study({"run.duration": 1.0}), BOTH_SIDES),
     "dead zone": (small_study(transmission={"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.01}), BOTH_SIDES),
     "shaft": (small_study(transmission={"law": "linear_shaft", "stiffness": 1.0}), BOTH_SIDES),
-    "rigid": (rigid_study(), [*BOTH_SIDES[:3], "torque", "gain_conditions_motor", "error_plane_motor"]),
+    "rigid": (rigid_study(), [*BOTH_SIDES[:3], "input", "gain_conditions_motor", "error_plane_motor"]),
     # nothing moves, nothing is identified
     "at rest": (
         small_study({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), AT_REST
     ),
     "not identified": (small_study({"identifier.start": 10.0}), BOTH_SIDES),
-    "diverged": (rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]), ["input", "motor_velocity",
-                 "motor_position", "torque"]),
+    "diverged": (rigid_study(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]), ["torque", "motor_velocity",
+                 "motor_position", "input"]),
 }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.figures import save
-from jaxbl.report.tune import draw_tuning, tune_headline, write_tune_report
+from jaxbl.report.results import describe, write_report
+from jaxbl.report.tune import draw_tuning
 from jaxbl.sweeps.trial import run
 
 SLOW_GAINS = {"lambda": 1e-3, "alpha": 0.05}
@@ -37,7 +38,8 @@ def tuning():
 @pytest.fixture(scope="module")
 def report_folder(tuning, tmp_path_factory):
     path = tmp_path_factory.mktemp("tuned")
-    path.joinpath("lines").write_text("\n".join(write_tune_report(tuning, path)))
+    result = write_report(tuning, path)
+    path.joinpath("lines").write_text("\n".join([result.headline, *result.remarks, *result.details]))
     return path
 
 
@@ -68,8 +70,8 @@ def test_numbers_figures_and_page(report_folder, tuning):
     lines = (report_folder / "lines").read_text().splitlines()
     for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
         assert text in page.text
-    assert lines[2].startswith(f"motor: lambda = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
-    assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
+    assert f"take λ = {tuning.summary['gains']['motor']['lambda']:.4g} √rad/s, α = " in lines[0].replace("Take", "take")
+    assert any("the gains 'slow' converge in only 0 % of the held-out runs" in line for line in lines)
 
 
 @pytest.mark.usefixtures("every_figure_drawn")
@@ -126,10 +128,8 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuning):
         are_named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
         assert are_named == [bool(binding)] * 2
         assert ("Bold line: margin_exact, which binds." in drawings["tuning_motor"].caption) == bool(binding)
-        lead = next(line for line in tune_headline(result.summary) if line.startswith("motor, what limits the gains: "))
-        assert lead.partition(": ")[2].partition(" (Chatter")[0] in drawings["limits_motor"].caption
-        assert ("margin_exact = 1.1 (here" in lead) == bool(binding)
-        assert ("no constraint binds" in lead) != bool(binding)
+        forbidden = "motor: a smaller error is forbidden by margin_exact."
+        assert (forbidden in describe(result).remarks) == bool(binding)
         titles = [ax.get_title("left") for ax in drawings["limits_motor"].figure.axes]
         assert ("← smaller λ: margin_exact" in titles) == bool(binding)
 

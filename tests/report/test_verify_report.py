@@ -1,6 +1,5 @@
 """The page and figures of a verification."""
 
-import re
 import shutil
 
 import numpy as np
@@ -9,7 +8,8 @@ import tomli_w
 from browser import check_figures, needs_chromium, open_pages
 from shared_results import VERIFY_STUDY
 
-from jaxbl.report.verify import draw_verdict, write_verify_report
+from jaxbl.report.results import write_report
+from jaxbl.report.verify import draw_verdict
 from jaxbl.sweeps.engine import Engine
 
 
@@ -17,7 +17,7 @@ from jaxbl.sweeps.engine import Engine
 def verify_report(verified_study, tmp_path_factory):
     verdict, _ = verified_study
     folder = tmp_path_factory.mktemp("verdict")
-    return verdict, folder, write_verify_report(verdict, folder)
+    return verdict, folder, write_report(verdict, folder)
 
 
 def test_figures(verify_report):
@@ -29,8 +29,6 @@ def test_figures(verify_report):
         "error_planes",
         "friction",
         "levels_motor",
-        "conservatism",
-        "claimed_bound",
     ]
     assert all(drawing.caption for drawing in drawings.values())
     atlas = drawings["atlas"].figure
@@ -42,35 +40,39 @@ def test_figures(verify_report):
     np.testing.assert_array_equal(points.get_ydata(), verdict.error_map.boundary)
 
 
-def test_crosses_are_the_counterexamples_to_the_exact_condition(verify_report):
+def test_every_run_is_a_dot_and_counterexamples_are_counted(verify_report):
     verdict, _, _ = verify_report
     (levels,) = [d.figure for d in draw_verdict(verdict) if d.name == "levels_motor"]
     for ax, level in zip(levels.axes, ("drive", "sampled"), strict=False):
-        crosses = sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() == "x")
+        dots, crosses = (sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() == m) for m in (".", "x"))
+        converged = verdict.levels[level]["motor.converged"].astype(bool)
+        assert (dots, crosses) == (converged.sum(), (~converged).sum())
         entries = next(entry for entry in verdict.summary["levels"] if entry["level"] == level)["conditions"]
         exact = next(entry for entry in entries if entry["name"] == "exact")
-        assert crosses == exact["counterexamples"]
+        assert ax.get_title().endswith(f"\n{exact['counterexamples']} failed though ρ < 1")
     assert exact["counterexamples"] > 0
 
 
 def test_page_and_lines(verify_report):
-    _, folder, lines = verify_report
+    _, folder, result = verify_report
     page = (folder / "report.html").read_text()
     for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
         assert text in page
-    assert any("no counterexample to any condition" in line for line in lines)
-    assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in lines)
-    (marked,) = [line for line in lines if line.startswith("small gains")]
-    assert "no condition can hold" in marked or "worst disturbance enlarges the velocity error" in marked
-    assert "On this disturbance |d| exceeds α during" in marked
-    (marked,) = [line for line in lines if line.startswith("good gains")]
-    assert "any disturbance within f⁺ dies out" in marked
-    assert len(list((folder / "figures").glob("*.png"))) == 7
+    assert (result.verdict, result.headline.partition(".")[0]) == ("failed", "Not safe: small gains")
+    assert any("no counterexample to any condition" in line for line in result.remarks)
+    assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in result.remarks)
+    (marked,) = [line for line in result.remarks if line.startswith("small gains")]
+    assert ": not safe" in marked
+    (marked,) = [line for line in result.remarks if line.startswith("good gains")]
+    assert ": safe: any disturbance within f⁺ dies out" in marked
+    (table,) = [table for table in result.tables if table.heading.startswith("Gains that are not safe")]
+    assert table.columns == ["", "small gains"] and table.rows[1][0] == "share of the time above α"
+    assert len(list((folder / "figures").glob("*.png"))) == 5
 
 
 def test_tuning_rules_in_figure_page_and_lines(verify_report):
-    verdict, folder, lines = verify_report
-    rules = verdict.summary["rules"]
+    verdict, folder, result = verify_report
+    lines, rules = result.remarks, verdict.summary["rules"]
     (rules_drawing,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
     sufficient_axes, failing_axes = rules_drawing.figure.axes
     legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (sufficient_axes, failing_axes)]
@@ -93,7 +95,7 @@ def test_tuning_rules_in_figure_page_and_lines(verify_report):
 @needs_chromium
 def test_the_page_in_a_browser(verify_report):
     with open_pages(verify_report[1] / "report.html") as (page,):
-        check_figures(page, 7)
+        check_figures(page, 5)
 
 
 def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):
@@ -106,9 +108,9 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished verification simulates"))
     code, lines, _ = call("verify", "study.toml")
     assert code == 0
-    assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor", "conservatism", "claimed_bound"}
+    assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor"}
     assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "verify/manifest.json"))
-    assert re.fullmatch(r"normalised: 63 cells, of which \d+ converge, with no counterexample to any condition.", lines[0])
+    assert lines[0].startswith("✗ Failed: Not safe: small gains")
     assert lines[-1] == "results/study_verdict/report.html"
     # the second call says the same
     assert call("verify", "study.toml")[:2] == (0, lines)

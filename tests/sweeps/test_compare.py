@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
-from jaxbl.report.compare import comparison_lines, draw_comparison
+from jaxbl.report.compare import draw_comparison
+from jaxbl.report.results import describe
 from jaxbl.sweeps.compare import compare
 
 RMSE = "motor.velocity_rmse"
@@ -106,7 +107,7 @@ def test_one_seed_tells_no_noise():
     change = next(m for m in comparison.metrics if m.metric == RMSE)
     assert (change.differs, change.changed, change.count) == (None, 100, 100)
     assert np.isnan(change.moved.low)
-    assert any("Noise: not known (one common seed)" in line for line in comparison_lines(comparison))
+    assert any("Noise: not known (one common seed)" in line for line in describe(comparison).remarks)
 
 
 def test_different_grids_are_compared_where_both_have_points():
@@ -118,7 +119,7 @@ def test_different_grids_are_compared_where_both_have_points():
     assert comparison.points == (50, 50, 80)
     assert (comparison.seeds, comparison.paired) == (6, True)
     assert next(m for m in comparison.metrics if m.metric == RMSE).points == 50
-    assert "Points: 50 in both; 50 in the first alone, 80 in the second alone." in comparison_lines(comparison)
+    assert "Points: 50 in both; 50 in the first alone, 80 in the second alone." in describe(comparison).remarks
 
 
 def test_an_axis_of_one_study_is_compared_at_the_others_value():
@@ -132,7 +133,7 @@ def test_an_axis_of_one_study_is_compared_at_the_others_value():
     comparison = compare(study(), make_result(with_effect))
     assert comparison.points == (0, 100, 200)
     assert comparison.metrics == ()
-    assert "No point is in both: no metric is compared." in comparison_lines(comparison)
+    assert describe(comparison).headline == "No point is in both studies: no metric is compared."
 
 
 def test_config_by_keys_with_what_decides_nothing_left_out():
@@ -157,9 +158,12 @@ def test_what_is_true_or_false_and_what_is_not_defined():
     )
     assert (converged.changed, converged.up, converged.moved.value) == (40, 40, pytest.approx(0.4))
     assert (time.points, time.only, time.changed) == (60, (0, 240), 0)
-    text = " ".join(" ".join(comparison_lines(comparison)).split())
-    assert "motor.converged: +40.00 % of the runs (+40.00 % to +40.00 %); 40 points gained, 0 lost (of 100)." in text
-    assert "motor.convergence_time (240 runs)" in text
+    result = describe(comparison)
+    assert (
+        "+40.00 % (+40.00 % to +40.00 %)",
+        "motor.converged: better at 40, worse at 0 of 100 points",
+    ) in result.key_figures
+    assert any("motor.convergence_time (240 runs)" in line for line in result.remarks)
 
 
 @pytest.mark.parametrize("axes", [GAINS, GAINS[1:], [*GAINS, listed_axis(NOISE, 0.0, 1e-4)], [listed_axis(NOISE, 1e-4)]])
@@ -169,9 +173,7 @@ def test_text_and_figure(axes):
 
     first, second = study(*axes, function=size(lambda frame: 0.0, 0)), study(*axes, function=size(far_shift, 2))
     comparison = compare(first, second)
-    lines = comparison_lines(comparison)
-    assert max(len(part) for line in lines for part in line.split("\n")) <= 80
-    drawings = draw_comparison(comparison, first.config)
+    drawings = draw_comparison(comparison)
     assert len(drawings) == (len(axes[0].get("values", [0, 0])) > 1)
     names = {field.name for field in dataclasses.fields(comparison) if not field.name.startswith("_")}
     assert set(comparison.to_dict()) == names

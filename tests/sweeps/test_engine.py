@@ -11,7 +11,7 @@ from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, small_st
 
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
-from jaxbl.report.sweep import headline
+from jaxbl.report.results import describe
 from jaxbl.sweeps import engine
 from jaxbl.sweeps.engine import Engine, Layout, layout_for
 from jaxbl.sweeps.points import Points
@@ -293,10 +293,10 @@ def test_diverging_lanes_are_flagged_and_leave_their_neighbours_alone(precision)
     assert (
         result.frame.loc[diverged, ["motor.velocity_rmse", "motor.f_plus", "motor.convergence_time"]].isna().all(axis=None)
     )
-    assert "2 runs diverged" in headline(result)[1]
+    assert "2 runs diverged" in describe(result).remarks[0]
     stable_frame = sweep(unstable_study(0.0, 0.01, 0.02, precision=precision)).frame
     assert_equal(result.frame[~diverged].reset_index(drop=True), stable_frame)
-    assert len(headline(StudyResult(result.config, stable_frame))) == 2
+    assert not any("diverged" in line for line in describe(StudyResult(result.config, stable_frame)).sentences)
 
 
 # ---------------------------------------------------------------- structural axes

@@ -8,7 +8,7 @@ from small_study import ALPHA, listed_axis, read_parts, thirty_run_study
 
 from jaxbl.errors import InputError
 from jaxbl.files import create_file, to_path
-from jaxbl.report.sweep import write_sweep_report
+from jaxbl.report.results import write_report
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import open_study, repair, share, sweep
 
@@ -99,7 +99,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_ch
 def test_a_report_in_a_store(bucket):
     address = f"{bucket}/c"
     figure = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
-    write_sweep_report(sweep(thirty_run_study(figures=[figure]), address), to_path(address))
+    write_report(sweep(thirty_run_study(figures=[figure]), address), address)
     stored = read_objects(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
     assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]

@@ -13,7 +13,7 @@ from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, small_st
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.report.sweep import headline
+from jaxbl.report.results import describe
 from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import BACKENDS
@@ -549,10 +549,11 @@ def test_a_refined_study_in_a_folder(refined_study, computed_chunks):
     second = sweep(study(), folder)
     assert (computed_chunks, second.cost["lanes"]) == ([], 0)
     assert read_files(folder) == before
-    lines = headline(open_study(folder))
+    found = describe(open_study(folder))
     share = f"{100 * len(result.frame) / 33**2:.2g}"
-    assert lines[0].startswith(f"{len(result.frame)} of 1089 grid points simulated ({share} %), {len(result.frame)} runs. ")
-    assert "not finished" not in "".join(lines)
+    count = len(result.frame)
+    assert found.headline.startswith(f"{count} runs at {count} of 1089 grid points ({share} %): ")
+    assert found.verdict == "good" and "not finished" not in "".join(found.sentences)
 
 
 @pytest.mark.parametrize("stop", [0, 1, 3, 5])
@@ -571,7 +572,7 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(
     # the next one may have been computed while that was written
     assert computed_chunks in (list(range(stop + 1)), list(range(stop + 2)))
     assert not read_manifest(tmp_path / "study")["finished"]
-    assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
+    assert "The study is not finished" in describe(open_study(tmp_path / "study")).remarks[0]
     calls.clear()
     # with other chunks asked for: those of the folder stay
     result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: calls.append(done))

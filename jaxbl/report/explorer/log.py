@@ -14,16 +14,16 @@ from jaxbl.errors import InputError
 from jaxbl.files import read_json, to_path
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.report.diagnose import diagnosis_lines
-from jaxbl.report.element import element_lines
+from jaxbl.report.diagnose import describe_diagnosis
+from jaxbl.report.element import describe_element
 from jaxbl.report.figures import missing_quantity
-from jaxbl.report.identify import identification_lines
+from jaxbl.report.identify import describe_identification
 
 from .folder import Source, colours_of, points_writer, write_page
 
 _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
            "displacement": "displacement"}  # fmt: skip
-_RESULTS = {"diagnosis.json": "Diagnosis of", "identification.json": "Identification from"}
+_RESULTS = "diagnosis.json", "identification.json"
 
 
 def _summary_file(folder: str | Path) -> Path | None:
@@ -42,14 +42,14 @@ def log_source(folder: str | Path) -> Source | None:
     if file is None:
         return None
     summary = read_json(file)
-    lines = diagnosis_lines if file.name == "diagnosis.json" else identification_lines
-    lead = (element_lines if summary.get("kind") == "element" else lines)(summary)
-    title = summary["title"] or f"{_RESULTS[file.name]} {Path(summary['file']).name}"
+    describe = describe_diagnosis if file.name == "diagnosis.json" else describe_identification
+    card = (describe_element if summary.get("kind") == "element" else describe)(summary)
+    lead = card.sentences
 
     def write(out: Path, served: bool) -> bool:
         model, frame = (_read(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
         content = write_log(summary, frame, out)
-        content |= {"title": title, "lead": lead, "config": model, "file": "model.toml"}
+        content |= {"title": card.title, "lead": lead, "config": model, "file": "model.toml"}
         write_page(out, ("log",), content, scripts=not served)
         return False
 

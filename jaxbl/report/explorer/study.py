@@ -13,7 +13,7 @@ from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
 from jaxbl.report.picture import packed
-from jaxbl.report.sweep import headline
+from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
@@ -53,8 +53,9 @@ def study_source(folder: str | Path) -> Source:
 def _lead(result: StudyResult) -> list[str]:
     """The answer, and the study's notes; of a sweep at work no figures, which would be out of date on the page."""
     manifest = result.source.manifest if isinstance(result.source, Store) else {"finished": True}
-    lines = headline(result) if manifest["finished"] else ["This sweep is unfinished: the page shows the runs so far."]
-    return [*lines, *result.config.notes]
+    if manifest["finished"]:
+        return answer_sweep(result).sentences
+    return ["This sweep is unfinished: the page shows the runs so far.", *result.config.notes]
 
 
 def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:

@@ -1,0 +1,73 @@
+"""Numbers that were found in a log: as key figures, as rows of a table, and as files."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tomli_w
+
+from jaxbl.files import json_with_checksum, write_atomic
+from jaxbl.json_types import JsonObject
+from jaxbl.lines import DOUBT, doubts_among
+from jaxbl.result import KeyFigure, Result
+
+if TYPE_CHECKING:
+    from jaxbl.diagnosis.diagnose import Diagnosis
+    from jaxbl.estimation.element import ElementIdentification
+    from jaxbl.estimation.identify import Identification
+
+_FIGURES = 4
+"""Numbers at the head of a page; its table has all."""
+NUMBER_COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
+
+
+def number_figures(numbers: JsonObject) -> list[KeyFigure]:
+    """Key figures of numbers by path: those of the transmission first, as they are asked for most."""
+    first = sorted(numbers, key=lambda path: not path.startswith("transmission."))[:_FIGURES]
+    return [KeyFigure(format_number(numbers[path]), path) for path in first]
+
+
+def format_number(number: JsonObject) -> str:
+    """A number with its standard error and unit."""
+    unit = f" {number['unit']}" if number.get("unit") else ""
+    error = f" ± {number['standard_error']:.2g}" if number["standard_error"] else ""
+    return f"{number['value']:.5g}{error}{unit}"
+
+
+def number_row(path: str, number: JsonObject) -> list[object]:
+    """Cells of a number that was found, below `NUMBER_COLUMNS`."""
+    return [path, number["value"], number["standard_error"], *number["interval"]]
+
+
+def lead_with_doubt(result: Result) -> Result:
+    """Return a result whose answer is the remark that puts all others in doubt, if there is one."""
+    doubts = doubts_among(result.remarks)
+    if not doubts:
+        return result
+    remarks = [result.headline, *(line for line in result.remarks if line != doubts[0])]
+    return replace(result, verdict="doubtful", headline=doubts[0].removeprefix(DOUBT), remarks=remarks)
+
+
+def write_fit(result: "Identification | Diagnosis | ElementIdentification", folder: Path, name: str, model: str = "") -> str:
+    """Write `name.json`, `model.toml` and `trace.parquet` into a folder that exists. Returns the model's TOML."""
+    result.trace.to_parquet(folder / "trace.parquet", index=False)
+    # that of a transmission alone is given
+    model = model or format_model(result, folder / "trace.parquet")  # pyright: ignore[reportArgumentType]
+    (folder / "model.toml").write_text(model, encoding="utf-8")
+    write_atomic(folder / f"{name}.json", json_with_checksum(result.summary))
+    return model
+
+
+def format_model(result: "Identification | Diagnosis", trace: Path) -> str:
+    """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
+    from jaxbl.estimation.logs import run_of
+    from jaxbl.gains.machine_study import complete_study
+
+    data, record = result.model.to_dict(), result.record
+    if result.replays:
+        data["run"] |= run_of(result.model, record) | {"duration": float(f"{record.time[-1] + record.sample_period:.9g}")}
+        data["excitation"] = {"kind": "recorded", "file": str(trace.resolve()), "time_column": "t", "torque_column": "u"}
+    data = complete_study(data, record, result.config)
+    if result.replays:
+        data["excitation"]["file"] = trace.name
+    return tomli_w.dumps(data)
