@@ -63,9 +63,11 @@ def diagnose_case(case: Case, data: Path, rivals: bool) -> Row:
             traceback.print_exc()
             row.error = f"{type(error).__name__}: {error}"
         row.seconds = time.perf_counter() - start
-    if task is None or not case.readable:
+        # what is held out is read once by the diagnosis, and anew for the comparison
+        again = None if task is None else read_diagnosis_task(logs, case.study, holdout=holdout)
+    if task is None or again is None or not case.readable:
         return row
-    _compare(row, case, task, model, rivals)
+    _compare(row, case, task, again.holdout.open(), model, rivals)
     return row
 
 
@@ -77,16 +79,16 @@ def _lost_motion(case: Case, log: Path) -> str:
     return "" if gearing is None else f"; lost motion by inspect: {gearing.describe_lost_motion('rad')}"
 
 
-def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
-    """Add the torque errors of all tools behind one low-pass."""
+def _compare(row: Row, case: Case, task, holdout, model, rivals: bool) -> None:
+    """Add the torque errors of all tools on the held-out record behind one low-pass."""
     sides = ("motor", "load") if task.config.drive.kind == "two_inertia" else ("motor",)
-    fitted, held = (parts_of(part, sides, case.cutoff) for part in (task.record, task.holdout))
+    fitted, held = (parts_of(part, sides, case.cutoff) for part in (task.record, holdout))
     linear = task.record.statistics.channels["theta_e"].unit == "m"
     row.unit = "N" if linear else "N m"
     row.driving = driving(held, float(task.config.drive.motor_inertia))
-    errors = {"nominal": torque_error(task.config, task.holdout, held)}
+    errors = {"nominal": torque_error(task.config, holdout, held)}
     if model is not None:
-        errors["jaxbl"] = torque_error(model, task.holdout, held)
+        errors["jaxbl"] = torque_error(model, holdout, held)
     row.torques = {name: float(np.sqrt(np.mean(part**2))) for name, part in errors.items()}
     if not rivals:
         return

@@ -115,7 +115,7 @@ def format_batch(rows: list[JsonObject]) -> list[str]:
     return format_descriptions(
         (
             row["log"],
-            row["verdict"].replace("_", " ") or "refused",
+            row["verdict"] or "refused",
             f"{row['findings']} ({row['confidence']:.2g})" if row["findings"] else row["refused"],
         )
         for row in rows

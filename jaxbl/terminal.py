@@ -130,10 +130,9 @@ def repeat_call(context: typer.Context, folder: Path, *, keeps_results: bool = T
             or source.name != "COMMANDLINE"
         ):
             continue
-        if parameter.param_type_name == "option":
-            words.append(parameter.opts[0])
-        if value is not True:
-            words += map(str, value if isinstance(value, list | tuple) else [value])
+        for part in value if isinstance(value, list | tuple) else [value]:
+            words += parameter.opts[:1] if parameter.param_type_name == "option" else []
+            words += [] if part is True else [str(part)]
     return [*words, "--out", str(folder)]
 
 

@@ -66,6 +66,16 @@ def check_figures(page, figures):
     assert len(images) == figures
     assert all(loaded and len(text) > 20 for loaded, text in images)
     assert_accessible(page)
+    size = page.viewport_size
+    for width, height in ((1280, 800), (1024, 768), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), (page.url, width)
+        if width == 1280:
+            # the answer and its picture are seen at once
+            for part in (".card .answer", ".card .view")[: 1 + bool(figures)]:
+                box = page.locator(part).first.bounding_box()
+                assert box["y"] + box["height"] <= height, (page.url, part, box)
+    page.set_viewport_size(size)
 
 
 _checked_styles: set[str] = set()

@@ -27,6 +27,7 @@ from passed import PASSED
 from progress_lines import without_progress
 from shared_results import ATLAS
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, small_study, spaced_axis
+from typer.main import get_command
 
 from jaxbl import cli, terminal
 from jaxbl.cli import setup
@@ -78,8 +79,15 @@ def test_help_does_not_wait_for_jax(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
     result = jaxbl("--help", cwd=tmp_path)
     assert result.returncode == 0
-    for command in ("simulate", "sweep", "verify", "tune", "plot"):
-        assert command in result.stdout
+    words = " ".join(result.stdout.split())
+    assert words == " ".join(jaxbl("-h", cwd=tmp_path).stdout.split())
+    headings = [line for line in result.stdout.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings[1:] == ["Start:", "From a data sheet or a study:", "From a log:", "Results:", "This machine:"]
+    for name, command in get_command(cli.app).commands.items():
+        # the whole first sentence, and below it an example that the command takes
+        summary, *_, example, page = [line for line in command.help.split("\n") if line]
+        assert f" {name} {summary}" in words and example.startswith(f"Example: jaxbl {name}")
+        assert (Path(__file__).parents[1] / page.removeprefix("Read on: ")).is_file()
 
 
 def test_a_sweep_and_its_second_call(tmp_path):
@@ -128,6 +136,10 @@ def test_interrupt_anywhere_else():
     assert end.value.code == 130
 
 
+SHARED = (
+    "sweep: --detach needs the --scheduler of a cluster that stays, --share goes without one; neither goes with "
+    "--overwrite or --verify-store, as others may be at work in the folder; choose another one with --out"
+)
 NO_SUCH_FILE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
 BAD = {
     "no such file": (
@@ -178,7 +190,7 @@ BAD = {
     ),
     "foreign folder, benchmark": (
         ["bench", "--out", "full"],
-        "full: is not empty and holds no benchmark; choose another folder with --out",
+        "full: is not empty and holds no bench.json; choose another folder with --out",
     ),
     "a file as folder": (
         ["sweep", "study.toml", "--out", "plain.toml"],
@@ -221,15 +233,15 @@ BAD = {
     ),
     "a share of a cluster": (
         ["sweep", "study.toml", "--share", "1/2", "--scheduler", "local:2"],
-        "--share: does not go with --scheduler: other processes may be at work in the folder; leave one of them out",
+        SHARED,
     ),
     "leaving no cluster": (
         ["sweep", "study.toml", "--detach"],
-        "--detach: needs the --scheduler of a cluster that stays when this command has ended",
+        SHARED,
     ),
     "leaving, and removing what is there": (
         ["sweep", "study.toml", "--detach", "--scheduler", "tcp://127.0.0.1:1", "--overwrite"],
-        "--detach: does not go with --overwrite or --verify-store; choose another folder with --out",
+        SHARED,
     ),
     "a cluster for one log": (
         ["diagnose", "log.csv", "--scheduler", "local:2"],
@@ -377,12 +389,31 @@ def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
 
 
+def test_values_and_observers_are_changed_on_the_command_line(call, tmp_path):
+    write_study(tmp_path, rigid_study(axes=AXES))
+    (tmp_path / "gains.toml").write_text("[observer.motor]\nlambda = 7.0\nalpha = 31.0\n")
+    changes = ["--gains", "gains.toml", "--set", f"{ALPHA}=33", "--set", "observer.discretisation=explicit"]
+    assert call("simulate", "study.toml", *changes, "--out", "run")[0] == 0
+    conditions = json.loads((tmp_path / "run" / "summary.json").read_text())["conditions"]["motor"]
+    assert (conditions["lambda"], conditions["alpha"]) == (7.0, 33.0)
+    assert call("sweep", "study.toml", *changes, "--out", "map")[0] == 0
+    study = tomllib.loads((tmp_path / "map" / "study.toml").read_text())
+    assert study["observer"]["motor"]["lambda"] == 7.0 and study["observer"]["discretisation"] == "explicit"
+    with pytest.raises(InputError, match=r"--set observer: should be PATH=VALUE, such as observer.motor.lambda=3"):
+        call("simulate", "study.toml", "--set", "observer")
+    with pytest.raises(InputError, match=r"unknown path 'observer.motor.lamda'; .* 'observer.motor.lambda'"):
+        call("simulate", "study.toml", "--set", "observer.motor.lamda=1")
+    with pytest.raises(InputError, match=r"none.toml: no such file"):
+        call("simulate", "study.toml", "--gains", "none.toml")
+
+
 def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):
     write_study(tmp_path, rigid_study(axes=GAINS, verify=ATLAS))
     monkeypatch.setattr(Engine, "run", interrupt)
-    code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
+    changes = ["--set", "encoders.noise=1e-5", "--set", f"{ALPHA}=5"]
+    code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan", *changes)
     assert code == 130
-    command = "jaxbl verify study.toml --backend scan --out out"
+    command = f"jaxbl verify study.toml --backend scan --set encoders.noise=1e-5 --set {ALPHA}=5 --out out"
     assert errors == [f"interrupted; what is finished is kept. Go on with: {command}"]
 
 

@@ -112,7 +112,7 @@ WORDS = [word for pair in SHEET.items() for word in pair]
 
 def test_a_study_is_written_beside_what_was_given_and_nothing_overwritten(call, tmp_path):
     code, lines, errors = call("init", "axis.toml", *WORDS, "--motor-friction", "15 mN m", "--title", 'my "axis"')
-    assert (code, errors) == (0, []) and lines[0].startswith("axis.toml: a study with comments.")
+    assert (code, errors) == (0, []) and lines[0].startswith("✓ Good: axis.toml is a study with comments.")
     text = (tmp_path / "axis.toml").read_text()
     assert "half_gap = 0.0218166 # rad on the motor's shaft, given: 3 arcmin at the output, end to end" in text
     study = read_config(tmp_path / "axis.toml")
@@ -251,7 +251,9 @@ def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
 )
 def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, rated_name, lines, call, tmp_path):
     code, output, _ = call("init", "axis.toml", *option_words(kind, numbers | SHORT_RUN))
-    assert code == 0 and ("m/s² (motor)." in output[0]) == (kind == "linear") and "load" not in output[0]
+    assert (
+        code == 0 and ("m/s² (motor)." in "".join(output[:2])) == (kind == "linear") and "(load)" not in "".join(output[:2])
+    )
     text = (tmp_path / "axis.toml").read_text()
     assert all(f"\n{line}\n" in text for line in lines)
     assert not any(unit in text.partition("[drive]")[2] for unit in ("rad", "N m", "kg m²")) or kind == "direct"
@@ -355,7 +357,7 @@ def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
 
     monkeypatch.setattr("typer.prompt", prompt)
     code, lines, errors = call("init", "axis.toml", "--frequency", "20 Hz")
-    assert code == 0 and lines[0].startswith("axis.toml: a study")
+    assert code == 0 and lines[0].startswith("✓ Good: axis.toml is a study")
     assert questions[0] == questions[1] and questions[0] == "kind of this drive"
     assert [text.partition(",")[0] for text in questions[2:]] == [
         item.question.partition(",")[0] for item in KINDS["linear"].items[:-1]
@@ -373,10 +375,11 @@ def test_simulate_sweep_and_tune_run_what_is_written(kind, commands, call):
     numbers = {"screw": option_words("screw", SCREW), "linear": option_words("linear", LINEAR)}.get(kind, WORDS)
     sheet = dict(itertools.pairwise(numbers))
     noise = {"linear": "20 nm"}.get(kind, "5 arcsec")
-    code, lines, _ = call("init", "axis.toml", *numbers, "--frequency", "5 Hz", "--encoder-noise", noise)
+    code, lines, _ = call("init", "axis.toml", *numbers, "--frequency", "5 Hz", "--encoder-noise", noise, "--json")
     assert code == 0
-    # as they are printed
-    printed = {line.split()[1]: line.split()[1:] for line in lines if line.startswith("  jaxbl ")}
+    # as they are proposed
+    steps = json.loads("\n".join(lines))["next"]
+    printed = {words[1]: words[1:] for step in steps for words in [step["command"].split()]}
     assert list(printed) == ["simulate", "sweep", "tune"]
     for command in commands:
         code, lines, _ = call(*printed[command])

@@ -10,8 +10,8 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395294, 2.09, 2.3, 2.73),
-    "report": (60815, 0.2, 1.16, 0.31),
+    "all": (395256, 2.09, 2.3, 2.72),
+    "report": (60782, 0.2, 1.16, 0.31),
     "diagnosis": (60431, 9.06, 7.45, 8.68),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
@@ -19,10 +19,10 @@ CEILINGS = {
     "sweeps": (28654, 0.07, 0.0, 0.0),
     "exports": (22808, 0.02, 0.0, 0.0),
     "fused": (24223, 0.0, 0.0, 0.0),
-    ".": (18351, 0.03, 0.0, 0.0),
+    ".": (18350, 0.03, 0.0, 0.0),
     "drive": (12682, 0.0, 2.19, 0.0),
     "throughput": (11727, 0.0, 0.0, 0.0),
-    "cli": (9495, 0.09, 0.0, 0.0),
+    "cli": (9491, 0.09, 0.0, 0.0),
     "config": (9331, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
     "monitoring": (5530, 0.0, 0.0, 0.0),

@@ -3,9 +3,11 @@
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from itertools import chain
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from jaxbl.errors import InputError, NoResult
 from jaxbl.terminal import INTERRUPTED
@@ -13,11 +15,33 @@ from jaxbl.terminal import INTERRUPTED
 from . import exporting, logs, setup, studies
 from .outcome import print_outcome
 
+_GROUPS = {
+    "Start": (setup.demo, setup.init),
+    "From a data sheet or a study": (studies.simulate, studies.sweep, studies.tune, studies.verify, exporting.export),
+    "From a log": (logs.inspect, logs.identify, logs.diagnose, logs.watch),
+    "Results": (studies.plot, studies.explore, studies.compare, studies.status, studies.repair),
+    "This machine": (setup.doctor, setup.bench, setup.schema),
+}
+
+
+class _Groups(TyperGroup):
+    """Commands by what a user has, each with its whole first sentence."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands into the help."""
+        for heading, functions in _GROUPS.items():
+            with formatter.section(heading):
+                names = [function.__name__ for function in functions]
+                formatter.write_dl([(name, str(self.commands[name].help).partition("\n")[0]) for name in names])
+
+
 app = typer.Typer(
+    cls=_Groups,
+    context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    help="Drives with backlash: sliding-mode observers, gain maps, identification and diagnosis from logs.",
+    help="Motor drives with gear backlash: simulate them, choose observer gains, find numbers and missing effects in logs.",
 )
 
 
@@ -38,15 +62,9 @@ def _main(
     pass
 
 
-for _command in (
-    *(setup.demo, setup.init),
-    *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify, exporting.export),
-    *(logs.inspect, logs.identify, logs.diagnose, logs.watch),
-    *(studies.plot, studies.explore, studies.compare, studies.repair, setup.bench, setup.doctor),
-):
-    app.command()(print_outcome(_command))
-# what it prints is JSON in any case
-app.command()(setup.schema)
+for _command in chain(*_GROUPS.values()):
+    # what `schema` prints is JSON in any case
+    app.command()(_command if _command is setup.schema else print_outcome(_command))
 
 
 def main(run: Callable[[], object] = app) -> None:

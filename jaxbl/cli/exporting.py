@@ -1,14 +1,15 @@
 """The command that writes code for other systems."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from jaxbl import workers
+import jaxbl
 from jaxbl.terminal import show_task
 
 from .options import ConfigArgument, folder_of, option
-from .outcome import Outcome
+from .outcome import Outcome, with_changes
+from .studies import read_study
 
 _TARGETS = (
     "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive; "
@@ -16,6 +17,7 @@ _TARGETS = (
 )
 
 
+@with_changes
 def export(
     context: typer.Context,
     config: ConfigArgument,
@@ -28,12 +30,16 @@ def export(
         option("SIDE", "of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"),
     ] = None,
     fmi: Annotated[int | None, option("2|3", "version of an FMU [default: 3]")] = None,
+    **changes: Any,
 ) -> Outcome:
-    """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator."""
-    workers.start_jax()
-    from jaxbl.exports import export as run_export
+    """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator.
 
+    Example: jaxbl export axis.toml --target c
+
+    Read on: docs/export.md
+    """
+    study, _ = read_study(config, None, **changes)
     folder = folder_of(config, target, out)
     with show_task(context, "exporting"):
-        result = run_export(config, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
+        result = jaxbl.export(study, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
     return Outcome(result.lines, result.folder, "", "export.json")

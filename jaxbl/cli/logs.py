@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import jaxbl
 from jaxbl import workers
-from jaxbl.errors import InputError
+from jaxbl.errors import InputError, escape_unprintable
+from jaxbl.files import claim_log_folder, lock_folder, remove_if_empty_on_error, run_or_read, to_jsonable, write_atomic
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure
 from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
@@ -34,7 +36,6 @@ from .outcome import Outcome
 
 if TYPE_CHECKING:
     from jaxbl.monitoring.watch import Watch, WatchTask
-    from jaxbl.records import LogTable
     from jaxbl.result import Result
 
 ALARM = 3
@@ -48,12 +49,14 @@ def inspect(
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
-    """Examine a measured log: channels, sampling, noise, and which parameters it can identify."""
+    """Examine a measured log: channels, sampling, noise, and which parameters it can identify.
+
+    Example: jaxbl inspect log.csv --write axis.toml
+
+    Read on: docs/logs.md
+    """
     if write is not None:
         check_new(write, "--write")
-    from jaxbl.files import claim_log_folder
-    from jaxbl.records import inspect as inspect_log
-    from jaxbl.report.results import describe, write_report
 
     table = gear_ratio = nominal = None
     if model is not None:
@@ -62,7 +65,7 @@ def inspect(
         table, gear_ratio, nominal = read_log_config(model)
     guesses: list[str] = []
     if write is None:
-        inspection = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
+        inspection = jaxbl.inspect(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
         from jaxbl.records.proposal import propose_study
 
@@ -70,11 +73,9 @@ def inspect(
         study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, "inspected", out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    card = describe(inspection)
+    card = jaxbl.describe(inspection)
     if write is not None:
         import tomli_w
-
-        from jaxbl.files import write_atomic
 
         remarks = [
             f"Proposed by jaxbl inspect --write from {log.name}. Look it through: names, units, and the drive.",
@@ -83,7 +84,7 @@ def inspect(
         write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
         remarks = [f"{write}: a first model.", *guesses, *card.remarks]
         card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
-    write_report(inspection, folder, card)
+    jaxbl.write_report(inspection, folder, card)
     return Outcome(card, folder, summary="inspection.json")
 
 
@@ -102,23 +103,32 @@ def identify(
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
-    """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
+    """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions.
+
+    Example: jaxbl identify log.csv --model axis.toml
+
+    Read on: docs/logs.md
+    """
     _check_limits(next_experiment, max_torque, max_travel)
     workers.start_jax()
     from jaxbl.config import read_log_config
 
     table, gear_ratio, _ = read_log_config(model)
+    folder = folder_of(log[0], "identified", out)
     if table.kind == "element":
         if len(log) > 1 or profile or next_experiment is not None:
             raise InputError(
                 "identify: of a transmission on a test rig one log is fitted at a time, without --profile (it has intervals "
                 "anyway) and --next-experiment (which is for drives); leave these out"
             )
-        return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], "identified", out), overwrite)
+        from jaxbl.estimation.element import read_element_task, run_element
+        from jaxbl.report.element import describe_element
+
+        task, file = read_element_task(log[0], table, gear_ratio, holdout=holdout), folder / "identification.json"
+        summary = run_or_read(task, file, run_element, jaxbl.write_report, overwrite=overwrite)
+        return Outcome(describe_element(summary), folder, summary=summary)
     from jaxbl.estimation.identify import read_identification_task, run_identification
-    from jaxbl.files import run_or_read
     from jaxbl.report.identify import describe_identification
-    from jaxbl.report.results import write_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     check_doubts(filter(None, (task.record, task.holdout)), force)
@@ -126,7 +136,6 @@ def identify(
         from jaxbl.diagnosis.next_experiment import check_gap_sought
 
         check_gap_sought(task)
-    folder = folder_of(log[0], "identified", out)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
 
     def describe(summary: JsonObject) -> "Result":
@@ -137,7 +146,7 @@ def identify(
             task,
             folder / "identification.json",
             lambda task: run_identification(task, progress),
-            lambda result, folder: write_report(result, folder, describe(result.summary)),
+            lambda result, folder: jaxbl.write_report(result, folder, describe(result.summary)),
             overwrite=overwrite,
         )
     card = describe(summary)
@@ -147,20 +156,6 @@ def identify(
         written = write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
         card = replace(card, key_figures=[KeyFigure("next experiment", written), *card.key_figures[:3]])
     return Outcome(card, folder, summary=summary)
-
-
-def _identify_element(
-    log: Path, table: "LogTable", gear_ratio: float | None, holdout: Path | None, folder: Path, overwrite: bool
-) -> Outcome:
-    from jaxbl.estimation.element import read_element_task, run_element
-    from jaxbl.files import run_or_read
-    from jaxbl.report.element import describe_element
-    from jaxbl.report.results import write_report
-
-    task = read_element_task(log, table, gear_ratio, holdout=holdout)
-    file = folder / "identification.json"
-    summary = run_or_read(task, file, run_element, write_report, overwrite=overwrite)
-    return Outcome(describe_element(summary), folder, summary=summary)
 
 
 def diagnose(
@@ -184,14 +179,26 @@ def diagnose(
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> Outcome:
-    """Find effects that a model lacks, add them, and test on held-out data that its errors shrink."""
+    """Find effects that a model lacks, add them, and test on held-out data that its errors shrink.
+
+    Example: jaxbl diagnose log.csv --model axis.toml --holdout other.csv
+
+    Read on: docs/diagnosis.md
+    """
     _check_limits(next_experiment, max_torque, max_travel)
     if batch is not None:
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
         workers.start_jax()
-        folder = out if out is not None else Path("results") / f"{batch.name}_diagnosed"
-        return _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
+        from jaxbl.batch import format_batch, read_batch, run_batch
+
+        folder = out or Path("results") / f"{batch.name}_diagnosed"
+        work, skipped = read_batch(batch, model, folder, overwrite=overwrite)
+        with run_with_progress(context, model or batch, folder, unit="logs") as progress:
+            rows = run_batch(work, folder, jobs, progress, scheduler)
+        lines = [f"Skipped, by their names no logs: {', '.join(skipped)}"] if skipped else []
+        code = 2 if all(row["refused"] for row in rows) else 0
+        return Outcome([*lines, *format_batch(rows)], folder, "batch.csv", {"logs": rows, "skipped": skipped}, code)
     if jobs is not None or scheduler is not None:
         option = "--scheduler" if jobs is None else "--jobs"
         raise InputError(f"{option} goes with --batch: one log is one process's work; leave it out, or give a folder")
@@ -201,9 +208,7 @@ def diagnose(
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
-    from jaxbl.files import run_or_read
     from jaxbl.report.diagnose import describe_diagnosis
-    from jaxbl.report.results import write_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     check_doubts(filter(None, (task.record, task.holdout)), force)
@@ -218,7 +223,7 @@ def diagnose(
             task,
             folder / "diagnosis.json",
             lambda task: run_diagnosis(task, progress),
-            lambda result, folder: write_report(result, folder, describe(result.summary)),
+            lambda result, folder: jaxbl.write_report(result, folder, describe(result.summary)),
             overwrite=overwrite,
         )
     card = describe(summary)
@@ -240,25 +245,6 @@ def _check_limits(next_experiment: Path | None, torque: float | None, travel: fl
             raise InputError(f"{name} is {limit:g}; it has to be positive")
 
 
-def _diagnose_batch(
-    context: typer.Context,
-    source: Path,
-    model: Path | None,
-    out: Path,
-    jobs: int | None,
-    overwrite: bool,
-    scheduler: str | None,
-) -> Outcome:
-    from jaxbl.batch import format_batch, read_batch, run_batch
-
-    work, skipped = read_batch(source, model, out, overwrite=overwrite)
-    with run_with_progress(context, model or source, out, unit="logs") as progress:
-        rows = run_batch(work, out, jobs, progress, scheduler)
-    lines = [f"Skipped, by their names no logs: {', '.join(skipped)}"] if skipped else []
-    code = 2 if all(row["refused"] for row in rows) else 0
-    return Outcome([*lines, *format_batch(rows)], out, "batch.csv", {"logs": rows, "skipped": skipped}, code)
-
-
 def watch(
     context: typer.Context,
     source: Annotated[str, argument("LOG|udp://HOST:PORT", f"{FORMATS}, or where to listen")],
@@ -276,29 +262,31 @@ def watch(
         bool, flag("--overwrite", "write into a folder that holds other results of a log or stream")
     ] = False,
 ) -> Outcome:
-    """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm."""
+    """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm.
+
+    Example: jaxbl watch log.csv --model axis.toml --alarm-gap 0.002
+
+    Read on: docs/watch.md
+    """
     workers.start_jax()
-    from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.monitoring.watch import read_watch_task
-    from jaxbl.report.results import describe, write_report
 
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
     if folder is None:
         result = _watch_and_print(context, task, None)
-        card = describe(result)
+        card = jaxbl.describe(result)
     else:
         with remove_if_empty_on_error(folder), lock_folder(folder):
             _claim_watch(folder, task, overwrite)
             result = _watch_and_print(context, task, folder)
-            card = replace(describe(result), next_steps=after_watch(task, result.summary, model))
-            write_report(result, folder, card)
+            card = replace(jaxbl.describe(result), next_steps=after_watch(task, result.summary, model))
+            jaxbl.write_report(result, folder, card)
     code = ALARM if result.summary["alarm"] else 0
     return Outcome(card, folder, summary=result.summary, code=code)
 
 
 def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:
-    from jaxbl.files import claim_log_folder
     from jaxbl.report.watch import VALUES
 
     if task.record is None and (folder / VALUES).exists() and not overwrite:
@@ -311,8 +299,6 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
     import json
     from contextlib import ExitStack
 
-    from jaxbl.errors import escape_unprintable
-    from jaxbl.files import to_jsonable
     from jaxbl.monitoring.watch import format_values, run_watch
     from jaxbl.report.watch import values_file
 

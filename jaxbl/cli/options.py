@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxbl.errors import InputError
-from jaxbl.files import to_path
+from jaxbl.files import is_empty, make_folder, to_path
 from jaxbl.lines import doubts_among
 
 if TYPE_CHECKING:
@@ -35,6 +35,11 @@ OutOption = Annotated[
     str | None,
     option("DIR", "folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>_<what it holds>]"),
 ]
+SetOption = Annotated[
+    list[str] | None,
+    option("PATH=VALUE", "change a value of the study, such as observer.motor.lambda=3; may be given again", "--set"),
+]
+GainsOption = Annotated[Path | None, option("TOML", "take the observers from another file, such as gains.toml of tune")]
 FolderArgument = Annotated[str, argument("DIR", "folder of a sweep, verify or tune")]
 OverwriteOption = Annotated[bool, flag("--overwrite", "remove the results of another study from the folder")]
 BackendOption = Annotated[
@@ -65,6 +70,13 @@ def check_doubts(records: "Iterable[Record | SealedRecord]", force: bool) -> Non
     for record in records:
         if not force and (doubts := doubts_among(record.warnings)):
             raise InputError(f"{record.path}: {doubts[0]} --force searches all the same")
+
+
+def claim_out(folder: Path, file: str) -> None:
+    """Make a folder for results, unless it holds something else than those of which `file` is one."""
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / file).exists():
+        raise InputError(f"{folder}: is not empty and holds no {file}; choose another folder with --out")
 
 
 def check_new(file: Path, option: str) -> None:

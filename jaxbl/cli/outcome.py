@@ -10,12 +10,12 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from jaxbl.errors import InputError, NoResult, escape_unprintable
-from jaxbl.files import list_paths, read_json
+from jaxbl.files import list_paths, read_json, to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.result import Result, format_result
 from jaxbl.terminal import INTERRUPTED
 
-from .options import flag
+from .options import GainsOption, SetOption, flag
 
 QuietOption = Annotated[bool, flag("--quiet", "print neither progress nor what was found, errors alone")]
 JsonOption = Annotated[bool, flag("--json", "print what was found as one JSON object")]
@@ -89,13 +89,16 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
                     typer.secho(line, fg=_COLOURS.get(line[:2]))
         finally:
             if json and report:
-                from jaxbl.files import to_jsonable
-
                 typer.echo(json_format.dumps(to_jsonable({"command": command.__name__} | report), ensure_ascii=False))
         if outcome.code:
             raise typer.Exit(outcome.code)
 
     return with_options(run, command, {"quiet": QuietOption, "json": JsonOption}, False)
+
+
+def with_changes(command: Callable[..., Outcome]) -> Callable[..., Outcome]:
+    """Give a command on a study the options --set and --gains, which :func:`.studies.read_study` takes."""
+    return with_options(command, command, {"changes": SetOption, "gains": GainsOption}, None)
 
 
 def with_options(

@@ -6,6 +6,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
+import jaxbl
 from jaxbl import workers
 from jaxbl.datasheet import (
     KINDS,
@@ -20,13 +21,13 @@ from jaxbl.datasheet import (
     write_first_study,
 )
 from jaxbl.errors import InputError
-from jaxbl.files import write_atomic
+from jaxbl.files import remove_if_empty_on_error, write_atomic
 from jaxbl.lines import format_descriptions
 from jaxbl.result import Result
 from jaxbl.terminal import can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
-from .options import BackendOption, OutOption, argument, check_new, flag, option
+from .options import BackendOption, OutOption, argument, check_new, claim_out, flag, option
 from .outcome import Outcome, with_options
 from .studies import compute, read_study
 
@@ -46,6 +47,10 @@ def init(
     """Write a first study from a drive's data sheet: what no option says is asked for.
 
     Numbers have units, as in the examples. A unit that is not known here is answered with those that are.
+
+    Example: jaxbl init axis.toml --kind screw
+
+    Read on: docs/tutorial.md
     """
     check_new(file, "init")
     asking, answered = can_ask_user(), {name: text for name, text in options.items() if text is not None}
@@ -148,7 +153,12 @@ with_options(init, init, {name: _make_option(items) for name, items in items_by_
 def schema(
     out: Annotated[Path | None, option("NEW.json", "file to be written [default: stdout]")] = None,
 ) -> None:
-    """Print the JSON schema of a study, by which editors complete and check its keys."""
+    """Print the JSON schema of a study, by which editors complete and check its keys.
+
+    Example: jaxbl schema --out study.schema.json
+
+    Read on: docs/which_command.md
+    """
     import json
 
     from jaxbl.config.schema import build_schema
@@ -163,7 +173,12 @@ def schema(
 
 
 def doctor(context: typer.Context) -> Outcome:
-    """Say what is installed here and where it keeps things, and test that it computes, in some seconds."""
+    """Say what is installed here and where it keeps things, and test that it computes, in some seconds.
+
+    Example: jaxbl doctor
+
+    Read on: docs/install.md
+    """
     workers.start_jax()
     with show_task(context, "looking at versions and devices"):
         from jaxbl.doctor import examine
@@ -182,12 +197,15 @@ def demo(
     out: OutOption = None,
     backend: BackendOption = None,
 ) -> Outcome:
-    """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute."""
+    """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute.
+
+    Example: jaxbl demo
+
+    Read on: README.md
+    """
     config = _find_shipped_study("gain_map.toml")
     study, chosen = read_study(config, backend)
-    from jaxbl.sweeps.sweep import sweep
-
-    return compute(context, config, study, out or "results/gain_map", False, chosen, sweep, "sweep", after_demo)
+    return compute(context, config, study, out or "results/gain_map", False, chosen, jaxbl.sweep, "sweep", after_demo)
 
 
 def _find_shipped_study(name: str) -> Path:
@@ -205,19 +223,20 @@ def bench(
     quick: Annotated[bool, flag("--quick", "take less than a minute: shorter runs, the others in one precision")] = False,
     out: Annotated[Path, option("DIR", "folder for the results")] = Path("results/bench"),
 ) -> Outcome:
-    """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json."""
+    """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json.
+
+    Example: jaxbl bench --quick
+
+    Read on: docs/speed.md
+    """
     workers.start_jax()
     import jax
 
-    from jaxbl.files import make_folder, remove_if_empty_on_error
     from jaxbl.report.bench import write_bench_report
-    from jaxbl.throughput import bench as run_bench
 
-    make_folder(out)
-    if any(out.iterdir()) and not (out / "bench.json").exists():
-        raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
+    claim_out(out, "bench.json")
     # the time of compiling is measured, so that nothing may come from the cache
     jax.config.update("jax_enable_compilation_cache", False)
     with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit="parts", keeps_results=False) as progress:
-        result = run_bench(quick=quick, progress=progress)
+        result = jaxbl.bench(quick=quick, progress=progress)
     return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)

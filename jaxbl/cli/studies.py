@@ -6,15 +6,17 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import jaxbl
 from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
-from jaxbl.files import FolderInUse, has_file, to_path
+from jaxbl.files import FolderInUse, has_file, lock_folder, make_folder, remove_if_empty_on_error, to_path
 from jaxbl.lines import NextStep, format_descriptions, format_duration
 from jaxbl.terminal import (
     is_quiet,
@@ -34,11 +36,12 @@ from .options import (
     ResultsArgument,
     SchedulerOption,
     argument,
+    claim_out,
     flag,
     folder_of,
     option,
 )
-from .outcome import Outcome
+from .outcome import Outcome, with_changes
 
 if TYPE_CHECKING:
     from jaxbl.config import Config
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult
 
 
+@with_changes
 def simulate(
     context: typer.Context,
     config: ConfigArgument,
@@ -55,24 +59,27 @@ def simulate(
     seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0, max=2**31 - 1)] = 0,
     every: Annotated[int, option("N", "keep every N-th sample of the trace", min=1)] = 1,
     overwrite: OverwriteOption = False,
+    **changes: Any,
 ) -> Outcome:
-    """Simulate a study once: trace, figures, summary."""
-    workers.start_jax()
-    from jaxbl.config import read_config
-    from jaxbl.files import lock_folder, remove_if_empty_on_error
-    from jaxbl.report.results import write_report
-    from jaxbl.sweeps.store import claim_folder
-    from jaxbl.sweeps.trial import run
+    """Simulate a study once: trace, figures, summary.
 
-    study = read_config(config)
+    Example: jaxbl simulate axis.toml --set observer.motor.lambda=30
+
+    Read on: docs/tutorial.md
+    """
+    workers.start_jax()
+    from jaxbl.sweeps.store import claim_folder
+
+    study, _ = read_study(config, None, **changes)
     folder = folder_of(config, "run", out)
     with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
         claim_folder(folder, study, "simulate", overwrite=overwrite)
-        trial = run(study, seed=seed, every=every)
-        card = write_report(trial, folder)
+        trial = jaxbl.run(study, seed=seed, every=every)
+        card = jaxbl.write_report(trial, folder)
     return Outcome(card, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
 
 
+@with_changes
 def sweep(
     context: typer.Context,
     config: ConfigArgument,
@@ -88,19 +95,23 @@ def sweep(
     share: Annotated[
         str | None, option("I/N", "compute the I-th of N shares into a folder that other processes write into, too")
     ] = None,
+    **changes: Any,
 ) -> Outcome:
-    """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
-    share_numbers = _parse_share(
-        share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None}
-    )
-    if detach and scheduler is None:
-        raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-    if detach and (overwrite or verify_store):
-        raise InputError("--detach: does not go with --overwrite or --verify-store; choose another folder with --out")
-    study, chosen = read_study(config, backend)
+    """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep.
+
+    Example: jaxbl sweep axis.toml --dry-run
+
+    Read on: docs/tutorial.md
+    """
+    if (detach or share) and (overwrite or verify_store or detach == (scheduler is None)):
+        raise InputError(
+            "sweep: --detach needs the --scheduler of a cluster that stays, --share goes without one; neither goes with "
+            "--overwrite or --verify-store, as others may be at work in the folder; choose another one with --out"
+        )
+    share_numbers = None if share is None else _parse_share(share)
+    study, chosen = read_study(config, backend, **changes)
     from jaxbl.report.checks import check_figures
     from jaxbl.sweeps.points import Points
-    from jaxbl.sweeps.sweep import sweep as run_sweep
 
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
@@ -108,17 +119,15 @@ def sweep(
         check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
             return _estimate_cost(study, chosen)
-    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
+    run = functools.partial(jaxbl.sweep, verify_store=verify_store, scheduler=scheduler)
     collect = functools.partial(compute, context, config, study, out, overwrite, chosen, run, "sweep", after_sweep)
     if detach or share_numbers is not None:
-        from jaxbl.sweeps.sweep import share as run_share, submit
-
         folder = folder_of(config, "map", out)
         with run_with_progress(context, config, folder) as progress:
             if share_numbers is None:
-                status_now = submit(study, folder, scheduler, backend=chosen)
+                status_now = jaxbl.submit(study, folder, scheduler, backend=chosen)
             else:
-                status_now = run_share(study, folder, share_numbers, progress=progress, backend=chosen)
+                status_now = jaxbl.share(study, folder, share_numbers, progress=progress, backend=chosen)
         if not status_now.complete:
             remark = f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report."
             return _describe_studies([status_now], remark)
@@ -130,15 +139,8 @@ def sweep(
     return collect()
 
 
-def _parse_share(text: str | None, other_options: dict[str, bool]) -> tuple[int, int] | None:
-    """Parse I/N into the number of a share and of all shares. `other_options`: set options that exclude --share."""
-    if text is None:
-        return None
-    for name, is_set in other_options.items():
-        if is_set:
-            raise InputError(
-                f"--share: does not go with {name}: other processes may be at work in the folder; leave one of them out"
-            )
+def _parse_share(text: str) -> tuple[int, int]:
+    """Parse I/N into the number of a share and of all shares."""
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise InputError(f"--share {text}: should be I/N, such as 2/8: the second of eight")
@@ -146,7 +148,12 @@ def _parse_share(text: str | None, other_options: dict[str, bool]) -> tuple[int,
 
 
 def status(folder: FolderArgument) -> Outcome:
-    """Say how far a study is, by the parts that exist."""
+    """Say how far a study is, by the parts that exist.
+
+    Example: jaxbl status results/axis_map
+
+    Read on: docs/which_command.md
+    """
     from jaxbl.sweeps.status import list_statuses
 
     return _describe_studies(list_statuses(folder))
@@ -178,9 +185,7 @@ def _describe_study(study: "Status") -> list[str]:
 
 def _estimate_cost(study: "Config", backend: "Backend | None") -> Outcome:
     """Estimate what a sweep will take."""
-    from jaxbl.sweeps.sweep import dry_run
-
-    cost = dry_run(study, backend=backend)
+    cost = jaxbl.dry_run(study, backend=backend)
     refined = study.sweep.refine is not None
     rows = [("points", f"{cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)")]
     if refined:
@@ -197,6 +202,7 @@ def _estimate_cost(study: "Config", backend: "Backend | None") -> Outcome:
     return Outcome(lines, summary=vars(cost))
 
 
+@with_changes
 def tune(
     context: typer.Context,
     config: ConfigArgument,
@@ -204,15 +210,20 @@ def tune(
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
     scheduler: SchedulerOption = None,
+    **changes: Any,
 ) -> Outcome:
-    """Choose the observers' gains, or their kind: gains.toml, comparison, report. Continues an interrupted search."""
-    study, chosen = read_study(config, backend)
-    from jaxbl.gains.tune import tune as run_tune
+    """Choose the observers' gains, or their kind: gains.toml, comparison, report. Continues an interrupted search.
 
-    run = functools.partial(run_tune, scheduler=scheduler)
+    Example: jaxbl tune axis.toml
+
+    Read on: docs/tutorial.md
+    """
+    study, chosen = read_study(config, backend, **changes)
+    run = functools.partial(jaxbl.tune, scheduler=scheduler)
     return compute(context, config, study, out, overwrite, chosen, run, "tune")
 
 
+@with_changes
 def verify(
     context: typer.Context,
     config: ConfigArgument,
@@ -220,23 +231,40 @@ def verify(
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
     scheduler: SchedulerOption = None,
+    **changes: Any,
 ) -> Outcome:
-    """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification."""
-    study, chosen = read_study(config, backend)
-    from jaxbl.gains.verify import verify as run_verify
+    """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification.
 
-    run = functools.partial(run_verify, scheduler=scheduler)
+    Example: jaxbl verify axis.toml --gains results/axis_gains/gains.toml
+
+    Read on: docs/theory.md
+    """
+    study, chosen = read_study(config, backend, **changes)
+    run = functools.partial(jaxbl.verify, scheduler=scheduler)
     return compute(context, config, study, out, overwrite, chosen, run, "verify")
 
 
-def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
-    """Read a study and the backend option."""
+def read_study(
+    config: Path, backend: str | None, changes: Sequence[str] | None = None, gains: Path | None = None
+) -> tuple["Config", "Backend | None"]:
+    """Read a study, with changed values and other gains, and the backend option."""
     workers.start_jax()
-    from jaxbl.config import read_config
+    from jaxbl.config import with_values
     from jaxbl.sweeps.programs import check_backend
 
     chosen = check_backend(backend, "--backend")
-    return read_config(config), chosen
+    study = jaxbl.read_config(config if gains is None else {"include": [str(config), str(gains)]})
+    return with_values(study, dict(map(_parse_change, changes or ()))), chosen
+
+
+def _parse_change(text: str) -> tuple[str, Any]:
+    """Parse PATH=VALUE into a path, and a number or a word."""
+    path, equals, value = text.partition("=")
+    if not (path and equals and value):
+        raise InputError(f"--set {text}: should be PATH=VALUE, such as observer.motor.lambda=3")
+    with suppress(ValueError):
+        return path, float(value)
+    return path, value
 
 
 _FOLDERS = {"sweep": "map", "tune": "gains", "verify": "verdict"}
@@ -271,10 +299,9 @@ def compute(
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
     with show_task(context, "drawing"):
         # what draws is loaded when there is something to be drawn
-        from jaxbl.report.results import describe, write_report
 
-        card = describe(result)
-        card = write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
+        card = jaxbl.describe(result)
+        card = jaxbl.write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
     return Outcome(card, folder, summary=_SUMMARIES.get(command) or _study_size(result))
 
 
@@ -283,24 +310,25 @@ def plot(
     folder: FolderArgument,
     config: Annotated[Path | None, option("CONFIG", "take title, notes and figures from this study")] = None,
 ) -> Outcome:
-    """Draw figures and report of a sweep again from its stored points, without simulating."""
-    workers.start_jax()
-    from jaxbl.config import read_config
-    from jaxbl.files import make_folder
-    from jaxbl.report.results import describe, write_report
-    from jaxbl.sweeps.store import Store, identity
-    from jaxbl.sweeps.sweep import open_study
+    """Draw figures and report of a sweep again from its stored points, without simulating.
 
-    where, result = to_path(folder), open_study(folder)
+    Example: jaxbl plot results/axis_map --config axis.toml
+
+    Read on: docs/tutorial.md
+    """
+    workers.start_jax()
+    from jaxbl.sweeps.store import Store, identity
+
+    where, result = to_path(folder), jaxbl.open_study(folder)
     make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
-        study = read_config(config)
+        study = jaxbl.read_config(config)
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = replace(result, config=study)
     with show_task(context, "drawing"):
-        card = describe(result)
-        card = write_report(result, where, replace(card, next_steps=after_sweep(card, result.config, where)))
+        card = jaxbl.describe(result)
+        card = jaxbl.write_report(result, where, replace(card, next_steps=after_sweep(card, result.config, where)))
     return Outcome(card, where, summary=_study_size(result))
 
 
@@ -313,7 +341,12 @@ def explore(
     port: Annotated[int, option("N", "port to serve on; 0: one that is free", min=0, max=65535)] = 0,
     browser: Annotated[bool | None, flag("--browser/--no-browser", "open the page [default: on a terminal]")] = None,
 ) -> Outcome:
-    """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python."""
+    """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python.
+
+    Example: jaxbl explore results/axis_map
+
+    Read on: docs/explore.md
+    """
     if static is not None and (port or browser is not None):
         raise InputError("--static: writes a page and serves none; --port and --browser do not go with it; leave them out")
     workers.start_jax()
@@ -323,8 +356,10 @@ def explore(
 
     source = log_source(folder)
     if source is None and not has_file(to_path(folder), "manifest.json"):
-        fault = "is missing" if not to_path(folder).exists() else "holds no sweep, identification or diagnosis"
-        raise InputError(f"{folder}: {fault}; give a folder that 'jaxbl sweep', 'identify' or 'diagnose' wrote")
+        raise InputError(
+            f"{folder}: is missing, or holds no sweep, identification or diagnosis; give a folder that 'jaxbl sweep', "
+            "'identify' or 'diagnose' wrote"
+        )
     source = source or study_source(folder)
     if static is not None:
         with show_task(context, "writing the page"):
@@ -349,29 +384,31 @@ def compare(
     second: Annotated[Path, argument("DIR2", "of another one", parser=to_path)],
     out: Annotated[Path | None, option("DIR", "folder for the results [default: results/compare-DIR1-DIR2]")] = None,
 ) -> Outcome:
-    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
-    workers.start_jax()
-    from jaxbl.files import is_empty, make_folder, remove_if_empty_on_error
-    from jaxbl.report.results import write_report
-    from jaxbl.sweeps.compare import compare as run_compare
-    from jaxbl.sweeps.sweep import open_study
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise.
 
-    studies = open_study(first), open_study(second)
-    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
-    make_folder(folder)
-    if not is_empty(folder) and not (folder / "comparison.json").exists():
-        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    Example: jaxbl compare results/before results/after
+
+    Read on: docs/tutorial.md
+    """
+    workers.start_jax()
+
+    studies = jaxbl.open_study(first), jaxbl.open_study(second)
+    folder = out or Path("results") / f"compare-{first.name}-{second.name}"
+    claim_out(folder, "comparison.json")
     with remove_if_empty_on_error(folder), show_task(context, "comparing"):
-        card = write_report(run_compare(*studies), folder)
+        card = jaxbl.write_report(jaxbl.compare(*studies), folder)
     return Outcome(card, folder, summary="comparison.json")
 
 
 def repair(folder: FolderArgument) -> Outcome:
-    """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
-    workers.start_jax()
-    from jaxbl.sweeps.sweep import repair as run_repair
+    """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew.
 
-    whole_parts, store = run_repair(folder)
+    Example: jaxbl repair results/axis_map
+
+    Read on: docs/which_command.md
+    """
+    workers.start_jax()
+    whole_parts, store = jaxbl.repair(folder)
     parts = store.manifest["parts"]
     lines = [*(f"Damaged: {damaged_part}" for damaged_part in store.damaged), f"{whole_parts} of {parts} parts are whole."]
     if whole_parts < parts:

@@ -5,7 +5,6 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +64,7 @@ def describe_comparison(comparison: Comparison) -> Result:
     remarks += [
         f"Points: {common} in both{alone}.",
         *([_noise(comparison)] if common else []),
-        *_where(comparison, changed[:1]),
+        *(_most(comparison, change) for change in changed[:1] if change.most),
     ]
     for i, study in enumerate(names):
         gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
@@ -108,21 +107,6 @@ def _most(comparison: Comparison, change: MetricChange) -> str:
     place = ", ".join(f"{path} = {_value(change.most[path])}" for path in comparison.axes)
     ends = f"{change.most['first']:.3g} -> {change.most['second']:.3g} {find_metric(change.metric).unit}".rstrip()
     return f"Largest change of {change.metric}: {ends}{f' at {place}' if place else ''}."
-
-
-def _where(comparison: Comparison, changes: Sequence[MetricChange]) -> list[str]:
-    """Say where the metric that changed most did so."""
-    lines = [_most(comparison, change) for change in changes if change.most is not None]
-    lines += (
-        f"The points at which {change.metric} differs lie at {', '.join(_span(*item) for item in change.where.items())}."
-        for change in changes
-        if change.where
-    )
-    return lines
-
-
-def _span(path: str, ends: Sequence[Any]) -> str:
-    return f"{path} {_value(ends[0])} to {_value(ends[1])}" if isinstance(ends[0], float) else f"{path} {', '.join(ends)}"
 
 
 def _ways(change: MetricChange) -> str:

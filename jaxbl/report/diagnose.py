@@ -33,7 +33,7 @@ from .figures import (
     write_inside,
 )
 from .motor_alone_figures import draw_motor_alone
-from .numbers import format_number, lead_with_doubt, write_fit
+from .numbers import format_number, lead_with_doubt, percent, write_fit
 from .residuals import draw_residuals, plot_torque
 
 _BEFORE, _AFTER = VERMILION, BLUE
@@ -94,7 +94,7 @@ def _reasons(summary: JsonObject) -> Lines:
         texts = ", ".join(f"{leaf} = {format_number(number)}" for leaf, number in numbers.items())
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
-            f"{finding.get('in_log') or _percent(finding['share']) + ' of the driving torque'}."
+            f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}."
         )
         if others:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
@@ -190,10 +190,6 @@ def _what_to_record(summary: JsonObject) -> str:
         for name, reach in gap["range"].items()
     )
     return f"{lead} Hold out a log that reaches as far: {reached}."
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
 
 
 _OVER = {"position": "position", "turn": "position within a turn", "speed": "speed"}
@@ -307,7 +303,7 @@ def _remarks(summary: JsonObject) -> Lines:
     for name, torque in sorted(remaining, key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
         lines.append(
-            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({_percent(torque['share'])} of the driving torque, "
+            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({percent(torque['share'])} of the driving torque, "
             f"evidence {torque['evidence']:.3g} nats)."
         )
     after = gap["holdout_rmse_after"]

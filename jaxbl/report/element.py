@@ -10,7 +10,7 @@ from jaxbl.lines import Lines
 from jaxbl.result import Result, ResultTable
 
 from .figures import BLUE, FAINT, ORANGE, Drawn, legend, outline, stacked, style, subplots
-from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, write_fit
+from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, percent, write_fit
 
 _POINTS = 6000
 """Points of a cloud: a page is about 1000 pixels wide."""
@@ -53,7 +53,7 @@ def _remarks(summary: JsonObject) -> Lines:
 
 
 def _size(error: JsonObject, unit: str) -> str:
-    return f"{error['rms']:.3g} {unit} rms, {100 * error['relative']:.2g} % of the torque"
+    return f"{error['rms']:.3g} {unit} rms, {percent(error['relative'])} of the torque"
 
 
 @style()

@@ -9,7 +9,7 @@ from jaxbl.lines import DOUBT, Lines
 from jaxbl.result import Result, ResultTable
 
 from .figures import SIDES
-from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, write_fit
+from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, percent, write_fit
 
 
 def write_identification(result: Identification, folder: Path) -> str:
@@ -65,10 +65,7 @@ def _far_off(parameters: JsonObject) -> Lines:
 
 def _lacking(equation: str, channel: str, share: float) -> str:
     """Say with what motion the torque goes that a model lacks."""
-    return (
-        f"{DOUBT}{100.0 * share:.0f} % of the torque that the model leaves over on the {equation} goes with its {channel}: "
-        "an effect is missing. What it does to the numbers is not known: they have no 95 % intervals."
-    )
+    return f"{percent(share)} of the torque left over on the {equation} goes with its {channel}: an effect is missing."
 
 
 def _backlash(summary: JsonObject) -> Lines:
@@ -143,7 +140,7 @@ def _shares(torque: JsonObject) -> str:
 def _share(error: JsonObject, model: str = "") -> str:
     """A torque error as a share of the driving torque, or in its unit where nothing drives."""
     relative = error[f"{model}relative"]
-    return f"{error[f'{model}rms']:.2g} {error['unit']} rms" if relative is None else f"{100.0 * relative:.2g} %"
+    return f"{error[f'{model}rms']:.2g} {error['unit']} rms" if relative is None else percent(relative)
 
 
 def _on_holdout(holdout: JsonObject) -> Lines:

@@ -39,6 +39,7 @@ from .figures import (
 )
 from .log_signals import LogSignals
 from .motor_alone_figures import draw_motor_alone
+from .numbers import percent
 
 Array = np.ndarray
 
@@ -82,7 +83,7 @@ def _with_error(value: float, error: float, unit: str) -> str:
     digits, share = 4, ""
     if value and error and np.isfinite(error):
         digits = int(np.clip(np.ceil(np.log10(abs(value) / error)) + 1, 1, 9))
-        share = f" ({100.0 * error / abs(value):.2g} %)"
+        share = f" ({percent(error / abs(value))})"
     width = f" ± {error:.1g}" if error else ""
     return f"{value:.{digits}g}{width}{f' {unit}' if unit else ''}{share}"
 
@@ -178,7 +179,7 @@ def _velocities(log: LogSignals) -> Drawn:
         _finish(above, f"{side} velocity ({unit})", limits(smoothed[log.detail], estimate[log.line]), 2)
         error = estimate - smoothed
         share = log.rms(error) / (log.rms(smoothed) or 1.0)
-        label = f"rms {log.rms(error):.2g} {unit} ({100.0 * share:.2g} %)"
+        label = f"rms {log.rms(error):.2g} {unit} ({percent(share)})"
         _draw(below, log, error, color=SIDE_COLOURS[side], lw=0.8, label=label)
         _finish(below, f"difference ({unit})", limits(error[log.settled], room=0.4))
     return Drawn(

@@ -29,7 +29,7 @@ from .figures import (
     style,
     subplots,
 )
-from .numbers import lead_with_doubt
+from .numbers import lead_with_doubt, percent
 
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
@@ -91,7 +91,7 @@ def _channel_table(record: Record) -> list[tuple[str, ...]]:
         rows.append((
             name, c.unit, f"{c.least:.4g}", f"{c.largest:.4g}", f"{c.resolution:.3g}" if c.resolution else "–",
             f"{c.noise:.2g}", f"{c.bandwidth:.3g} Hz" if c.bandwidth else "–",
-            f"{100 * c.saturated:.2g} %" if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
+            percent(c.saturated) if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
         ))  # fmt: skip
     return rows
 

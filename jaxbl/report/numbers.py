@@ -34,6 +34,11 @@ def format_number(number: JsonObject) -> str:
     return f"{number['value']:.5g}{error}{unit}"
 
 
+def percent(share: float) -> str:
+    """A share in text, of two digits up to 10 %."""
+    return f"{100.0 * share:.2g} %" if abs(share) < 0.095 else f"{100.0 * share:.0f} %"
+
+
 def number_row(path: str, number: JsonObject) -> list[object]:
     """Cells of a number that was found, below `NUMBER_COLUMNS`."""
     return [path, number["value"], number["standard_error"], *number["interval"]]

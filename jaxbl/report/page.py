@@ -44,16 +44,17 @@ _PARTS = "page.css", "shared.js", "page.js"
 
 
 def format_page(result: Result, pictures: Sequence[tuple[str, Picture]], config: str) -> str:
-    """The whole page: the card with the first figure, then remarks, figures, tables, and what is folded away."""
+    """The whole page: the card with the first figure, the first table, remarks, figures, tables, and what is folded away."""
     style, *scripts = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
     script = "\n".join(scripts)
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
     first, *more = (_figure(*named) for named in pictures) if pictures else ("",)
-    parts = [_card(result, first), _list(result.remarks)]
+    tables = [*map(_table, result.tables)]
+    parts = [_card(result, first), *tables[:1], _list(result.remarks)]
     if more:
         parts.append(f'<div class="figures">{"".join(more)}</div>')
-    parts += map(_table, result.tables)
+    parts += tables[1:]
     if result.details:
         parts.append(_fold(f"Remarks ({len(result.details)})", _list(result.details)))
     parts.append(_fold("Config", f"<pre>{escape(config)}</pre>"))

@@ -25,6 +25,7 @@ from jaxbl.sweeps.sweep import StudyResult
 from .aggregates import Distinct, Groups, Rows, spread
 from .figures import SIDES
 from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
+from .numbers import percent
 
 
 def write_sweep(result: StudyResult, folder: Path) -> str:
@@ -141,7 +142,7 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
     if result.config.sweep.refine is not None:
         points = len(Points(result.config))
         simulated = survey.runs // result.config.sweep.seeds
-        count = f"{count} at {simulated} of {points} grid points ({100 * simulated / points:.2g} %)"
+        count = f"{count} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
     shares = [f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %" for side in survey.sides]

@@ -44,7 +44,7 @@ from .figures import (
 )
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import Cells, cell_edges, color_norm, condition_curves, flat_remark, hatch_failures, outline_effects, set_up_map
-from .numbers import lead_with_doubt
+from .numbers import lead_with_doubt, percent
 
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
@@ -428,9 +428,9 @@ def _reasons(summary: JsonObject) -> Lines:
 def describe_verdict(verdict: JsonObject) -> str:
     """Say whether gains matter (`verdict` of a side), and what limits the error."""
     factor = verdict["worst_over_least"]
-    excess = f"{100 * (factor - 1):.2g} %"
+    excess = percent(factor - 1.0)
     causes = sorted(verdict["causes"].items(), key=lambda cause: -cause[1])
-    limits = ", ".join(f"{part} {100 * share:.2g} %" for part, share in causes)
+    limits = ", ".join(f"{part} {percent(share)}" for part, share in causes)
     sentences = {
         "yes": f"gains matter: the worst that meet all constraints have {factor:.3g} times the least error.",
         "no": f"gains do not matter: all that meet the constraints are within {excess} of the least error.",

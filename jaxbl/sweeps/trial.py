@@ -29,7 +29,7 @@ class Trial(NamedTuple):
     Attributes:
         config: the study (its axes are not used).
         trace: one row a sample: `t`, `u`, `theta_e`, `theta_s` as in a measured log, true values and estimates by side, and
-            identified parameters (columns and units: README).
+            identified parameters (columns and units: docs/api.md).
         summary: metrics, identified parameters, gain conditions and remarks, as in `summary.json`.
     """
 

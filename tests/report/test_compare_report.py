@@ -84,7 +84,7 @@ def test_unfinished_studies_are_compared_as_far_as_they_are(studies_folder, tmp_
     ("second", "out", "message"),
     [
         ("nothing", "new", "nothing: holds no study (no manifest.json); run 'jaxbl sweep' first"),
-        ("after", "before", "before: is not empty and holds no comparison; choose another folder with --out"),
+        ("after", "before", "before: is not empty and holds no comparison.json; choose another folder with --out"),
     ],
 )
 def test_bad_input(studies_folder, run_command, second, out, message):

@@ -550,7 +550,7 @@ def test_a_refined_study_in_a_folder(refined_study, computed_chunks):
     assert (computed_chunks, second.cost["lanes"]) == ([], 0)
     assert read_files(folder) == before
     found = describe(open_study(folder))
-    share = f"{100 * len(result.frame) / 33**2:.2g}"
+    share = f"{100 * len(result.frame) / 33**2:.0f}"
     count = len(result.frame)
     assert found.headline.startswith(f"{count} runs at {count} of 1089 grid points ({share} %): ")
     assert found.verdict == "good" and "not finished" not in "".join(found.sentences)
