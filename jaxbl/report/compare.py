@@ -22,8 +22,6 @@ from .figures import COLOURS, MISSING, Axes, Drawn, Figure, Patch, colour_bar, l
 from .maps import axis_label, color_norm, hatch_failures, is_log, set_up_map
 
 _PANELS = 3
-_LISTED = 12
-"""Names in a sentence; `comparison.json` has all."""
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> str:
@@ -71,7 +69,7 @@ def describe_comparison(comparison: Comparison) -> Result:
         if gone:
             remarks.append(f"A number in {study} alone: {', '.join(gone)}.")
     same = [change.metric for change in comparison.metrics if change not in changed]
-    details = [f"No difference beyond {beyond}: {', '.join(same)}."] if 0 < len(same) <= _LISTED else []
+    details = [f"No difference beyond {beyond}: {', '.join(same)}."] if same else []
     figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
     rows = [[key, _value(old), _value(new)] for key, (old, new) in comparison.config.items()]
     tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)

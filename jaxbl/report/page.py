@@ -38,6 +38,8 @@ def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
         return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
 
 
+_SHORT = 8
+"""Rows of a table that may stand above the figures."""
 _WIDE = 700
 """Pixels beyond which a figure has the whole width of the page; others stand in two columns."""
 _PARTS = "page.css", "shared.js", "page.js"
@@ -50,11 +52,12 @@ def format_page(result: Result, pictures: Sequence[tuple[str, Picture]], config:
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
     first, *more = (_figure(*named) for named in pictures) if pictures else ("",)
-    tables = [*map(_table, result.tables)]
-    parts = [_card(result, first), *tables[:1], _list(result.remarks)]
+    # a short table of what was found stands before what is said of it
+    above = [table for table in result.tables[:1] if len(table.rows) <= _SHORT]
+    parts = [_card(result, first), *map(_table, above), _list(result.remarks)]
     if more:
         parts.append(f'<div class="figures">{"".join(more)}</div>')
-    parts += tables[1:]
+    parts += map(_table, result.tables[len(above) :])
     if result.details:
         parts.append(_fold(f"Remarks ({len(result.details)})", _list(result.details)))
     parts.append(_fold("Config", f"<pre>{escape(config)}</pre>"))

@@ -21,6 +21,14 @@ from .figures import Drawn, style
 
 _MOST_MARKS = 800
 """Markers of a cloud that are drawn one by one; more become an image."""
+_DARK = b"""@media (prefers-color-scheme: dark) {
+  svg { fill: #e8e8ea }
+  [style*="stroke: #000000"] { stroke: #e8e8ea !important }
+  [style*="fill: #000000"] { fill: #e8e8ea !important }
+  [style*="fill: #ffffff"] { fill: none !important }
+  [style*="stroke: #dddddd"] { stroke: #43464c !important }
+}</style>"""
+"""Black lines and texts are light, and white is transparent, where the reader has a dark page."""
 _MOST_VALUES = 60_000
 """Numbers of a figure that its page holds."""
 
@@ -70,7 +78,8 @@ def picture(drawn: Drawn) -> Picture:
     step = max(math.ceil(2 * count / _MOST_VALUES), 1)
     panels = [_panel(figure, ax, value, step) for ax in axes]
     described = " ".join([drawn.caption, *map(_describe, panels[:6])])
-    return Picture(file.getvalue(), (width, height), drawn.caption, described, panels)
+    svg = file.getvalue().replace(b"</style>", _DARK, 1)
+    return Picture(svg, (width, height), drawn.caption, described, panels)
 
 
 def _count_marks(artist: Any) -> int:

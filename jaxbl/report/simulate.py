@@ -7,7 +7,6 @@ from pandas import DataFrame
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.files import write_json, write_table
-from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
@@ -58,14 +57,17 @@ def describe_trial(trial: Trial) -> Result:
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
-    key_figures = []
-    for side in sides:
-        ratio = 1.0 if side == "motor" else trial.config.drive.gear_ratio
-        tolerance = f"{limits.velocity_tolerance / ratio:.3g}"
-        key_figures += [
-            _size(metrics, side, "velocity", "rad/s", f" (the largest may be {tolerance})"),
-            _size(metrics, side, "torque", "N m"),
-        ]
+    ratios = {"motor": 1.0, "load": getattr(trial.config.drive, "gear_ratio", 1.0)}
+    units = {"velocity": "rad/s", "torque": "N m"}
+    errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}
+    bounds = {(side, "velocity"): f"; the largest may be {limits.velocity_tolerance / ratios[side]:.3g}" for side in sides}
+    figures = [
+        KeyFigure(
+            "diverges" if error is None else f"{error:.3g} {units[key[1]]}",
+            f"{key[0]}: {key[1]} error, rms{bounds.get(key, '')}",
+        )
+        for key, error in errors.items()
+    ]
     rows = [
         [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
         for name, metric in SIDE_METRICS.items()
@@ -82,13 +84,7 @@ def describe_trial(trial: Trial) -> Result:
     judged = summary["conditions"].items()
     remarks += [conditions_line(side, gains, "the true bound along this run") for side, gains in judged]
     title = trial.config.title or "Run"
-    return Result(title, verdict, headline, key_figures, remarks, summary["remarks"], tables)
-
-
-def _size(metrics: JsonObject, side: str, quantity: str, unit: str, more: str = "") -> KeyFigure:
-    """The error of an estimate."""
-    error = metrics[f"{side}.{quantity}_rmse"]
-    return KeyFigure("diverges" if error is None else f"{error:.3g} {unit}", f"{side}: {quantity} error, rms{more}")
+    return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
 @style()

@@ -332,7 +332,6 @@ def describe_tuning(tuning: Tuning) -> Result:
         _gains_table(summary),
         *certificate_tables(summary),
         _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
-        _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
     ]
     title = tuning.config.title or "Gains"
     remarks = [*certified, *remarks] if is_refuted(summary) else [*remarks, *certified]
