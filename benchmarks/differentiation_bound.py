@@ -8,7 +8,7 @@ least :func:`least_exact_error`; :func:`adaptive_quotient` reaches it for N >= L
 References: R. Seeber, H. Haimovich, Optimal robust exact differentiation via linear adaptive techniques, Automatica 148
 (2023), for the question, for the continuous bound of exact differentiators, 2 sqrt(2 N L), and for a quotient over a time
 that adapts to the noise; E. Landau (1913) for |f'| <= 2 sqrt(N L) on a half line. The sampled forms and their proofs are
-our own (docs/theory.md).
+our own (docs/theory_appendix.md).
 """
 
 import math
@@ -151,8 +151,8 @@ def worst_signal(noise: float, slope: float, period: float, samples: int) -> Wor
 
     The largest f'(0) of all f with |f(-i T)| <= N for i = 0 ... samples and |f''| <= L. Signals f and -f may both give the
     reading zero throughout, so that whatever is made of these readings errs by f'(0) for one of them; and the set of signals
-    is convex and symmetric, for which no method errs more than that (docs/theory.md). The unknowns are f(0), f'(0) and
-    f'' in each period, constant there: the largest f'(0) is reached by such a signal.
+    is convex and symmetric, for which no method errs more than that (docs/theory_appendix.md). The unknowns are f(0), f'(0)
+    and f'' in each period, constant there: the largest f'(0) is reached by such a signal.
     """
     _check_bounds(noise, slope, period)
     if period <= 0.0 or samples < 1:

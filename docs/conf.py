@@ -24,7 +24,6 @@ include_patterns = [
     "README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
-    "benchmarks/NOTES.md",
     "docs/*.md",
 ]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]

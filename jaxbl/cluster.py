@@ -32,7 +32,7 @@ _POLL_SECONDS = 0.05
 """Time between two looks at which jobs have ended."""
 _AHEAD, _FEWEST_AHEAD = 4, 16
 """Jobs a worker, and in all at least, that the scheduler knows at once: workers never wait for the next one, and neither
-scheduler nor client grows with the number of jobs (docs/scale.md)."""
+scheduler nor client grows with the number of jobs (docs/speed.md)."""
 _COUNT_SECONDS = 2.0
 """Time between two counts of the workers."""
 _ONE_AT_A_TIME = Lock()

@@ -69,7 +69,8 @@ def test_api_has_every_public_name():
 def test_every_page_is_in_the_site():
     index = ROOT / "docs" / "index.md"
     listed = re.findall(r"^(?:\w+ <)?([\w./]+)>?$", index.read_text(encoding="utf-8"), re.M)
-    pages = {page.resolve().with_suffix("") for page in TEXTS}
+    # notes are for whoever changes the code
+    pages = {page.resolve().with_suffix("") for page in TEXTS if page.name != "NOTES.md"}
     assert {(index.parent / page).resolve() for page in listed} == pages - {index.with_suffix("")}
 
 

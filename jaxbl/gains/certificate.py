@@ -49,7 +49,7 @@ def certify(
 ) -> JsonObject:
     """Prove a velocity accuracy and a reaching time for gains, and look for a counterexample by adversarial runs.
 
-    Source: sets that the sampled error system cannot leave (:mod:`.invariant_set`, docs/theory.md).
+    Source: sets that the sampled error system cannot leave (:mod:`.invariant_set`, docs/theory_appendix.md).
 
     Args:
         lambda_: gain, rad^0.5/s.

@@ -13,7 +13,7 @@ r + l sqrt(r) + a = |b|. Explicit: u = a sign b and phi = -l sqrt|b| sign b.
 A set is a stack of rows: row k holds all g in [k, k + 1] dg and all e between bounds. At fixed b, e⁺ grows with e, so that a
 row's largest e⁺ follows from its upper bound in closed form; the lower ones are the mirror image. The image of a set is
 bounded by rows again, rounded outward: whatever the adversary does, the error lies in the image one sample later. An image
-inside of its set proves that the set is never left. The derivation is in docs/theory.md.
+inside of its set proves that the set is never left. The derivation is in docs/theory_appendix.md.
 """
 
 import math

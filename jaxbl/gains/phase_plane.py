@@ -55,8 +55,8 @@ def majorant(peak: float, lambda_: float, alpha: float, f_plus: float) -> tuple[
 def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 1001) -> tuple[np.ndarray, np.ndarray]:
     """The outermost path of (34) from e = 0 with slope 1 rad/s to e = 0 again: e (rad) and its slope (rad/s).
 
-    With y = sqrt(e) and a slope of p y, y sqrt(p^2 + lambda p + c) falls by exp(-(lambda / 2) arc) (docs/theory.md); c is
-    2 (alpha - f) on the way out and 2 (alpha + f) on the way back. It ends with the ratio of
+    With y = sqrt(e) and a slope of p y, y sqrt(p^2 + lambda p + c) falls by exp(-(lambda / 2) arc)
+    (docs/theory_appendix.md); c is 2 (alpha - f) on the way out and 2 (alpha + f) on the way back. It ends with the ratio of
     :func:`jaxbl.observer.conditions.peak_ratio`. Needs alpha > f.
     """
     half, size, es, slopes = 0.5 * lambda_, 1.0, [], []

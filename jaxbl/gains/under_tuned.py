@@ -3,7 +3,7 @@
 The error system is x1' = x2 - lambda sqrt|x1| sign x1, x2' = d(t) - alpha sign x1 - damping x2. Between two passages through
 x1 = 0 it makes a half cycle; a peak V is |x2| at such a passage. Unless said to be exact, what follows is to first order in
 the losses of a half cycle (lambda, damping) and, for :func:`peak_law`, in the change of d over one. Derived for this project
-(docs/theory.md), and checked against :func:`simulate_error`, which takes no such approximation.
+(docs/theory_appendix.md), and checked against :func:`simulate_error`, which takes no such approximation.
 """
 
 from bisect import bisect_right

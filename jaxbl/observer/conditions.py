@@ -65,7 +65,7 @@ def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
     1 / alpha if lambda^2 >= 4 alpha, else 2 / (lambda sqrt(2 alpha - lambda^2 / 4)), from which the form above follows.
 
     Reference: J. A. Moreno, M. Osorio, Strict Lyapunov functions for the super-twisting algorithm, IEEE Trans. Autom.
-    Control 57 (2012), for V and the inequality. The closed form is derived in docs/theory.md.
+    Control 57 (2012), for V and the inequality. The closed form is derived in docs/theory_appendix.md.
     """
     ratio = jnp.where(alpha > f_plus, f_plus / jnp.where(alpha > f_plus, alpha, 1.0), 0.0)
     # alpha - sqrt(alpha^2 - f^2) without cancellation
@@ -107,7 +107,7 @@ def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     rho = sqrt(c2 / c1) exp(-(lambda / 2) (I1 + I2)) with c1 = 2 (alpha - f), c2 = 2 (alpha + f) and, from 0 to infinity,
     I1 = int dp / (p^2 + lambda p + c1), I2 = int dp / (p^2 - lambda p + c2).
     rho is 0 if lambda^2 >= 4 c2, and `inf` if alpha <= f.
-    Source: derived for this project (docs/theory.md), checked against simulation.
+    Source: derived for this project (docs/theory_appendix.md), checked against simulation.
     """
     log_ratio = _log_peak_ratio(lambda_, alpha, f_plus)
     overdamped = lambda_**2 >= 8.0 * (alpha + f_plus)
@@ -311,7 +311,7 @@ def convergence_time_worst(
         f_plus: bound of the disturbance, rad/s^2.
         position_error, velocity_error: x1 and x2 at t = 0, rad and rad/s.
 
-    Source: derived for this project (docs/theory.md), checked against simulation.
+    Source: derived for this project (docs/theory_appendix.md), checked against simulation.
     """
     zero = jnp.zeros_like(jnp.asarray(lambda_ * alpha * f_plus * 1.0))
     ray = jax.lax.stop_gradient(slowest_ray(lambda_, alpha, f_plus))  # the time is stationary in it

@@ -5,8 +5,8 @@ n - 2 derivatives. With order 1 the disturbance is the switching term, as in the
 
 The scheme is backward Euler. Its own states z_i are backward differences in the sliding set, and thus lag behind derivatives
 by some periods. The states here are linear combinations of the z_i that are exact derivatives of a polynomial of degree n
-(docs/theory.md); R. Seeber, Proper implicit discretization of arbitrary-order robust exact differentiators (2024, arXiv
-2404.02770), calls such a discretisation proper.
+(docs/theory_appendix.md); R. Seeber, Proper implicit discretization of arbitrary-order robust exact differentiators (2024,
+arXiv 2404.02770), calls such a discretisation proper.
 
 References: A. Levant, Int. J. Control 76 (2003); coefficients of the non-recursive form: A. Levant, M. Livne, IEEE Trans.
 Autom. Control 65 (2020).

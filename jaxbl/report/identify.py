@@ -6,7 +6,7 @@ from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.search import is_noise
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines
-from jaxbl.result import Result, ResultTable
+from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import SIDES
 from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, percent, write_fit
@@ -37,12 +37,12 @@ def describe_identification(summary: JsonObject) -> Result:
         rows = [[name, *(sides[side] for side in SIDES)] for name, sides in method["recursive"].items()]
         columns = ["", *(f"by the {side}" for side in SIDES)]
         tables.append(ResultTable("Recursive identification, at the end of the log", columns, rows))
-    remarks = [*summary["warnings"], *_far_off(parameters), *_backlash(summary)]
+    remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
         remarks.append(_lacking(**lacks))
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
-    figures = number_figures(numbers)
+    figures = [*_backlash(summary), *number_figures(numbers)][:4]
     return lead_with_doubt(Result(title, verdict, headline, figures, remarks, _remarks(summary), tables))
 
 
@@ -68,19 +68,16 @@ def _lacking(equation: str, channel: str, share: float) -> str:
     return f"{percent(share)} of the torque left over on the {equation} goes with its {channel}: an effect is missing."
 
 
-def _backlash(summary: JsonObject) -> Lines:
+def _backlash(summary: JsonObject) -> list[KeyFigure]:
     """Say what a log without the load's encoder shows of a gap."""
     gap = summary.get("backlash")
     if gap is None:
         return []
     if not gap["shown"]:
-        return [f"No gap is shown: {gap['why']}."]
+        return [KeyFigure("No gap is shown", gap["why"])]
     unit, count = summary["residual"]["motor"]["unit"], gap["crossings"]
-    crossings = f"{count} crossing{'s' * (count != 1)}"
-    return [
-        f"There is a gap: a half gap of {gap['half_gap']:.4g} {unit} at the motor, from {crossings}; "
-        "without it the motor's readings cannot be met."
-    ]
+    meaning = f"half gap at the motor, from {count} crossings; without it its readings cannot be met"
+    return [KeyFigure(f"{gap['half_gap']:.4g} {unit}", meaning)]
 
 
 def _remarks(summary: JsonObject) -> Lines:

@@ -288,11 +288,7 @@ def choice_headline(summary: JsonObject) -> Lines:
     sides = points[0]["sides"]
     if len(points) > 1:
         return [line for side in sides for line in _map_lines(side, summary)]
-    lines = [_best_line(side, result, summary) for side, result in sides.items()]
-    if (kind := summary["for_both_sides"]) is not None:
-        times = ", ".join(f"{side} {result['kinds'][kind]['ratio']:.3g}" for side, result in sides.items())
-        lines.append(f"For both sides {kind} is chosen (gains.toml): times the best one's error, {times}.")
-    return lines
+    return [_best_line(side, result, summary) for side, result in sides.items()]
 
 
 def _best_line(side: str, result: JsonObject, summary: JsonObject) -> str:

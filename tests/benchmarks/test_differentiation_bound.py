@@ -101,7 +101,7 @@ def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_n
 
 
 def prove_bound(noise):
-    """The bound of the proof in docs/theory.md (T = L = 1): the larger one over all noises that the readings may show."""
+    """The bound proved in docs/theory_appendix.md (T = L = 1): the larger one over all noises that the readings may show."""
     periods = np.arange(1, int(4.0 * math.sqrt(noise)) + 10)
     worst = 0.0
     for shown_noise in np.linspace(0.0, noise, 1001):

@@ -92,7 +92,7 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
         cli.app, ["identify", str(path), "--model", "axis.toml", "--out", "out", "--next-experiment", "next.csv"]
     )
     assert called.exit_code == 0, called.output
-    assert "No gap is shown: without one the motor's readings are met as well" in called.stdout
+    assert "No gap is shown  without one the motor's readings are met as well" in called.stdout
     assert "To show a half gap of" in called.stdout
     assert "next.csv" in called.stdout
     content = json.loads((tmp_path / "out" / "identification.json").read_text())

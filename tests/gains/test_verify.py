@@ -31,7 +31,7 @@ GENERAL_CAUSES = {"several", "f_plus underestimated", "unexplained"}
 
 
 def exact_lambda(ratio):
-    """Least lambda at f_plus = 1 from the integrals of docs/theory.md."""
+    """Least lambda at f_plus = 1 from the integrals of docs/theory_appendix.md."""
     c1, c2 = 2.0 * (ratio - 1.0), 2.0 * (ratio + 1.0)
 
     def arc(lambda_, c):

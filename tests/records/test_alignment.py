@@ -5,7 +5,7 @@ import pytest
 from measured import NOMINAL, simulate_axis
 
 from jaxbl.records import NominalDrive, inspect, read_record
-from jaxbl.report.inspect import summary
+from jaxbl.report.inspect import describe_inspection
 
 
 @pytest.fixture
@@ -145,5 +145,5 @@ def test_a_screw_twists_in_radians(read_frame):
 
 def test_inspect_says_it_first(tmp_path):
     simulate_axis(3.04e-3, 0.379).to_parquet(tmp_path / "log.parquet")
-    lines = summary(inspect(tmp_path / "log.parquet", gear_ratio=20.0, nominal=NOMINAL))
+    lines = describe_inspection(inspect(tmp_path / "log.parquet", gear_ratio=20.0, nominal=NOMINAL)).remarks
     assert lines[0].startswith("theta_s is 3.0") and lines[1].startswith("theta_e - 20 theta_s is 0.37")

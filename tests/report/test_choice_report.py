@@ -12,7 +12,7 @@ from test_page import Page
 from jaxbl.gains.tune import tune
 from jaxbl.report.figures import save
 from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names
-from jaxbl.report.results import draw, write_report
+from jaxbl.report.results import describe, draw, write_report
 
 # points differ in values of lanes alone
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -62,11 +62,11 @@ def test_report_holds_lines_numbers_and_figures(report_folder):
 
 def test_sentences_have_the_numbers_of_the_summary(point_choice):
     motor = point_choice.summary["points"][0]["sides"]["motor"]
-    line, chosen_line = choice_headline(point_choice.summary)
+    (line,) = choice_headline(point_choice.summary)
     assert line.startswith(f"motor: {motor['best']} ")
     for kind, errors in list(motor["kinds"].items())[1:]:
         assert f"{kind} {errors['ratio']:.3g} ({errors['low']:.3g} to {errors['high']:.3g})" in line
-    assert point_choice.summary["for_both_sides"] in chosen_line
+    assert point_choice.summary["for_both_sides"] in describe(point_choice).headline
 
 
 def test_kinds_that_are_alike_are_said_first(point_choice):
