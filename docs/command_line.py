@@ -3,8 +3,10 @@
 The kernel of the tutorials begins with this file (`PYTHONSTARTUP`): there, `%%sh` runs its lines so.
 """
 
+import io
 import shlex
 import sys
+from contextlib import redirect_stdout
 
 
 def run_commands(text: str) -> None:
@@ -21,7 +23,14 @@ def run_commands(text: str) -> None:
                     raise
 
 
+def run_cell(line: str, cell: str) -> None:
+    """Print what the commands of a cell print without the colours that they give a kernel's output."""
+    with redirect_stdout(io.StringIO()) as printed:
+        run_commands(cell)
+    print(printed.getvalue(), end="")
+
+
 if __name__ == "__main__":
     from IPython import get_ipython
 
-    get_ipython().register_magic_function(lambda line, cell: run_commands(cell), "cell", "sh")
+    get_ipython().register_magic_function(run_cell, "cell", "sh")

@@ -69,10 +69,10 @@ def read_docstring(app, what, name, it, options, lines):
 
 
 def list_outdated_tutorials(app, env, added, changed, removed):
-    """Run the tutorials anew once the package has changed."""
+    """Run the tutorials anew once the package, or how their cells are run, has changed."""
     from study_directive import read_package
 
-    package = hashlib.sha256(read_package()).hexdigest()
+    package = hashlib.sha256(read_package() + (HERE / "command_line.py").read_bytes()).hexdigest()
     outdated = getattr(env, "tutorials_package", None) != package
     env.tutorials_package = package
     return [f"{HERE.name}/{name}" for name in TUTORIALS] if outdated else []
