@@ -10,9 +10,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395237, 2.09, 2.3, 2.72),
+    "all": (395216, 2.09, 2.3, 2.72),
     "report": (60763, 0.2, 1.17, 0.31),
-    "diagnosis": (60431, 9.06, 7.45, 8.68),
+    "diagnosis": (60410, 9.05, 7.43, 8.63),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
     "estimation": (34426, 7.36, 12.7, 15.66),

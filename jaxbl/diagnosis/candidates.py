@@ -118,6 +118,13 @@ def contains(general: str, name: str) -> bool:
     return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
 
 
+def is_finer_law(name: str) -> bool:
+    """Tell whether an effect is a finer law of the torque of its special case, as friction that bends is one of friction:
+    gravity is not one of a constant torque, which has another cause."""
+    words = set(name.partition(".")[2].split("_"))
+    return any(words.intersection(kind.split("_")) for kind in EFFECTS[name].special_cases)
+
+
 _AT_ONCE = 6
 """Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02

@@ -339,8 +339,12 @@ class EffectSearch:
             return Trial(tuple(new), fitted, self.gain(current, fitted))
         if old.keys() & gone:
             # it stood for the new ones: they are compared with the model that has neither
-            current = self.fits.fit({name: old[name] for name in old if name not in gone}, theta, current)
+            current = self._refit(current, {name: old[name] for name in old if name not in gone})
         return self._try(current, proposal._replace(numbers={name: new[name] for name in new if name not in gone}))
+
+    def _refit(self, current: FittedModel, numbers: EffectNumbers, *added: str) -> FittedModel:
+        """Fit a model with other effects, from the own numbers of one; `added`: those that are new there."""
+        return self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, added)
 
     def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
@@ -355,7 +359,7 @@ class EffectSearch:
                 fewer = None if certain else self._simplify(current, name)
                 if fewer is None and thorough:
                     numbers = {other: one for other, one in current.numbers.items() if other != name}
-                    less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
+                    less = self._refit(current, numbers)
                     gains[name] = self.gain(less, current)
                     kept = certain or gains[name].is_accepted
                     self._note(f"remove {name}", gains[name], not kept, gains[name].rule, loss=True)
@@ -390,7 +394,7 @@ class EffectSearch:
                 (plain if other == name else other): reduced(one) if other == name else one
                 for other, one in current.numbers.items()
             }
-            less = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current)
+            less = self._refit(current, numbers)
             gain = self.gain(less, current)
             self._note(f"replace {name} by {plain}", gain, not gain.is_accepted, gain.rule, loss=True)
             if not gain.is_accepted:
@@ -399,7 +403,7 @@ class EffectSearch:
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""
-        own, found = current.theta[: len(self.fits.prior)], []
+        found = list[Trial]()
         for trial in sorted(self._tried.get(name, []), key=lambda one: -one.gain.nats)[:2]:
             (other, *more) = trial.added
             if more or other in current.names or contains(other, name) or contains(name, other):
@@ -407,7 +411,7 @@ class EffectSearch:
             numbers = {effect: values for effect, values in current.numbers.items() if effect != name}
             if any(replaces(effect, other) or replaces(other, effect) for effect in numbers):
                 continue
-            fitted = self.fits.fit({**numbers, other: trial.fitted.numbers[other]}, own, current, (other,))
+            fitted = self._refit(current, {**numbers, other: trial.fitted.numbers[other]}, other)
             gain = self.gain(fitted, current)
             why = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
             self._note(f"replace {name} by {other}", gain, False, why, loss=True)
@@ -428,7 +432,7 @@ class EffectSearch:
         if not ranked:
             return []
         numbers = {**current.numbers, **ranked[0].numbers}
-        fitted = self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, (name,))
+        fitted = self._refit(current, numbers, name)
         gain = self.gain(fitted, current)
         self._note(f"{name} with other waves", gain, False, "what is better by the same rule stays", loss=True)
         return [Trial((name,), fitted, gain)]

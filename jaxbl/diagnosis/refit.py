@@ -28,7 +28,7 @@ from jaxbl.records.least_squares import BlockRegression
 from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
-from .candidates import ZERO_SPREAD, EffectNumbers
+from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import SILENT, Linear, Predictor
 from .neutral_effects import complete, lean
@@ -169,7 +169,7 @@ class _Fit:
         self.free, self.added = (*fits.free, *free), np.array(theta)
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
-        general = sum(bool(EFFECTS[name].special_cases) for name in numbers)
+        general = sum(is_finer_law(name) for name in numbers)
         self.log_odds = fits.log_odds + LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:

@@ -97,10 +97,6 @@ def _corner(smoothness: float) -> float:
     return min(smoothness ** (1.0 / 6.0), np.pi)
 
 
-def _period(segment: Segment) -> float:
-    return float(segment.time[-1] - segment.time[0]) / (len(segment) - 1)
-
-
 def _mean(spectrum: np.ndarray) -> float:
     """Variance of a real signal with a spectral density given from 0 to half the sampling rate."""
     return float(np.trapezoid(spectrum) / (len(spectrum) - 1))
@@ -239,7 +235,7 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
             pieces.append(
                 Residual(
                     side, segment.time, missing, np.sqrt(np.maximum(variance, tiny)),
-                    correlation / max(correlation[0], tiny), responses[side].corner / (2.0 * np.pi * _period(segment)),
+                    correlation / max(correlation[0], tiny), responses[side].corner / (2.0 * np.pi * segment.period),
                 )
             )  # fmt: skip
     return found
@@ -247,8 +243,9 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
 
 def _responses(segment: Segment) -> dict[str, _Response]:
     """Of each side's smoother, over as many frequencies as the slowest of them needs."""
-    period = _period(segment)
-    smoothness = {side: float(one.jerk) * period**5 / float(one.noise) ** 2 for side, one in segment.smoothed.items()}
+    smoothness = {
+        side: float(one.jerk) * segment.period**5 / float(one.noise) ** 2 for side, one in segment.smoothed.items()
+    }
     slowest = min(_corner(one) for one in smoothness.values())
     size = int(2 ** np.ceil(np.log2(64.0 * 2.0 * np.pi / slowest)))
     return {side: _response(one, min(max(size, 1024), _LARGEST)) for side, one in smoothness.items()}
@@ -273,7 +270,7 @@ def _noise(
     for name, smoothed in segment.smoothed.items():
         if name != side and not any(np.any(slope[name]) for slope in slopes):
             continue
-        gain = float(smoothed.noise) * _period(segment) ** -np.arange(3.0)[:, None] * responses[name].gain
+        gain = float(smoothed.noise) * segment.period ** -np.arange(3.0)[:, None] * responses[name].gain
         # deviations of the smoothed states, away from the ends and near them
         own = np.diagonal(np.asarray(smoothed.covariance), axis1=1, axis2=2).T
         near = own / np.median(own, axis=1)[:, None]

@@ -27,7 +27,9 @@ class Thresholds:
         default=-2.0,
     )  # fmt: skip
     general_odds: float = parameter(
-        "nats", "the same of a general effect over its special case: one to twenty", default=-3.0
+        "nats",
+        "the same of a finer law over the plain one, as of Stribeck friction over Coulomb: one to twenty",
+        default=-3.0,
     )
     effect_size: float = parameter(
         "driving torque", "prior size of an effect: a good part of the torque that drives the machine", default=0.3
