@@ -94,7 +94,7 @@ def oracle(case: Case) -> Mapping[str, float]:
         task = read_diagnosis_task(paths[0], case.model, holdout=other)
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = Choice(setup).search.fits.fit(case.truth["effects"], np.zeros(len(setup.own)))
+        fitted = Choice(setup).search.fits.fit(case.truth["effects"], np.zeros(len(setup.free)))
         return open_held_out(setup)[1].compare(fitted.experiment).errors
 
 

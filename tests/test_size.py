@@ -10,12 +10,12 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (395216, 2.09, 2.3, 2.72),
+    "all": (394262, 0.04, 0.3, 0.04),
     "report": (60763, 0.2, 1.17, 0.31),
-    "diagnosis": (60410, 9.05, 7.43, 8.63),
+    "diagnosis": (59532, 0.0, 0.0, 0.0),
     "records": (48514, 0.0, 0.0, 0.0),
     "gains": (39345, 0.0, 0.0, 0.0),
-    "estimation": (34426, 7.36, 12.7, 15.66),
+    "estimation": (34350, 0.0, 0.0, 0.0),
     "sweeps": (28654, 0.07, 0.0, 0.0),
     "exports": (22808, 0.02, 0.0, 0.0),
     "fused": (24223, 0.0, 0.0, 0.0),

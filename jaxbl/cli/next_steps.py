@@ -81,10 +81,10 @@ def after_identification(task: "LogTask", summary: JsonObject, log_call: "LogCal
 
 def after_diagnosis(task: "LogTask", summary: JsonObject, log_call: "LogCall") -> list[NextStep]:
     """Propose commands after a diagnosis. Arguments as for :func:`after_identification`."""
-    from jaxbl.diagnosis.diagnosis_summary import tied
+    from jaxbl.diagnosis.diagnosis_summary import find_tie
 
     steps, folder = _propose_gap_experiment(summary, log_call), log_call.folder
-    pair = None if "backlash" in summary or log_call.next_experiment else tied(summary)
+    pair = None if "backlash" in summary or log_call.next_experiment else find_tie(summary)
     if pair is not None:
         steps.append(log_call.propose_experiment(f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
     if summary["verdict"] == "no_discrepancy":

@@ -17,19 +17,21 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     otherwise: a ripple is seen in the torque, and hardly in windows of the position. Torques are referred to the input: a
     model that multiplies all of them, and the input, by one factor misses the same.
     """
-    both = (control, model)
+    pair = (control, model)
     # of fewer samples than blocks nothing can be said
-    channels = [name for name, one in control.samples.items() if not name.startswith("velocity") and one.size >= BLOCKS]
-    scales = [{name: each.gain if name.startswith("torque") else 1.0 for name in channels} for each in both]
-    floors = [log.noise_floor(each.torques) for each in both]
+    channels = [
+        name for name, errors in control.samples.items() if not name.startswith("velocity") and errors.size >= BLOCKS
+    ]
+    scales = [{name: comparison.gain if name.startswith("torque") else 1.0 for name in channels} for comparison in pair]
+    floors = [log.noise_floor(comparison.torques) for comparison in pair]
     noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}
     costs = [
-        np.array([mean_squares(each.samples[name], scale[name] * noise[name]) for name in channels])
-        for each, scale in zip(both, scales, strict=True)
+        np.array([mean_squares(comparison.samples[name], scale[name] * noise[name]) for name in channels])
+        for comparison, scale in zip(pair, scales, strict=True)
     ]
     together = standard_errors_between(*costs)
     by_channel = [standard_errors_between(*channel) for channel in zip(*costs, strict=True)]
-    return max(together, *by_channel) if -min(by_channel) < LIMITS.seen < max(by_channel) else together
+    return max(together, *by_channel) if -min(by_channel) < LIMITS.difference < max(by_channel) else together
 
 
 def mean_squares(errors: np.ndarray, noise: float | np.ndarray) -> np.ndarray:

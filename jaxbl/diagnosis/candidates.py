@@ -5,6 +5,9 @@ harmonics, Stribeck speed, limits, gaps, time constants) several values are trie
 the only number is of that kind, the effect at a trial value is taken as it is, and its slope gives the column.
 """
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 import dataclasses
 import itertools
 import math
@@ -39,7 +42,7 @@ class Part(eqx.Module):
         held: 1 where a side is not shown to move for a while, else 0.
         step: A, shape (samples, states, states).
         force: B, by torque on each side and by the input, shape (samples, states, sides + 1).
-        own: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
+        by_number: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
         defect: model's step less the smoothed one, shape (samples, states).
         weight: 1, or 0 where samples are padding.
         before: input before the first sample, N m, shape (earlier,); None where that is not known.
@@ -56,7 +59,7 @@ class Part(eqx.Module):
     held: SideSamples
     step: Float[Array, "samples states states"]
     force: Float[Array, "samples states inputs"]
-    own: Float[Array, "samples states numbers"]
+    by_number: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
     weight: Samples
     before: Float[Array, " earlier"] | None = None
@@ -101,15 +104,15 @@ def are_possible(effects: EffectNumbers, period: float) -> bool:
     )
 
 
-def replaces(by: str, name: str) -> bool:
+def replaces(other: str, name: str) -> bool:
     """Tell whether an effect gives way to another one: its special case, or of the same word at one place."""
-    return contains(by, name) or exclusive(by, [name])
+    return contains(other, name) or exclusive(other, [name])
 
 
-def exclusive(name: str, others: Iterable[str]) -> bool:
+def exclusive(name: str, names: Iterable[str]) -> bool:
     """Tell whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
     word, place = EFFECTS[name].exclusive, name.partition(".")[0]
-    return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
+    return word is not None and any(EFFECTS[other].exclusive == word and other.partition(".")[0] == place for other in names)
 
 
 def contains(general: str, name: str) -> bool:
@@ -139,32 +142,32 @@ _REACH = 4.0 * SPACING
 
 def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Candidate]:
     """Effects that a model lacks, variant by variant; `scales` of the log as an effect of a given name sees them."""
-    found: list[Candidate] = []
+    variants: list[Candidate] = []
     for name in lacking:
         log = scales(name)
         # without an input nothing acts on it
         if EFFECTS[name].suits(experiment.transmission) and (log.torque > 0.0 or not name.startswith("actuator.")):
-            found += _variants(name, log)
-    return found
+            variants += _variants(name, log)
+    return variants
 
 
 def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     """An effect at all values tried of the numbers that its torque is not proportional to."""
     roles = EFFECTS[name].roles()
-    tried = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
-    for values in itertools.product(*(roles[leaf].trials(log) for leaf in tried)):
-        known = dict(zip(tried, values, strict=True))
+    leaves = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
+    for values in itertools.product(*(roles[leaf].trials(log) for leaf in leaves)):
+        fixed = dict(zip(leaves, values, strict=True))
         if EFFECTS[name].sizes():
-            yield _proportional(name, known, log)
+            yield _proportional(name, fixed, log)
             continue
         # of one that remembers its input the first samples are the clearest mark on many a log; not where all that it
         # remembers is known
-        remembers = remembers_input(_effect(name, known)) and not EFFECTS[name].state_from_input
+        remembers = remembers_input(_effect(name, fixed)) and not EFFECTS[name].state_from_input
         for from_rest in (False, True) if remembers else (False,):
-            yield _trial(name, known, from_rest)
+            yield _trial(name, fixed, from_rest)
 
 
-def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
+def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:
     """An effect with sizes: a column for each direction of them, two a quarter turn apart where its phase is not known."""
     cls = EFFECTS[name]
     roles, directions = cls.roles(), cls.directions()
@@ -172,49 +175,52 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
     effects, sizes = [], []
     for direction in directions:
         (size,) = {float(next(iter(roles[leaf].trials(log)))) for leaf in direction}
-        numbers = dict.fromkeys(cls.sizes(), 0.0) | {leaf: size * share for leaf, share in direction.items()} | known
+        numbers = dict.fromkeys(cls.sizes(), 0.0) | {leaf: size * share for leaf, share in direction.items()} | fixed
         turns = [{}] if phase is None else [{phase: 0.0}, {phase: 0.5 * math.pi}]
         effects += [_effect(name, numbers | turn) for turn in turns]
         sizes += [size] * len(turns)
 
     def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
-        return {at: np.stack([torque[at] / size for torque, size in zip(torques, sizes, strict=True)]) for at in torques[0]}
+        return {
+            place: np.stack([torque[place] / size for torque, size in zip(torques, sizes, strict=True)])
+            for place in torques[0]
+        }
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         if phase is not None:
             sine, cosine = values
-            return {cls.sizes()[0]: math.hypot(sine, cosine)} | known | {phase: math.atan2(cosine, sine)}
+            return {cls.sizes()[0]: math.hypot(sine, cosine)} | fixed | {phase: math.atan2(cosine, sine)}
         numbers = dict.fromkeys(cls.sizes(), 0.0)
         for value, direction in zip(values, directions, strict=True):
             for leaf, share in direction.items():
                 numbers[leaf] += value * share
-        return numbers | known if cls.possible(numbers) else None
+        return numbers | fixed if cls.possible(numbers) else None
 
     return Candidate(name, len(effects), tuple(effects), columns, numbers_of, spread=ZERO_SPREAD if cls.in_log else 0.0)
 
 
-def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:
+def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
     """An effect without sizes: the first of its numbers about the value tried."""
-    leaf, value = next(iter(known.items()))
-    tried = tuple(_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+    leaf, value = next(iter(fixed.items()))
+    effects = tuple(_effect(name, fixed | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
 
     def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
-        below, tried, above = torques
-        return {at: np.stack([(above[at] - below[at]) / (2.0 * _STEP), tried[at]]) for at in tried}
+        below, middle, above = torques
+        return {place: np.stack([(above[place] - below[place]) / (2.0 * _STEP), middle[place]]) for place in middle}
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         (change,) = values
-        return known | {leaf: value * math.exp(change)} if abs(change) < _REACH else None
+        return fixed | {leaf: value * math.exp(change)} if abs(change) < _REACH else None
 
-    return Candidate(name, 1, tried, columns, numbers_of, offset=True, from_rest=from_rest)
+    return Candidate(name, 1, effects, columns, numbers_of, offset=True, from_rest=from_rest)
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return _made(name, *numbers.items())
+    return _make_cached(name, *numbers.items())
 
 
 @lru_cache(maxsize=4096)
-def _made(name: str, *numbers: tuple[str, float]) -> AbstractEffect:
+def _make_cached(name: str, *numbers: tuple[str, float]) -> AbstractEffect:
     """Screening after screening asks for the same ones."""
     return make_effect(name, **dict(numbers))
 
@@ -235,36 +241,36 @@ class Forces:
     def __init__(self, columns: Sequence[Torques]):
         """Put columns beside one another."""
         self.width, self.runs = 0, list[tuple[int, slice, np.ndarray]]()
-        for places, some in itertools.groupby(columns, key=tuple):
-            pieces = list(some)
-            each = {at: np.concatenate([np.atleast_2d(one[at]) for one in pieces]) for at in places}
-            here = slice(self.width, self.width + len(each[places[0]]))
-            self.runs += [(at, here, torques) for at, torques in each.items()]
+        for places, alike in itertools.groupby(columns, key=tuple):
+            pieces = list(alike)
+            joined = {place: np.concatenate([np.atleast_2d(piece[place]) for piece in pieces]) for place in places}
+            here = slice(self.width, self.width + len(joined[places[0]]))
+            self.runs += [(place, here, torques) for place, torques in joined.items()]
             self.width = here.stop
 
     def driving(self, force: np.ndarray, rows: slice) -> np.ndarray:
-        """What the columns add to states in some samples, shape (states, rows, columns); `force`: B there, shape
+        """Add up the columns' effect on the states in some samples, shape (states, rows, columns); `force`: B there, shape
         (rows, states, sides + 1)."""
         count, states, _ = force.shape
-        found = np.zeros((states, count, self.width))
-        for at, columns, torques in self.runs:
-            found[:, :, columns] += force[:, :, at].T[:, :, None] * torques[:, rows].T
-        return found
+        driven = np.zeros((states, count, self.width))
+        for place, columns, torques in self.runs:
+            driven[:, :, columns] += force[:, :, place].T[:, :, None] * torques[:, rows].T
+        return driven
 
     def squares(self, over: Mapping[int, float]) -> np.ndarray:
         """Sum of squares of each column, over those of a number for each place; shape (columns,)."""
-        found = np.zeros(self.width)
-        for at, columns, torques in self.runs:
-            found[columns] += np.einsum("ct,ct->c", torques, torques) / over[at] ** 2
-        return found
-
-    def on(self, at: int, samples: int) -> np.ndarray:
-        """All columns at one place, shape (columns, samples)."""
-        found = np.zeros((self.width, samples))
+        sums = np.zeros(self.width)
         for place, columns, torques in self.runs:
-            if place == at:
-                found[columns] = torques
-        return found
+            sums[columns] += np.einsum("ct,ct->c", torques, torques) / over[place] ** 2
+        return sums
+
+    def on(self, place: int, samples: int) -> np.ndarray:
+        """All columns at one place, shape (columns, samples)."""
+        rows = np.zeros((self.width, samples))
+        for other, columns, torques in self.runs:
+            if other == place:
+                rows[columns] = torques
+        return rows
 
 
 class MotionTorques:
@@ -274,23 +280,23 @@ class MotionTorques:
         """Prepare to ask for torques; `shared` keeps those that are the same for all models along the part."""
         self.experiment, self.part, self.shared = experiment, part, shared
         self.sides = experiment.sides
-        self.real = np.asarray(part.weight) > 0.0
+        self.real = part.weight > 0.0
         # what is behind them only fills up
         self.samples = int(np.sum(self.real))
-        self.torque = np.asarray(part.torque)
+        self.torque = part.torque
         # what torques along the motion need, of one shape whatever numbers are free
-        self.moving = dataclasses.replace(part, step=None, force=None, own=None, defect=None)
-        self.held = {side: (np.asarray(part.held[side]) > 0.0) & self.real for side in self.sides}
-        needed = _needed(experiment, self.moving) if any(one.any() for one in self.held.values()) else None
+        self.moving = dataclasses.replace(part, step=None, force=None, by_number=None, defect=None)
+        self.held = {side: (part.held[side] > 0.0) & self.real for side in self.sides}
+        needed = _find_needed(experiment, self.moving) if any(samples.any() for samples in self.held.values()) else None
         self.direction = {side: self._direction(side, needed) for side in self.sides}
         self.known: dict[Candidate, Torques] = {}
 
     def _direction(self, side: str, needed: Mapping[str, jax.Array] | None) -> np.ndarray:
         """Direction of motion of a side, between -1 and 1; where it stands still, of the torque that holds it (`needed`)."""
-        velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
+        velocity, deviation = self.part.velocity[side], self.part.deviation[side]
         period = float(self.part.time[1] - self.part.time[0])
         # the share of the time around a sample in forward motion less that in backward motion
-        step = np.maximum(np.abs(np.asarray(self.part.acceleration[side])) * period, np.finfo(float).tiny)
+        step = np.maximum(np.abs(self.part.acceleration[side]) * period, np.finfo(float).tiny)
         passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
         moving = passage * (2.0 - np.abs(passage))
         held = self.held[side]
@@ -308,59 +314,61 @@ class MotionTorques:
     def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[Torques]:
         """Torque that each effect adds, on top of what a model without it has. Before the first input known that one had
         lasted, or with `from_rest` nothing had happened."""
-        found: list[Torques] = [{}] * len(effects)
+        torques_of: list[Torques] = [{}] * len(effects)
         asked: dict[str, list[int]] = {}
         for i, effect in enumerate(effects):
-            known = self.shared.get(_key(effect, from_rest)) if self._shares(effect) else None
-            if known is None:
+            stored = self.shared.get(_key(effect, from_rest)) if self._shares(effect) else None
+            if stored is None:
                 asked.setdefault(effect.name, []).append(i)
             else:
-                found[i] = known
-        for name, which in asked.items():
-            place = self.experiment.drive.resolve_place(effects[which[0]].place)
+                torques_of[i] = stored
+        for name, indices in asked.items():
+            place = self.experiment.drive.resolve_place(effects[indices[0]].place)
             # of the model's own only those in the gear matter, and only for others there: one structure, and one program
-            gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
+            gear = [
+                other for other in self.experiment.effects if other.place == place == "transmission" and other.name != name
+            ]
             bare = with_effects(self.experiment, tuple(gear))
             # friction of the gear is on the motor's side; an effect on the input needs none
-            direction = np.asarray(self.direction.get("motor" if place == "transmission" else place, self.torque))
-            for first in range(0, len(which), _AT_ONCE):
-                some = which[first : first + _AT_ONCE]
+            direction = self.direction.get("motor" if place == "transmission" else place, self.torque)
+            for first in range(0, len(indices), _AT_ONCE):
+                batch = indices[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
-                spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
-                members = (*(effects[i] for i in some), *spare)
-                stack = jax.tree.map(lambda *x: np.array([float(one) for one in x]), *members)
+                spare = [effects[batch[-1]]] * (_AT_ONCE - len(batch))
+                members = (*(effects[i] for i in batch), *spare)
+                stack = jax.tree.map(lambda *x: np.array([float(leaf) for leaf in x]), *members)
                 torques = _torques(bare, stack, self.moving, direction, from_rest)
-                each = {at: np.asarray(one)[:, : self.samples] for at, one in torques.items()}
-                for row, i in enumerate(some):
-                    found[i] = {at: one[row] for at, one in each.items()}
+                rows = {side: np.asarray(torque)[:, : self.samples] for side, torque in torques.items()}
+                for k, i in enumerate(batch):
+                    torques_of[i] = {side: torque[k] for side, torque in rows.items()}
                     if self._shares(effects[i]):
-                        self.shared[_key(effects[i], from_rest)] = found[i]
-        return found
+                        self.shared[_key(effects[i], from_rest)] = torques_of[i]
+        return torques_of
 
     def _shares(self, effect: AbstractEffect) -> bool:
         """Tell whether the torque of an effect follows from motion and input alone: not in the gear, where the model has
         torques of its own; nor where the model says how it moves, or what holds it at rest."""
-        place, own = self.experiment.drive.resolve_place(effect.place), type(effect)
+        place, kind = self.experiment.drive.resolve_place(effect.place), type(effect)
         if place == "actuator":
             return True
         held = place in self.held and self.held[place].any()
         return place != "transmission" and not any(
-            getattr(own, hook) is not getattr(AbstractEffect, hook)
+            getattr(kind, hook) is not getattr(AbstractEffect, hook)
             for hook in ("added_inertia", *(("dry_friction", "holds") if held else ()))
         )
 
 
 def _key(effect: AbstractEffect, from_rest: bool) -> tuple:
-    return effect.name, from_rest, *(float(one) for one in jax.tree.leaves(effect))
+    return effect.name, from_rest, *(float(leaf) for leaf in jax.tree.leaves(effect))
 
 
 def columns_of(candidates: Sequence[Candidate], signals: MotionTorques) -> list[Torques]:
     """Columns of each candidate."""
     new = [candidate for candidate in candidates if candidate not in signals.known]
     for from_rest in (False, True):
-        some = [candidate for candidate in new if candidate.from_rest == from_rest]
-        torques = iter(signals.of([effect for candidate in some for effect in candidate.effects], from_rest))
-        for candidate in some:
+        alike = [candidate for candidate in new if candidate.from_rest == from_rest]
+        torques = iter(signals.of([effect for candidate in alike for effect in candidate.effects], from_rest))
+        for candidate in alike:
             signals.known[candidate] = candidate.columns(signals, [next(torques) for _ in candidate.effects])
     return [signals.known[candidate] for candidate in candidates]
 
@@ -379,14 +387,16 @@ def _torques(
     drive, sides = experiment.drive, experiment.sides
     along = Path(part.time, part.torque, part.position, part.velocity, before=part.before)
 
-    def one(effect: AbstractEffect) -> dict[int, jax.Array]:
+    def act(effect: AbstractEffect) -> dict[int, jax.Array]:
         place = drive.resolve_place(effect.place)
         if place == "transmission":
-            both = (experiment, with_effects(experiment, (*experiment.effects, effect)))
-            at = part.position, part.velocity
-            given = [(one.plant, effect_path(one, along)[0]) for one in both]
-            before, after = (plant.transmitted_torque(*at, states) for plant, states in given)
-            rubbed = [plant.gear_friction(states, c) for (plant, states), (c, _) in zip(given, (before, after), strict=True)]
+            models = (experiment, with_effects(experiment, (*experiment.effects, effect)))
+            motion = part.position, part.velocity
+            states_of = [(model.plant, effect_path(model, along)[0]) for model in models]
+            before, after = (plant.transmitted_torque(*motion, states) for plant, states in states_of)
+            rubbed = [
+                plant.gear_friction(states, c) for (plant, states), (c, _) in zip(states_of, (before, after), strict=True)
+            ]
             return {
                 0: before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction,
                 1: after[1] * after[0] - before[1] * before[0],
@@ -403,20 +413,20 @@ def _torques(
         resisting = resisting + effect.added_inertia() * part.modelled[place]
         return {sides.index(place): -resisting}
 
-    def whole(torque: jax.Array) -> jax.Array:
+    def fill(torque: jax.Array) -> jax.Array:
         return jnp.broadcast_to(torque, part.time.shape)
 
-    return jax.vmap(lambda effect: {at: whole(torque) for at, torque in one(effect).items()})(effects)
+    return jax.vmap(lambda effect: {place: fill(torque) for place, torque in act(effect).items()})(effects)
 
 
 @jit
-def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
+def _find_needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
     states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity, before=part.before))
     acting = plant.side_torques(part.position, part.velocity, states, torque, part.time)
-    found = {}
+    torques = {}
     for side in experiment.sides:
-        rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]
-        found[side] = jnp.broadcast_to(rest - plant.inertia(side) * part.acceleration[side], part.time.shape)
-    return found
+        remaining = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]
+        torques[side] = jnp.broadcast_to(remaining - plant.inertia(side) * part.acceleration[side], part.time.shape)
+    return torques

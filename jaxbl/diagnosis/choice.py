@@ -43,7 +43,7 @@ class Chosen(NamedTuple):
     """The model that stands.
 
     Attributes:
-        found: the explanation.
+        explanation: of the log.
         fitted: the model with it.
         compared: how it compares on the log, each quarter by numbers fitted without it.
         findings: its effects, and how sure they are.
@@ -53,7 +53,7 @@ class Chosen(NamedTuple):
         numbers_off: whether that is more than is stated of them.
     """
 
-    found: Explanation
+    explanation: Explanation
     fitted: FittedModel
     compared: Comparison
     findings: tuple[Finding, ...]
@@ -64,8 +64,8 @@ class Chosen(NamedTuple):
 
     @property
     def verdict(self) -> VerdictName:
-        """What the log alone says."""
-        if self.found.left > LIMITS.unknown:
+        """Verdict by the log alone."""
+        if self.explanation.largest_gain > LIMITS.unknown:
             return "unknown_effect"
         return "explained" if self.fitted.names else "no_discrepancy"
 
@@ -89,45 +89,45 @@ class Choice:
                 f"uncertainty.expected: '{name}' is no effect that is sought on this drive; it should be one of: "
                 f"{', '.join(sought)}"
             )
-        known = *stated.exact, *rotary
-        self.search = EffectSearch(setup.bare, setup.own, setup.prior.tolist(), self.log, known, stated.expected)
+        exact = *stated.exact, *rotary
+        self.search = EffectSearch(setup.bare, setup.free, setup.prior.tolist(), self.log, exact, stated.expected)
         self.before = self.log.compare(setup.nominal)
 
     def choose(self) -> Chosen:
         """Search for effects, and settle the numbers."""
-        found = self.search.run()
-        fitted, compared = found.fitted, self.search.compare(found.fitted)
-        if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.seen:
+        explanation = self.search.run()
+        fitted, compared = explanation.fitted, self.search.compare(explanation.fitted)
+        if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.difference:
             fitted, compared = self._as_given(fitted), self.before
-        findings = weigh(found)
-        fits, closest = self.search.fits, _closest(found)
-        numbers_off = fits is self.search.rough and fitted is found.fitted
-        return Chosen(found, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
+        findings = weigh(explanation)
+        fits, closest = self.search.fits, _closest(explanation)
+        numbers_off = fits is self.search.rough and fitted is explanation.fitted
+        return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
         fitted = chosen.fitted
-        whole, away = self.log.compare(fitted.experiment), np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
-        expected = expected_errors(self.log, fitted, whole, self.setup.input_noise, chosen.driving)
-        if np.max(away, initial=0.0) > LIMITS.far or not list_failed(self.log.with_slow(whole), expected):
+        compared, away = self.log.compare(fitted.experiment), np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
+        expected = expected_errors(self.log, fitted, compared, self.setup.input_noise, chosen.driving)
+        if np.max(away, initial=0.0) > LIMITS.far or not list_failed(self.log.with_slow(compared), expected):
             return None
         tables = tabulate(self.log, fitted.experiment, chosen.compared, lacking, self.setup.sliding)
-        z, why = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")
-        self.search.history.append(Step("add a table of what is left", None, z, tables is not None, why))
+        z, reason = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")
+        self.search.history.append(Step("add a table of what is left", None, z, tables is not None, reason))
         return tables
 
     def _as_given(self, fitted: FittedModel) -> FittedModel:
         """Return the model with the numbers that it came with."""
-        known = np.diag(self.setup.prior**2)
+        covariance = np.diag(self.setup.prior**2)
         # if nothing is missing, its numbers are off by as much as the fit says
         off = fitted.white + np.outer(fitted.theta, fitted.theta)
         return fitted._replace(
-            experiment=self.setup.nominal, theta=0.0 * fitted.theta, covariance=known, white=off, left_out=None
+            experiment=self.setup.nominal, theta=0.0 * fitted.theta, covariance=covariance, white=off, left_out=None
         )
 
 
-def _closest(found: Explanation) -> Rival | None:
+def _closest(explanation: Explanation) -> Rival | None:
     """Find the rival over which the effect in whose place it stands gains least."""
-    every = [trial for trials in found.rivals.values() for trial in trials if np.isfinite(trial.gain.nats)]
-    best = min(every, key=lambda trial: trial.gain.nats, default=None)
+    trials_of_all = [trial for trials in explanation.rivals.values() for trial in trials if np.isfinite(trial.gain.nats)]
+    best = min(trials_of_all, key=lambda trial: trial.gain.nats, default=None)
     return None if best is None else Rival(best.added[0], best.fitted)

@@ -35,22 +35,22 @@ class Finding(NamedTuple):
     alternatives: tuple[tuple[str, float], ...]
 
 
-def weigh(found: Explanation) -> tuple[Finding, ...]:
+def weigh(explanation: Explanation) -> tuple[Finding, ...]:
     """Weigh the effects that were found."""
-    return tuple(_weigh(found, name) for name in found.fitted.names)
+    return tuple(_weigh(explanation, name) for name in explanation.fitted.names)
 
 
-def _weigh(found: Explanation, name: str) -> Finding:
-    fitted = found.fitted
-    odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in found.rivals[name]}
+def _weigh(explanation: Explanation, name: str) -> Finding:
+    fitted = explanation.fitted
+    odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
     if (plain := special_case(fitted, name)) is not None:
         # as likely by the fit
         odds[plain] = 1.0
     total = 1.0 + sum(odds.values())
     # no surer than that its torque is not zero, nor than that it makes the model better by blocks
-    least = min(_certainty(fitted, name), float(ndtr(found.gains[name].standard_errors)))
-    others = sorted(((one, chance / total) for one, chance in odds.items()), key=lambda pair: -pair[1])
-    alternatives = tuple(pair for pair in others if pair[1] > LEAST_CHANCE)
+    least = min(_certainty(fitted, name), float(ndtr(explanation.gains[name].standard_errors)))
+    weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
+    alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
     return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)
 
 
@@ -71,8 +71,8 @@ def explained_share(experiment: Experiment, before: Errors, after: Errors, expec
     def beyond(errors: Errors) -> float:
         total = 0.0
         for side in experiment.sides:
-            one = expected[f"torque_{side}"]
-            more = errors[f"torque_{side}"] ** 2 - one.noise**2 - one.rounding**2
+            channel = expected[f"torque_{side}"]
+            more = errors[f"torque_{side}"] ** 2 - channel.noise**2 - channel.rounding**2
             total += max(more, 0.0) / float(experiment.drive.ratio(side)) ** 2
         return total
 

@@ -1,12 +1,15 @@
 """Coordinates of a log that a missing torque may depend on: speed, position, reversals, gap, load, time and others."""
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from jaxbl.estimation.regression import Kinematics, transmitted
+from jaxbl.estimation.regression import Kinematics, find_transmitted
 from jaxbl.estimation.segments import Segment
 from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
@@ -34,16 +37,18 @@ class CoordinateValues(NamedTuple):
     Attributes:
         values: a number a sample, or the index of its class.
         unit: of the number.
-        classes: names of the classes; empty for numbers.
         symbol: for sentences.
+        classes: names of the classes; empty for numbers.
     """
 
     values: np.ndarray
     unit: str = ""
-    classes: tuple[str, ...] = ()
     symbol: str = ""
+    classes: tuple[str, ...] = ()
 
 
+SideCoordinates = dict[str, list[dict[str, CoordinateValues]]]
+"""Coordinates by name along each side's residuals, segment by segment."""
 _ANGLES = {"motor": "θe", "load": "θs"}
 
 
@@ -56,15 +61,15 @@ def coordinates_of(
     """
     part, side = segment.kinematics, residual.name
     length, omega = ("m", "v") if side in sliding else ("rad", "ω")
-    velocity = np.asarray(part.velocity[side])
-    deviation = np.asarray(segment.smoothed[side].deviation(1))
+    velocity = part.velocity[side]
+    deviation = segment.smoothed[side].deviation(1)
     still = np.abs(velocity) <= np.maximum(_STILL * deviation, _STILL_SHARE * rms(velocity))
 
-    def position_of(one: str) -> CoordinateValues:
-        unit, symbol = ("m", "x") if one in sliding else ("rad", _ANGLES[one])
-        return CoordinateValues(np.asarray(part.position[one]), unit, symbol=symbol)
+    def position_of(place: str) -> CoordinateValues:
+        unit, symbol = ("m", "x") if place in sliding else ("rad", _ANGLES[place])
+        return CoordinateValues(part.position[place], unit, symbol)
 
-    found = {
+    coordinates = {
         EVERYWHERE: CoordinateValues(np.zeros(len(velocity), int), classes=("everywhere",)),
         "direction": CoordinateValues(
             np.where(still, 1, np.where(velocity > 0.0, 2, 0)), classes=("backward", "at rest", "forward"),
@@ -73,30 +78,30 @@ def coordinates_of(
     }  # fmt: skip
     geared = len(part.position) > 1 and experiment.transmission is not None
     if geared:
-        found |= _gear_classes(experiment, part)
-    found["|speed|"] = CoordinateValues(np.abs(velocity), f"{length}/s", symbol=f"|{omega}|")
-    found["speed"] = CoordinateValues(velocity, f"{length}/s", symbol=omega)
-    for one in [name for name in part.position if name in (side, "load") and name not in sliding]:
-        position = np.asarray(part.position[one])
+        coordinates |= _gear_classes(experiment, part)
+    coordinates["|speed|"] = CoordinateValues(np.abs(velocity), f"{length}/s", f"|{omega}|")
+    coordinates["speed"] = CoordinateValues(velocity, f"{length}/s", omega)
+    for place in [name for name in part.position if name in (side, "load") and name not in sliding]:
+        position = part.position[place]
         if (turned := within_turn(position)) is not None:
-            name = "turn" if one == side else f"{one} turn"
-            found[name] = CoordinateValues(turned, "rad", symbol=f"{_ANGLES[one]} mod 2π")
-    found["position"] = position_of(side)
+            name = "turn" if place == side else f"{place} turn"
+            coordinates[name] = CoordinateValues(turned, "rad", f"{_ANGLES[place]} mod 2π")
+    coordinates["position"] = position_of(side)
     if side != "load" and geared:
-        found["load position"] = position_of("load")
+        coordinates["load position"] = position_of("load")
     unit, force = ("m", "N") if "motor" in sliding else ("rad", "N m")
     if geared:
-        twist, rate = (_twist(experiment, one) for one in (part.position, part.velocity))
-        found["twist"] = CoordinateValues(twist, unit, symbol="z")
-        found["twist rate"] = CoordinateValues(rate, f"{unit}/s", symbol="ż")
+        twist, rate = (_twist(experiment, motion) for motion in (part.position, part.velocity))
+        coordinates["twist"] = CoordinateValues(twist, unit, "z")
+        coordinates["twist rate"] = CoordinateValues(rate, f"{unit}/s", "ż")
     if side == "motor":
-        found["input"] = CoordinateValues(np.asarray(part.torque), force, symbol="u")
+        coordinates["input"] = CoordinateValues(part.torque, force, "u")
     # the measured one's noise is the residual's, and would be found there
     width = np.sqrt(np.log(2.0)) / (2.0 * np.pi * residual.bandwidth / _SLOWER * residual.period)
-    acceleration = gaussian_filter1d(np.asarray(part.acceleration[side]), width)
-    found["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", symbol="a")
-    found["time"] = CoordinateValues(np.asarray(part.time), "s", symbol="t")
-    return found
+    acceleration = gaussian_filter1d(part.acceleration[side], width)
+    coordinates["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", "a")
+    coordinates["time"] = CoordinateValues(part.time, "s", "t")
+    return coordinates
 
 
 def within_turn(position: np.ndarray) -> np.ndarray | None:
@@ -109,36 +114,39 @@ def all_coordinates(
     segments: Sequence[Segment],
     residuals: SideResiduals,
     sliding: Collection[str],
-) -> dict[str, list[dict[str, CoordinateValues]]]:
+) -> SideCoordinates:
     """Those of each side's residuals (:func:`coordinates_of`), segment by segment."""
     return {
-        side: [coordinates_of(experiment, segment, one, sliding) for segment, one in zip(segments, pieces, strict=True)]
+        side: [
+            coordinates_of(experiment, segment, residual, sliding)
+            for segment, residual in zip(segments, pieces, strict=True)
+        ]
         for side, pieces in residuals.items()
     }
 
 
 def _twist(experiment: Experiment, values: Mapping[str, Any]) -> np.ndarray:
-    """Of positions, rad, or its rate, of velocities."""
-    return np.asarray(values["motor"]) - float(experiment.drive.ratio("load")) * np.asarray(values["load"])
+    """Twist by the positions, rad, or its rate by the velocities."""
+    return values["motor"] - float(experiment.drive.ratio("load")) * values["load"]
 
 
 def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, CoordinateValues]:
     """On which side of the gap the transmission is, and which way it is loaded."""
-    found, plant = {}, experiment.plant
-    torque = np.asarray(transmitted(experiment, part) if part.transmitted is None else part.transmitted)
+    classes, plant = {}, experiment.plant
+    torque = np.asarray(find_transmitted(experiment, part) if part.transmitted is None else part.transmitted)
     if plant.half_gap > 0.0:
         twist = _twist(experiment, part.position)
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
-        found["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
+        classes["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
     idle = np.abs(torque) < _IDLE * rms(torque)
     loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
-    found["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
-    return found
+    classes["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
+    return classes
 
 
 def _near_reversals(part: Kinematics, velocity: np.ndarray, still: np.ndarray, bandwidth: float) -> CoordinateValues:
-    """Whether the motion reverses nearby, and to which direction: near is what the low-pass smears, and some more."""
-    time = np.asarray(part.time)
+    """Tell where the motion reverses nearby, and to which direction: near is what the low-pass smears, and some more."""
+    time = part.time
     sign = np.where(still, 0.0, np.sign(velocity))
     moving = np.flatnonzero(sign)
     turning = np.flatnonzero(np.diff(sign[moving]))

@@ -13,6 +13,7 @@ import pandas as pd
 from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
+from jaxbl.estimation.free_parameters import free_values
 from jaxbl.estimation.logs import Logs, arrays, gains_for
 from jaxbl.estimation.segments import at_period
 from jaxbl.files import to_jsonable
@@ -24,11 +25,11 @@ from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_cou
 from .blocks import standard_errors_better
 from .choice import Choice, Chosen
 from .confidence import explained_share
-from .coordinates import CoordinateValues, all_coordinates
+from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
     contradictions_of,
+    describe_observers,
     extended_study,
-    observers_say,
     rival_tables,
     summarise_test,
     summary_of,
@@ -36,22 +37,21 @@ from .diagnosis_summary import (
     where_lacking,
 )
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
-from .fitted_model import free_values
 from .judgement import judge
 from .localise import Localised, localise
 from .motor_alone import diagnose_alone
 from .neutral_effects import without
 from .numbers_by_log import contradictions
-from .observer_residual import Observed, observed_torques
+from .observer_residual import SideObserved, observed_torques
 from .proof import Proof, prove
-from .residuals import Residual, SideResiduals, residual_torques
+from .residuals import Residual, SideResiduals
 from .setup import Setup, set_up
 from .thresholds import LIMITS
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a log says that a model lacks.
+    """A diagnosis of a model by a log.
 
     Attributes:
         config: the study, as given.
@@ -81,8 +81,8 @@ class Diagnosis:
     summary: JsonObject
     trace: pd.DataFrame
     residuals: SideResiduals
-    observed: dict[str, list[Observed]]
-    coordinates: dict[str, list[dict[str, CoordinateValues]]]
+    observed: SideObserved
+    coordinates: SideCoordinates
     located: dict[str, Localised]
     pairs: dict[str, list[tuple[Residual, Residual, bool]]]
     replays: bool
@@ -121,9 +121,9 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     done = make_stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
     with jax.enable_x64(True), limit_blas_threads():
         if alone:
-            found = diagnose_alone(task, done)
+            model, held_out, summary, trace = diagnose_alone(task, done)
             return Diagnosis(
-                task.config, found.model, task.record, found.holdout, to_jsonable(found.summary), found.trace,
+                task.config, model, task.record, held_out, to_jsonable(summary), trace,
                 {}, {}, {}, {}, {},
                 replays="excitation" in task.missing,
             )  # fmt: skip
@@ -134,14 +134,14 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         choice = Choice(setup)
         chosen = choice.choose()
         if chosen.verdict == "no_discrepancy":
-            _check_shown(setup, choice.search.fits.given.shown())
+            _check_input_shown(setup, choice.search.fits.given.find_input_significance())
         done()
-        fitted, lacking_after = chosen.fitted, residual_torques(chosen.fitted.experiment, setup.fitted.segments)
+        fitted, lacking_after = chosen.fitted, setup.fitted.find_lacking(chosen.fitted.experiment)
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
         tables = choice.tabulate(chosen, lacking_after)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
-        values = free_values(setup.own, fitted.theta) | gain_values
+        values = free_values(setup.free, fitted.theta) | gain_values
         model = extended_study(task.config, fitted.numbers, values, task.record, tables.effects() if tables else ())
         done()
         # the model stands; only now what was held out is read
@@ -153,14 +153,13 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         done()
         announce("running the observers")
         missing = _missing(setup, proof, chosen, lacking_after)
-        on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, proof.after.torques)
         observing = set_leaves(setup.bare, arrays(gain_values))
-        observed = _observed(setup, proof, observing)
+        observed = _run_observers(setup, proof, observing)
         trace = trace_of(setup, proof, missing, observed)
         done()
         summary = summary_of(setup, chosen, choice.search.history) | {"verdict": judgement.verdict, "explained_share": share}
-        about, notes = observers_say(observing, observed[0], setup)
-        for side, witness in about.items():
+        views, notes = describe_observers(observing, observed[0], setup)
+        for side, witness in views.items():
             summary["where"][side]["observed"] = witness
         summary["notes"] += notes
         summary["contradictions"] = contradictions_of(task.record, fitted, apart)
@@ -175,11 +174,14 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             better = standard_errors_better(proof.log, proof.after, with_tables)
             summary["torque_tables"] = tables.summarise(with_tables.errors, better)
         if chosen.rival is not None:
-            summary["rival"] = rival_tables(task.config, task.record, setup.own, chosen.rival)
+            summary["rival"] = rival_tables(task.config, task.record, setup.free, chosen.rival)
         done()
+    logs = [(proof.before.torques, proof.after.torques, True)]
+    if not task.separate:
+        logs.insert(0, (setup.lacking, lacking_after, False))
     pairs = {
-        side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]
-        for side in on_log
+        side: [(*pair, held_out) for before, after, held_out in logs for pair in zip(before[side], after[side], strict=True)]
+        for side in setup.lacking
     }
     return Diagnosis(
         task.config, model, task.record, proof.record, to_jsonable(summary), trace, setup.lacking, observed[0],
@@ -194,35 +196,29 @@ def _missing(
     """Torques that models lack on the log and on what was held out, by names of columns: the model as given, the one with
     the effects, that without each of them, and the one with another effect in place of one."""
     fitted = chosen.fitted
-    others = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
+    reduced = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
     if chosen.rival is not None:
-        others[f"missing_with.{chosen.rival.effect}"] = chosen.rival.fitted.experiment
+        reduced[f"missing_with.{chosen.rival.effect}"] = chosen.rival.fitted.experiment
     after = lacking_after, proof.after.torques
-    found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
-    for name, experiment in others.items():
-        held: SideResiduals = {}
+    missing = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
+    for name, experiment in reduced.items():
         # the trace has no samples of another log
-        if not setup.task.separate:
-            held = residual_torques(at_period(experiment, proof.log.period), proof.log.segments)
-        found[name] = residual_torques(experiment, setup.fitted.segments), held
-    return found
+        held_out = {} if setup.task.separate else proof.log.find_lacking(experiment)
+        missing[name] = setup.fitted.find_lacking(experiment), held_out
+    return missing
 
 
-def _paired(before: SideResiduals, after: SideResiduals) -> dict[str, list[tuple[Residual, Residual]]]:
-    return {side: list(zip(pieces, after[side], strict=True)) for side, pieces in before.items()}
-
-
-def _check_shown(setup: Setup, shown: float) -> None:
-    """Refuse to say that nothing is missing where noise hides everything; `shown`: standard deviations by which the log
+def _check_input_shown(setup: Setup, deviations: float) -> None:
+    """Refuse to say that nothing is missing where noise hides everything; `deviations`: standard deviations by which the log
     shows its input."""
-    if shown * LIMITS.effect_size >= LIMITS.significant:
+    if deviations * LIMITS.effect_size >= LIMITS.significant:
         return
     record = setup.task.record
     noise = ", ".join(
         f"{value:.2g} {record.statistics.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
         for side, value in setup.fitted.noise.items()
     )
-    least = LIMITS.significant / max(shown, 1e-12)
+    least = LIMITS.significant / max(deviations, 1e-12)
     raise InputError(
         f"{record.path}: noise hides everything: with readings as noisy as {noise}, no torque of less than "
         f"{100.0 * least:.0f} % of the input would be seen; noise {least / LIMITS.effect_size:.2g} times smaller, or "
@@ -230,11 +226,9 @@ def _check_shown(setup: Setup, shown: float) -> None:
     )
 
 
-def _observed(
-    setup: Setup, proof: Proof, nominal: Experiment
-) -> tuple[dict[str, list[Observed]], dict[str, list[Observed]]]:
-    """What the observers see on the log, and on what was held out of it; nothing is decided by it."""
-    held = {}
+def _run_observers(setup: Setup, proof: Proof, nominal: Experiment) -> tuple[SideObserved, SideObserved]:
+    """Run the observers on the log, and on what was held out of it; nothing is decided by it."""
+    held_out = {}
     if not setup.task.separate:
-        held = observed_torques(at_period(nominal, proof.log.period), proof.log.segments)
-    return observed_torques(nominal, setup.fitted.segments), held
+        held_out = observed_torques(at_period(nominal, proof.log.period), proof.log.segments)
+    return observed_torques(nominal, setup.fitted.segments), held_out

@@ -14,7 +14,7 @@ import pandas as pd
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
-from jaxbl.estimation.free_parameters import FreeParameter
+from jaxbl.estimation.free_parameters import FreeParameter, free_values
 from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
@@ -24,13 +24,13 @@ from .candidates import EffectNumbers, are_possible
 from .choice import Chosen, Rival
 from .confidence import Finding
 from .diagnosis_task import input_rms
-from .fitted_model import FittedModel, free_values
-from .history import Step
+from .fitted_model import FittedModel
+from .history import Step, describe_history
 from .judgement import Judgement
 from .localise import Localised
 from .neutral_effects import with_added
 from .numbers_by_log import Contradiction
-from .observer_residual import Observed, compared
+from .observer_residual import SideObserved, compare_observers
 from .proof import Proof
 from .residuals import SideResiduals
 from .sentences import sentence_of
@@ -41,18 +41,18 @@ from .thresholds import LIMITS
 def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObject:
     """Make the summary but for the proof, the verdict, and what the observers say."""
     task, record, located = setup.task, setup.task.record, setup.located
-    fitted, found = chosen.fitted, chosen.found
+    fitted, explanation = chosen.fitted, chosen.explanation
     where = where_lacking(record, located)
     values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
-    for one in chosen.findings:
-        if task.separate and EFFECTS[one.effect].in_time:
-            notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
+    for finding in chosen.findings:
+        if task.separate and EFFECTS[finding.effect].in_time:
+            notes.append(f"{finding.effect} is taken to run from the start of each log in the same way.")
     if chosen.verdict == "no_discrepancy":
-        for side, one in located.items():
-            least = LIMITS.significant * one.coordinates["all"].regions[0].mean_error
+        for side, place in located.items():
+            least = LIMITS.significant * place.coordinates["all"].regions[0].mean_error
             unit = record.unit_of(f"{side}.torque", "N m")
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     if (noise := setup.input_noise.unfelt) > 0.0:
@@ -68,26 +68,26 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
         # what has the larger torque matters more
         "findings": sorted(
             (
-                describe_finding(record, one, values, errors, where)
+                describe_finding(record, finding, values, errors, where)
                 | {
-                    "share": fitted.share(one.effect),
-                    "z": found.gains[one.effect].standard_errors,
-                    "in_log": EFFECTS[one.effect].in_log,
+                    "share": fitted.share(finding.effect),
+                    "z": explanation.gains[finding.effect].standard_errors,
+                    "in_log": EFFECTS[finding.effect].in_log,
                 }
-                for one in chosen.findings
+                for finding in chosen.findings
             ),
-            key=lambda one: -one["share"],
+            key=lambda finding: -finding["share"],
         ),
-        "parameters": describe_parameters(record, setup.own, values, errors),
+        "parameters": describe_parameters(record, setup.free, values, errors),
         "numbers_off": chosen.numbers_off,
         "where": where,
-        "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
-        "history": [step._asdict() for step in history],
+        "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in explanation.remainder.items()},
+        "history": describe_history(history),
         "notes": notes,
     }
 
 
-def describe_parameters(record: Record, own: Sequence[FreeParameter], values: Numbers, errors: Numbers) -> JsonObject:
+def describe_parameters(record: Record, free: Sequence[FreeParameter], values: Numbers, errors: Numbers) -> JsonObject:
     """Describe the model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
     return {
         number.path: {
@@ -96,29 +96,29 @@ def describe_parameters(record: Record, own: Sequence[FreeParameter], values: Nu
             "nominal": number.nominal,
             "unit": record.unit_of(number.path, number.unit),
         }
-        for number in own
+        for number in free
     }
 
 
-def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
+def describe_finding(record: Record, finding: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
     """Describe a finding but for its share and gain; values and standard errors by path, `where` by side."""
-    units = units_of(EFFECTS[one.effect])
+    units = units_of(EFFECTS[finding.effect])
     numbers = {
         leaf: {
-            "value": values.get(f"effects.{one.effect}.{leaf}", value),
-            "standard_error": errors.get(f"effects.{one.effect}.{leaf}", 0.0),
-            "unit": record.unit_of(f"{one.effect}.{leaf}", units[leaf]),
+            "value": values.get(f"effects.{finding.effect}.{leaf}", value),
+            "standard_error": errors.get(f"effects.{finding.effect}.{leaf}", 0.0),
+            "unit": record.unit_of(f"{finding.effect}.{leaf}", units[leaf]),
         }
-        for leaf, value in one.numbers.items()
+        for leaf, value in finding.numbers.items()
     }
-    place = one.effect.partition(".")[0]
+    place = finding.effect.partition(".")[0]
     side = "motor" if place == "actuator" else place
     sides = [side] if side in where else list(where)
     return {
-        "effect": one.effect,
-        "confidence": one.confidence,
+        "effect": finding.effect,
+        "confidence": finding.confidence,
         "parameters": numbers,
-        "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
+        "alternatives": [{"effect": name, "confidence": chance} for name, chance in finding.alternatives],
         "where": {"place": place, "sentences": {side: where[side]["sentence"] for side in sides}},
     }
 
@@ -126,7 +126,7 @@ def describe_finding(record: Record, one: Finding, values: Numbers, errors: Numb
 def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
     """Say what the held-out errors of a complete model would be, which of them are larger, and the control."""
     expected = proof.expected
-    before, after = (proof.log.with_slow(each) for each in (proof.before, proof.after))
+    before, after = (proof.log.with_slow(comparison) for comparison in (proof.before, proof.after))
     return {
         "expected": {name: error._asdict() for name, error in expected.items() if " below " not in name},
         "slow_torques": {
@@ -135,50 +135,51 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
             if " below " in name
         },
         "test": judgement.test,
-        "controls": {"wrong": {"effect": one.effect, "rmse": one.errors, "z": one.z}} if (one := proof.control) else {},
+        "controls": proof.controls,
     }
 
 
-def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contradiction]) -> list[JsonObject]:
+def contradictions_of(record: Record, fitted: FittedModel, contradictions: Sequence[Contradiction]) -> list[JsonObject]:
     """Numbers that two logs show to be different, in the log's units."""
-    units = {one.path: record.unit_of(one.path, one.unit) for one in fitted.free}
+    units = {number.path: record.unit_of(number.path, number.unit) for number in fitted.free}
     return [
         {
-            "parameter": one.path,
-            "unit": units[one.path],
-            "logs": [{"log": by.log, "value": by.value, "standard_error": by.error} for by in (one.least, one.most)],
+            "parameter": contradiction.path,
+            "unit": units[contradiction.path],
+            "logs": [
+                {"log": value.log, "value": value.value, "standard_error": value.error}
+                for value in (contradiction.least, contradiction.most)
+            ],
         }
-        for one in found
+        for contradiction in contradictions
     ]
 
 
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> JsonObject:
-    """Where a model lacks torque, by side, with sentences in the log's units."""
+    """Describe where a model lacks torque, by side, with sentences in the log's units."""
     return {
-        name: dataclasses.asdict(one) | {"sentence": sentence_of(one, record.unit_of(f"{name}.torque", "N m"))}
-        for name, one in located.items()
+        name: dataclasses.asdict(place) | {"sentence": sentence_of(place, record.unit_of(f"{name}.torque", "N m"))}
+        for name, place in located.items()
     }
 
 
-def observers_say(
-    nominal: Experiment, observed: Mapping[str, Sequence[Observed]], setup: Setup
-) -> tuple[JsonObject, list[str]]:
-    """What the observers of a model with their gains say of the torques that it lacks as given, by side, and notes where
-    they say nothing."""
-    found, notes = {}, []
+def describe_observers(nominal: Experiment, observed: SideObserved, setup: Setup) -> tuple[JsonObject, list[str]]:
+    """Compare the observers of a model, with their gains, to the torques that it lacks as given, by side; notes where they
+    say nothing."""
+    views, notes = {}, []
     for side, pieces in observed.items():
         gains = getattr(nominal.observer, side).gains()
-        found[side] = compared(nominal, pieces, setup.lacking[side], setup.fitted.bandwidth[side]) | {
+        views[side] = compare_observers(nominal, pieces, setup.lacking[side], setup.fitted.bandwidth[side]) | {
             "gains": gains,
             "time_constant": float(nominal.equivalent_control.time_constant),
         }
-        if not found[side]["converged"]:
+        if not views[side]["converged"]:
             listed = ", ".join(f"{key} = {value:.3g}" for key, value in gains.items())
             notes.append(
                 f"The {side}'s observer does not converge on this log ({listed}): its "
                 "equivalent control says nothing of the missing torque. The verdict does not use it."
             )
-    return found, notes
+    return views, notes
 
 
 def extended_study(
@@ -193,22 +194,26 @@ def extended_study(
     data = config.to_dict()
     if not are_possible(numbers, config.run.sample_period):
         data["run"] = data.get("run", {}) | run_of(config, record)
-    added = [*({"kind": name, **one} for name, one in numbers.items()), *tables]
-    data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
+    added = [*({"kind": name, **values_of} for name, values_of in numbers.items()), *tables]
+    data["effects"] = with_added(data.get("effects", []), added, lambda effect: effect["kind"])
     return with_values(read_config(data), values)
 
 
-def tied(summary: JsonObject) -> tuple[str, str] | None:
+def find_tie(summary: JsonObject) -> tuple[str, str] | None:
     """The finding that the rival stands for, and the rival; None where nothing is tied."""
     other = summary.get("rival", {}).get("effect")
-    found = (one["effect"] for one in summary["findings"] if other in [each["effect"] for each in one["alternatives"]])
-    name = next(found, None)
+    names = (
+        finding["effect"]
+        for finding in summary["findings"]
+        if other in [rival["effect"] for rival in finding["alternatives"]]
+    )
+    name = next(names, None)
     return None if name is None else (name, other)
 
 
-def rival_tables(config: Config, record: Record, own: Sequence[FreeParameter], rival: Rival) -> JsonObject:
+def rival_tables(config: Config, record: Record, free: Sequence[FreeParameter], rival: Rival) -> JsonObject:
     """The best model with another effect, as tables of a study."""
-    data = extended_study(config, rival.fitted.numbers, free_values(own, rival.fitted.theta), record).to_dict()
+    data = extended_study(config, rival.fitted.numbers, free_values(free, rival.fitted.theta), record).to_dict()
     return {"effect": rival.effect} | {key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data}
 
 
@@ -216,7 +221,7 @@ def trace_of(
     setup: Setup,
     proof: Proof,
     missing: Mapping[str, tuple[SideResiduals, SideResiduals]],
-    observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]],
+    observed: tuple[SideObserved, SideObserved],
 ) -> pd.DataFrame:
     """One row a sample of the log, its held-out part included; of another log that was held out there is nothing.
 
@@ -224,36 +229,38 @@ def trace_of(
     the observers.
     """
     task = setup.task
-    whole = task.record if task.separate else proof.record
-    columns: JsonObject = {"t": whole.time, "u": whole.torque}
-    columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
+    joined = task.record if task.separate else proof.record
+    columns: JsonObject = {"t": joined.time, "u": joined.torque}
+    columns |= {POSITION_CHANNELS[side]: joined.positions[side] for side in POSITION_CHANNELS if side in joined.positions}
     if setup.nominal.transmission is not None:
-        columns["twist"] = setup.nominal.plant.twist(whole.positions)
-    columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
+        columns["twist"] = setup.nominal.plant.twist(joined.positions)
+    columns["held_out"] = np.arange(len(joined.time)) >= len(task.record.time)
     logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(proof.record, proof.log.segments)])
     parts = [rows for record, _ in logs for rows in record.segments]
 
     def along(values: Iterable[Any]) -> np.ndarray:
-        column = np.full(len(whole.time), np.nan)
-        for rows, one in zip(parts, values, strict=True):
-            column[rows] = one
+        column = np.full(len(joined.time), np.nan)
+        for rows, piece in zip(parts, values, strict=True):
+            column[rows] = piece
         return column
 
     before, _ = missing["missing_before"]
     for side in before:
         for order, name in ((1, "velocity"), (2, "acceleration")):
-            columns[f"{side}.{name}"] = along(one.smoothed[side].state[:, order] for _, segments in logs for one in segments)
+            columns[f"{side}.{name}"] = along(
+                segment.smoothed[side].state[:, order] for _, segments in logs for segment in segments
+            )
         for name, torques in missing.items():
-            pieces = [one for torque in torques[: len(logs)] for one in torque[side]]
-            columns[f"{side}.{name}"] = along(one.torque for one in pieces)
+            pieces = [piece for torque in torques[: len(logs)] for piece in torque[side]]
+            columns[f"{side}.{name}"] = along(piece.torque for piece in pieces)
             if name == "missing_before":
-                columns[f"{side}.noise"] = along(one.deviation for one in pieces)
+                columns[f"{side}.noise"] = along(piece.deviation for piece in pieces)
     for side in observed[0]:
-        torque, noise = np.full((2, len(whole.time)), np.nan)
+        torque, noise = np.full((2, len(joined.time)), np.nan)
         for record, pieces in zip((task.record, proof.record), observed, strict=True):
-            for part, one in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
-                if one.converged:
-                    rows = slice(part.start + one.skipped, part.stop)
-                    torque[rows], noise[rows] = one.residual.torque, one.residual.deviation
+            for part, piece in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
+                if piece.has_converged:
+                    rows = slice(part.start + piece.skipped, part.stop)
+                    torque[rows], noise[rows] = piece.residual.torque, piece.residual.deviation
         columns |= {f"{side}.observed_before": torque, f"{side}.observed_noise": noise}
     return pd.DataFrame(columns)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxbl.config import ConfigSource, read_model
 from jaxbl.errors import InputError
 from jaxbl.estimation.logs import Logs, LogTask, SealedRecord, read_with_holdout
-from jaxbl.estimation.segments import led_in
+from jaxbl.estimation.segments import skip_unknown_input
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 from jaxbl.records.plausibility import GEAR_TOLERANCE
@@ -50,8 +50,8 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
         record, other = split_off_last_quarter(record)
     else:
         _check_machine(record, other)
-    rest = config.log.initial_state == "rest"
-    record, other = (led_in(_long(one), rest) for one in (record, other))
+    at_rest = config.log.initial_state == "rest"
+    record, other = (skip_unknown_input(_long(log), at_rest) for log in (record, other))
     return DiagnosisTask(config, missing, record, SealedRecord(other), holdout is not None)
 
 
@@ -74,31 +74,29 @@ def _long(record: Record) -> Record:
 
 def can_hold_out(record: Record) -> bool:
     """Tell whether a log is long enough for a quarter of it to be held out."""
-    return HELD_OUT * _count_samples(record) >= _LEAST_SAMPLES
+    return HELD_OUT * len(_list_rows(record)) >= _LEAST_SAMPLES
 
 
-def _count_samples(record: Record) -> int:
-    return sum(part.stop - part.start for part in record.segments)
+def _list_rows(record: Record) -> np.ndarray:
+    """List the rows of a log's segments."""
+    return np.concatenate([np.r_[part] for part in record.segments])
 
 
 def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
-    total = _count_samples(record)
-    left = round((1.0 - HELD_OUT) * total)
+    rows = _list_rows(record)
     if not can_hold_out(record):
         raise InputError(
-            f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
+            f"{record.path}: {len(rows)} samples are too few to hold a quarter of them out; at least "
             f"{int(np.ceil(_LEAST_SAMPLES / HELD_OUT))} are needed, or another log: --holdout"
         )
-    row = record.segments[-1].stop
-    for part in record.segments:
-        if left <= part.stop - part.start:
-            row = part.start + left
-            break
-        left -= part.stop - part.start
+    row = int(rows[round((1.0 - HELD_OUT) * len(rows)) - 1]) + 1
     first = tuple(slice(part.start, min(part.stop, row)) for part in record.segments if part.start < row)
     last = tuple(slice(max(part.start, row), part.stop) for part in record.segments if part.stop > row)
-    cut = {name: None if (one := getattr(record, name)) is None else one[:row] for name in ("time", "torque", "transmitted")}
+    cut = {
+        name: None if (values := getattr(record, name)) is None else values[:row]
+        for name in ("time", "torque", "transmitted")
+    }
     positions = {side: values[:row] for side, values in record.positions.items()}
     # times count from the log's first sample in both: a disturbance may be periodic in time
     return replace(record, **cut, positions=positions, segments=first), replace(record, segments=last)
@@ -113,19 +111,24 @@ def _check_machine(record: Record, other: Record) -> None:
             f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
             f"set [log] resample = {record.sample_period:.6g} to read both at the same period"
         )
-    gears = record.statistics.gearing, other.statistics.gearing
-    if gears[0] is not None and gears[1] is not None and not (gears[0].is_loose or gears[1].is_loose):
-        ratios = gears[0].ratio, gears[1].ratio
-        clear = all(one.residual < _LOOSE for one in gears if one is not None)
-        if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
-            raise InputError(
-                f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
-                "is of another machine, or a sign or unit differs"
-            )
+    ratios = [
+        gear.ratio
+        for gear in (record.statistics.gearing, other.statistics.gearing)
+        if gear is not None and not gear.is_loose and gear.residual < _LOOSE
+    ]
+    if len(ratios) == 2 and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
+        raise InputError(
+            f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
+            "is of another machine, or a sign or unit differs"
+        )
     inertias = []
-    for one in (record.statistics.dynamics, other.statistics.dynamics):
-        if one is not None and one.shares[0] > _SHOWN and _KNOWN * one.errors[0] * one.inflation[0] < abs(one.values[0]):
-            inertias.append(float(one.values[0]))
+    for dynamics in (record.statistics.dynamics, other.statistics.dynamics):
+        if (
+            dynamics is not None
+            and dynamics.shares[0] > _SHOWN
+            and _KNOWN * dynamics.errors[0] * dynamics.inflation[0] < abs(dynamics.values[0])
+        ):
+            inertias.append(float(dynamics.values[0]))
     if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:
         raise InputError(
             f"{other.path}: shows an inertia of {inertias[1]:.3g}, {record.path} of {inertias[0]:.3g} at the motor; it is "

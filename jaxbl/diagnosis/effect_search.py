@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.estimation.free_parameters import FreeParameter
+from jaxbl.records.least_squares import column_rms
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
@@ -27,7 +28,7 @@ from .fitted_model import FittedModel
 from .free_functions import functions_of
 from .history import Step, describe_change
 from .linearised_model import Linear, Predictor
-from .neutral_effects import candidates, corrected
+from .neutral_effects import candidates, find_corrected
 from .reference_log import Comparison, ReferenceLog
 from .refit import ModelFits, owner_of
 from .thresholds import LIMITS
@@ -75,7 +76,7 @@ class Gain(NamedTuple):
 
     @property
     def rule(self) -> str:
-        """What is asked of it."""
+        """Say what is asked of it."""
         return f"nats above 0 and {self.asked:.2g} standard errors are asked"
 
 
@@ -110,25 +111,25 @@ class _Proposal(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """What a log says that a model lacks.
+    """The effects that a model lacks by a log.
 
     Attributes:
         fitted: the model with the effects that were found.
         gains: over the model without an effect, by effect.
         rivals: models with another effect in place of one of these, and what the found one gains over each, by effect.
-        rest: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size among
-            those tried, as a share of the driving torque.
+        remainder: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size
+            among those tried, as a share of the driving torque.
     """
 
     fitted: FittedModel
     gains: dict[str, Gain]
     rivals: dict[str, list[Trial]]
-    rest: dict[str, tuple[float, float]]
+    remainder: dict[str, tuple[float, float]]
 
     @property
-    def left(self) -> float:
+    def largest_gain(self) -> float:
         """Largest gain of the free functions that are large enough for an effect, nats."""
-        return max((gain for gain, share in self.rest.values() if share > LIMITS.least_torque), default=0.0)
+        return max((gain for gain, share in self.remainder.values() if share > LIMITS.least_torque), default=0.0)
 
 
 class EffectSearch:
@@ -156,7 +157,7 @@ class EffectSearch:
         self.fits = self.stated = ModelFits(experiment, free, stated, log.segments)
         rough = np.hypot(stated, LIMITS.number_error)
         self.rough = ModelFits(experiment, free, rough, log.segments, LIMITS.effect_odds)
-        self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
+        self.lacking = [name for name in candidates(experiment) if name not in exact and find_corrected(name) not in exact]
         self.floor = LIMITS.noise_structure * sum(map(len, log.segments)) * len(experiment.sides)
         self.history: list[Step] = []
         self._compared: dict[tuple, Comparison] = {}
@@ -181,16 +182,16 @@ class EffectSearch:
         if not self._is_possible(before):
             return Gain(np.inf, np.inf, asked)
         assert before.foretold is not None and after.foretold is not None
-        size = np.sqrt(np.mean(after.foretold**2, axis=0))
-        foretold = standard_errors_between(*(mean_squares(each.foretold, size) for each in (before, after)))  # type: ignore
+        size = column_rms(after.foretold)
+        foretold = standard_errors_between(*(mean_squares(model.foretold, size) for model in (before, after)))  # type: ignore
         simulated = standard_errors_better(self.log, self.compare(before), self.compare(after))
         least, most = sorted((foretold, simulated))
         # what is known of the model's own numbers counts, but for what two standard deviations explain
         count = len(self.stated.prior)
         moved = [float(np.sum((model.theta[:count] / model.linear.prior[:count]) ** 2)) for model in (before, after)]
         beyond = float(np.sqrt(max(moved[0] - moved[1] - LIMITS.sure**2, 0.0)))
-        shown = (most if least > -LIMITS.sure else least) + beyond
-        return Gain(after.log_evidence - before.log_evidence, shown, asked)
+        margin = (most if least > -LIMITS.sure else least) + beyond
+        return Gain(after.log_evidence - before.log_evidence, margin, asked)
 
     def _is_possible(self, fitted: FittedModel) -> bool:
         """Tell whether a model can be simulated, and each of its effects has a torque that counts."""
@@ -204,22 +205,23 @@ class EffectSearch:
 
     def run(self) -> Explanation:
         """Find what is missing."""
-        found = self._explain(self._begin())
-        if self.fits is self.rough and self.passed_by is not None and not found.left > LIMITS.unknown:
+        explanation = self._explain(self._begin())
+        if self.fits is self.rough and self.passed_by is not None and not explanation.largest_gain > LIMITS.unknown:
             # a few effects may be likelier than numbers that are all off
             self.fits = self.stated
-            others = self._explain(self.passed_by)
-            nats = others.fitted.log_evidence - found.fitted.log_evidence
+            by_effects = self._explain(self.passed_by)
+            nats = by_effects.fitted.log_evidence - explanation.fitted.log_evidence
             self._note("effects in place of numbers that are off", Gain(nats, np.nan), nats > 0.0, "the likelier ones stay")
             if nats > 0.0:
-                found = others
+                explanation = by_effects
             else:
                 self.fits = self.rough
+        remaining = explanation.largest_gain
         self._note(
-            "fit free functions to what remains", Gain(found.left, np.nan), bool(found.left > LIMITS.unknown),
-            f"a free function still gains {found.left:.3g} nats; {LIMITS.unknown:g} show something unknown",
+            "fit free functions to what remains", Gain(remaining, np.nan), bool(remaining > LIMITS.unknown),
+            f"a free function still gains {remaining:.3g} nats; {LIMITS.unknown:g} show something unknown",
         )  # fmt: skip
-        return found
+        return explanation
 
     def _explain(self, current: FittedModel) -> Explanation:
         """Add, replace and take out effects until nothing is accepted."""
@@ -262,12 +264,12 @@ class EffectSearch:
             else:
                 self.lacking.remove(name)
             trial = self._try(current, proposals[0])
-            kept, why = self._is_possible(trial.fitted), "known to act"
+            stays, reason = self._is_possible(trial.fitted), "known to act"
             if name not in self.expected:
-                kept = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
-                why = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
-            self._note(f"add {name}", trial.gain, kept, why)
-            current = trial.fitted if kept else current
+                stays = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
+                reason = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
+            self._note(f"add {name}", trial.gain, stays, reason)
+            current = trial.fitted if stays else current
         return current
 
     def _identify(self, fitted: FittedModel) -> tuple[bool, frozenset[tuple]]:
@@ -284,9 +286,9 @@ class EffectSearch:
         if self.fits is self.stated and self.passed_by is None:
             fitted = self._try_numbers(current, 0.0 if best is None else best.worth)
         for trial in trials:
-            kept = trial is best and fitted is None
-            why = "most likely" if kept else "less likely" if trial in accepted else trial.gain.rule
-            self._note(describe_change(current.numbers, trial.fitted.numbers), trial.gain, kept, why)
+            is_best = trial is best and fitted is None
+            reason = "most likely" if is_best else "less likely" if trial in accepted else trial.gain.rule
+            self._note(describe_change(current.numbers, trial.fitted.numbers), trial.gain, is_best, reason)
         if fitted is not None:
             return fitted
         if best is None:
@@ -313,11 +315,13 @@ class EffectSearch:
         best = trial if trial.gain.is_accepted and trial.worth > worth else None
         if best is not None:
             # it may be one of the numbers alone
-            others = [name for name in self.lacking if current.linear.same(name) is not None and name not in current.names]
-            singles = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in others]
-            best = max([trial, *(single for single in singles if single.gain.is_accepted)], key=lambda each: each.worth)
-        why = "most likely" if best is trial else "less likely" if trial.gain.is_accepted else trial.gain.rule
-        self._note("let all numbers be further off than stated", trial.gain, best is trial, why)
+            corrections = [
+                name for name in self.lacking if current.linear.same(name) is not None and name not in current.names
+            ]
+            singles = [self._try(current, _Proposal({name: EFFECTS[name].neutral()})) for name in corrections]
+            best = max([trial, *(single for single in singles if single.gain.is_accepted)], key=lambda single: single.worth)
+        reason = "most likely" if best is trial else "less likely" if trial.gain.is_accepted else trial.gain.rule
+        self._note("let all numbers be further off than stated", trial.gain, best is trial, reason)
         if best is trial:
             self.fits, self.passed_by = self.rough, current
         elif best is not None:
@@ -327,7 +331,7 @@ class EffectSearch:
     def _try(self, current: FittedModel, proposal: _Proposal) -> Trial:
         """Put more effects into a model, in place of those that cannot stand beside them."""
         new, theta = proposal.numbers, current.theta[: len(self.fits.prior)]
-        old = {name: numbers for name, numbers in current.numbers.items() if not any(replaces(by, name) for by in new)}
+        old = {name: numbers for name, numbers in current.numbers.items() if not any(replaces(other, name) for other in new)}
         announce(f"trying {' + '.join([*old, *new])}")
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
         fitted = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
@@ -358,12 +362,12 @@ class EffectSearch:
                 certain = name in self.expected
                 fewer = None if certain else self._simplify(current, name)
                 if fewer is None and thorough:
-                    numbers = {other: one for other, one in current.numbers.items() if other != name}
+                    numbers = {other: values for other, values in current.numbers.items() if other != name}
                     less = self._refit(current, numbers)
                     gains[name] = self.gain(less, current)
-                    kept = certain or gains[name].is_accepted
-                    self._note(f"remove {name}", gains[name], not kept, gains[name].rule, loss=True)
-                    fewer = None if kept else less
+                    stays = certain or gains[name].is_accepted
+                    self._note(f"remove {name}", gains[name], not stays, gains[name].rule, loss=True)
+                    fewer = None if stays else less
                 if fewer is not None:
                     current = fewer
                     break
@@ -391,8 +395,8 @@ class EffectSearch:
             if plain not in self.lacking or plain in current.names:
                 continue
             numbers = {
-                (plain if other == name else other): reduced(one) if other == name else one
-                for other, one in current.numbers.items()
+                (plain if other == name else other): reduced(values) if other == name else values
+                for other, values in current.numbers.items()
             }
             less = self._refit(current, numbers)
             gain = self.gain(less, current)
@@ -403,8 +407,8 @@ class EffectSearch:
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""
-        found = list[Trial]()
-        for trial in sorted(self._tried.get(name, []), key=lambda one: -one.gain.nats)[:2]:
+        rivals = list[Trial]()
+        for trial in sorted(self._tried.get(name, []), key=lambda trial: -trial.gain.nats)[:2]:
             (other, *more) = trial.added
             if more or other in current.names or contains(other, name) or contains(name, other):
                 continue
@@ -413,10 +417,10 @@ class EffectSearch:
                 continue
             fitted = self._refit(current, {**numbers, other: trial.fitted.numbers[other]}, other)
             gain = self.gain(fitted, current)
-            why = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
-            self._note(f"replace {name} by {other}", gain, False, why, loss=True)
-            found.append(trial._replace(fitted=fitted, gain=gain))
-        return found
+            reason = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
+            self._note(f"replace {name} by {other}", gain, False, reason, loss=True)
+            rivals.append(trial._replace(fitted=fitted, gain=gain))
+        return rivals
 
     def _change_waves(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit a model with the likeliest other waves of an effect, if it has any: a fit leaves whole numbers as they are."""
@@ -437,9 +441,9 @@ class EffectSearch:
         self._note(f"{name} with other waves", gain, False, "what is better by the same rule stays", loss=True)
         return [Trial((name,), fitted, gain)]
 
-    def _note(self, tried: str, gain: Gain, kept: bool, why: str, *, loss: bool = False) -> None:
-        nats, z = (-one if loss else one for one in gain[:2])
-        self.history.append(Step(tried, nats, None if np.isnan(z) else z, kept, why))
+    def _note(self, change: str, gain: Gain, accepted: bool, reason: str, *, loss: bool = False) -> None:
+        nats, z = (-number if loss else number for number in gain[:2])
+        self.history.append(Step(change, nats, None if np.isnan(z) else z, accepted, reason))
 
     # ---- proposals ----
 
@@ -457,15 +461,15 @@ class EffectSearch:
         ranked = self._rank(linear, current.names, variants, predictor)
         if ranked:
             # a predictor chosen without an effect makes up for it
-            leaders = [linear.choose([one.variant]) for one in ranked[:_LEADERS] if one.variant is not None]
-            predictor = min(leaders, key=lambda one: float(np.sum(np.log(one.deviation))))
+            leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS] if proposal.variant is not None]
+            predictor = min(leaders, key=lambda leader: np.sum(np.log(leader.deviation)))
             ranked = self._rank(linear, current.names, variants, predictor)
         promised = {next(iter(proposal.numbers)): proposal for proposal in ranked[:_PROPOSED]}
         by_torque = regression.propose()[:_BY_TORQUE]
-        shown = [
+        additional = [
             effect for effect in by_torque if effect.name not in promised and effect.share > _PROMISING * by_torque[0].share
         ]
-        shares = {effect.name: effect.share for effect in shown}
+        shares = {effect.name: effect.share for effect in additional}
         proposals = [
             proposal
             for name, proposal in promised.items()
@@ -476,7 +480,7 @@ class EffectSearch:
         ]
         proposals += [
             _Proposal({effect.name: effect.numbers})
-            for effect in shown
+            for effect in additional
             if not any(contains(effect.name, other) and effect.share < share + SHOWN for other, share in shares.items())
         ]
         together = regression.propose_together()
@@ -487,10 +491,10 @@ class EffectSearch:
     def _regress(self, linear: Linear, current: FittedModel, variants: Sequence[Candidate]) -> TorqueRegression:
         """Prepare the regression on what a model lacks; errors of numbers that may change take part, and are no finding."""
         free = {name for name in self.lacking if linear.same(name) is not None and linear.nominal(name) is not None}
-        base = [one for one in variants if one.name in free]
+        base = [variant for variant in variants if variant.name in free]
         # the recorded input is what is explained
-        others = [one for one in variants if one.name not in free and not one.name.startswith("actuator.")]
-        return TorqueRegression(linear, current.names, self.compare(current).torques, self.log, base, others)
+        tested = [variant for variant in variants if variant.name not in free and not variant.name.startswith("actuator.")]
+        return TorqueRegression(linear, current.names, self.compare(current).torques, self.log, base, tested)
 
     def _rank(
         self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor, least: float = 0.0
@@ -505,20 +509,20 @@ class EffectSearch:
         best: dict[str, _Proposal] = {}
         for i, variant in enumerate(variants):
             gone = [name for name in names if name == variant.name or replaces(variant.name, name)]
-            found = evidence_of(_without(columns, linear, gone) if gone else columns, variants, i)
-            if found is not None:
-                nats = self._nats(linear, base, found) - linear.choices(variant.name)
+            evidence = evidence_of(_without(columns, linear, gone) if gone else columns, variants, i)
+            if evidence is not None:
+                nats = self._nats(linear, base, evidence) - linear.choices(variant.name)
                 if nats > (best[variant.name].nats if variant.name in best else least):
                     best[variant.name] = _Proposal(
-                        {variant.name: found.numbers}, found.own[: len(self.fits.prior)], nats, variant
+                        {variant.name: evidence.numbers}, evidence.own_change[: len(self.fits.prior)], nats, variant
                     )
         return sorted(best.values(), key=lambda proposal: -proposal.nats)
 
-    def _nats(self, linear: Linear, base: Evidence, found: Evidence) -> float:
+    def _nats(self, linear: Linear, base: Evidence, evidence: Evidence) -> float:
         """Tell the gain in evidence where the size of errors is not known."""
         errors = linear.count * len(linear.sides)
-        explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(found.misfit, 1e-300)))
-        return found.log_evidence - base.log_evidence + 0.5 * (found.misfit - base.misfit) + explained
+        explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(evidence.misfit, 1e-300)))
+        return evidence.log_evidence - base.log_evidence + 0.5 * (evidence.misfit - base.misfit) + explained
 
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
         """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
@@ -526,17 +530,17 @@ class EffectSearch:
         predictor, functions = linear.choose(()), functions_of(linear.signals)
         columns = linear.columns(functions, predictor.smoothness, predictor.deviation)
         gained = {}
-        for i, one in enumerate(functions):
+        for i, function in enumerate(functions):
             best = (-np.inf, 0.0)
             for size in _SIZES:
                 scale = columns.scale.copy()
                 scale[list(columns.places[i])] *= size
                 sized = dataclasses.replace(columns, scale=scale)
-                none, some = evidence_of(sized), evidence_of(sized, functions, i)
-                assert none is not None and some is not None
-                nats = self._nats(linear, none, some)
+                none, with_function = evidence_of(sized), evidence_of(sized, functions, i)
+                assert none is not None and with_function is not None
+                nats = self._nats(linear, none, with_function)
                 best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
-            gained[one.name] = best
+            gained[function.name] = best
         return gained
 
 
@@ -547,12 +551,12 @@ def _waves(name: str) -> list[str]:
 
 def _without(columns: Products, linear: Linear, names: Collection[str]) -> Products:
     """Change products to those of a model without the torque of some of its effects."""
-    gone = [1 + i for i, one in enumerate(linear.free) if owner_of(one)[0] in names]
+    gone = [1 + i for i, number in enumerate(linear.free) if owner_of(number)[0] in names]
     change = np.eye(len(columns.scale))
     for k in gone:
-        one, at = linear.free[k - 1], linear.theta[k - 1]
-        if one.role == "size":
-            change[0, k] = -float(one.value(at)) / float(one.slope(at))
+        number, theta = linear.free[k - 1], linear.theta[k - 1]
+        if number.role == "size":
+            change[0, k] = -float(number.value(theta)) / float(number.slope(theta))
     scale = columns.scale.copy()
     scale[gone] = np.inf
     return dataclasses.replace(columns, products=change @ columns.products @ change.T, scale=scale)

@@ -25,7 +25,7 @@ class Products:
         products: of all columns with one another, over the errors' variance, initial states eliminated; shape
             (columns, columns). Order: constant, own numbers, then each variant's columns and offset. Those of different
             variants may be left out: no two are in a model at once.
-        own: number of the model's own numbers.
+        own_count: number of the model's own numbers.
         places: columns of each variant.
         offsets: column of each variant's offset, or -1.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
@@ -35,7 +35,7 @@ class Products:
     """
 
     products: np.ndarray
-    own: int
+    own_count: int
     places: tuple[tuple[int, ...], ...]
     offsets: tuple[int, ...]
     scale: np.ndarray
@@ -44,37 +44,37 @@ class Products:
 
 
 class Evidence(NamedTuple):
-    """What is in favour of a candidate, or of none.
+    """Evidence in favour of a candidate, or of none.
 
     Attributes:
         log_evidence: nats; only differences count.
         misfit: sum of squared errors over their variance.
         numbers: of the candidate's effect.
-        own: change of the model's own numbers (theta).
+        own_change: change of the model's own numbers (theta).
     """
 
     log_evidence: float
     misfit: float
     numbers: Numbers
-    own: np.ndarray
+    own_change: np.ndarray
 
 
-def evidence_of(columns: Products, variants: Sequence[Candidate] = (), which: int | None = None) -> Evidence | None:
+def evidence_of(columns: Products, variants: Sequence[Candidate] = (), index: int | None = None) -> Evidence | None:
     """Evidence of one of the candidates, or of the model without any; None where the numbers are not allowed.
 
     A candidate that is linear about a value that was tried is left at this value where it would have to go too far.
     """
-    if which is None:
+    if index is None:
         return _evidence(columns, (), None, None)
-    places, offset = columns.places[which], columns.offsets[which]
-    found = _evidence(columns, places, offset, variants[which])
-    return _evidence(columns, (), offset, variants[which]) if found is None and offset >= 0 else found
+    places, offset = columns.places[index], columns.offsets[index]
+    evidence = _evidence(columns, places, offset, variants[index])
+    return _evidence(columns, (), offset, variants[index]) if evidence is None and offset >= 0 else evidence
 
 
 def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate: Candidate | None) -> Evidence | None:
     fixed = np.array([0] if offset is None or offset < 0 else [0, offset])
     # what has no torque along this record has no coefficient either
-    alive = [k for k in (*range(1, 1 + c.own), *places) if np.isfinite(c.scale[k])]
+    alive = [k for k in (*range(1, 1 + c.own_count), *places) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()
     joined = [k for k in alive if k in c.twins]
     for k in joined:
@@ -94,7 +94,7 @@ def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate:
         values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
         values[of] -= factor * values[k]
     numbers = {} if candidate is None else candidate.numbers(values[list(places)].tolist() if places else [0.0])
-    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own])
+    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own_count])
 
 
 def _solve(

@@ -69,42 +69,42 @@ def expected_errors(
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
     def apart(other: Comparison) -> Errors:
-        every = other.samples | log.slow(other.torques)
-        return {name: float(np.mean((one - samples[name]) ** 2)) for name, one in every.items()}
+        channels = other.samples | log.slow(other.torques)
+        return {name: float(np.mean((errors - samples[name]) ** 2)) for name, errors in channels.items()}
 
     drawn = []
     for _ in range(_DRAWS):
         model = fitted.move_by(root @ random.standard_normal(len(root)))
-        segments = [_disturbed(one, noise, random) for one in log.segments]
+        segments = [_disturb(segment, noise, random) for segment in log.segments]
         drawn.append(apart(replace(log, segments=segments).compare(model)))
     least = LIMITS.least_torque * driving
-    segments = [replace(one, torque=one.torque + least) for one in log.segments]
+    segments = [replace(segment, torque=segment.torque + least) for segment in log.segments]
     small = apart(replace(log, segments=segments).compare(fitted.experiment))
     for side in fitted.experiment.sides:
         ratio = float(fitted.experiment.drive.ratio(side))
         small[f"torque_{side}"] = (least * ratio) ** 2
         small |= {name: (LIMITS.slow_torque * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
-    found, names = {}, [name for name in floor if not name.startswith("velocity")]
+    expected, names = {}, [name for name in floor if not name.startswith("velocity")]
     for name in names:
-        squares = np.array([one[name] for one in drawn])
+        squares = np.array([squares_of[name] for squares_of in drawn])
         unsure = _TORQUE_NOISE_ERROR if name.startswith("torque") else _NOISE_ERROR
         drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LIMITS.failing / len(names))
         limit = (1.0 + unsure) ** 2 * floor[name] ** 2 + drawn_most + small[name]
-        found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
-    if any(name.startswith("torque") for name in list_failed(log.with_slow(base), found)):
+        expected[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
+    if any(name.startswith("torque") for name in list_failed(log.with_slow(base), expected)):
         for name, rounding in log.rounding(fitted.experiment).items():
-            if name in found:
-                limit = np.hypot(found[name].limit, (1.0 + _NOISE_ERROR) * rounding)
-                found[name] = found[name]._replace(rounding=rounding, limit=float(limit))
-    return found
+            if name in expected:
+                limit = np.hypot(expected[name].limit, (1.0 + _NOISE_ERROR) * rounding)
+                expected[name] = expected[name]._replace(rounding=rounding, limit=float(limit))
+    return expected
 
 
 def list_failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
     """List channels in which a model leaves more than a complete one would, or in which nobody can say: draws diverge."""
-    return [name for name, one in expected.items() if not errors[name] <= one.limit < np.inf]
+    return [name for name, channel in expected.items() if not errors[name] <= channel.limit < np.inf]
 
 
-def _disturbed(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:
+def _disturb(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:
     """A segment with other noise of its input, smoothed as the input was."""
     torque = segment.torque + noise.possible * random.standard_normal(len(segment))
     return replace(segment, torque=smoothed_input(torque, noise.unfelt) if noise.unfelt > 0.0 else torque)

@@ -1,12 +1,12 @@
 """A model with some effects whose numbers are all fitted, and what may be said of these numbers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS, Numbers
-from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves, units_of
+from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.estimation.logs import arrays
 from jaxbl.fused import Arrays
@@ -19,16 +19,16 @@ LEAST_LEFT = 0.05
 
 
 class FitEnd(NamedTuple):
-    """Where a fit of prediction errors ended.
+    """End of a fit of prediction errors.
 
     Attributes:
-        own: theta of the model's own numbers.
+        theta: of the model's own numbers.
         start: initial positions and velocities of each segment.
         smoothness: of each side's predictor.
         cost: minus twice the log-likelihood, with the prior.
     """
 
-    own: np.ndarray
+    theta: np.ndarray
     start: Arrays
     smoothness: Sequence[float]
     cost: float
@@ -90,29 +90,20 @@ class FittedModel(NamedTuple):
         """The model with a change of theta, to first order: a number that the log hardly shows may change by several times
         its size, and by no more; what must stay positive stays so."""
         values = {}
-        for number, at, by in zip(self.free, self.theta, change, strict=True):
-            value, slope = float(number.value(at)), float(number.slope(at))
-            values[number.path] = max(value + slope * by, LEAST_LEFT * value) if number.positive else value + slope * by
+        for number, theta, step in zip(self.free, self.theta, change, strict=True):
+            value, slope = float(number.value(theta)), float(number.slope(theta))
+            values[number.path] = max(value + slope * step, LEAST_LEFT * value) if number.positive else value + slope * step
         return set_leaves(self.experiment, arrays(values))
 
 
-def special_case(fitted: FittedModel, name: str, noise: Mapping[str, float] | None = None) -> str | None:
+def special_case(fitted: FittedModel, name: str) -> str | None:
     """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
-    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend. With the `noise` of each
-    side's readings, rad, nor is a way known that is shorter than that."""
+    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
     cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
-    least = {} if noise is None else {"rad": noise.get(place, max(noise.values()))}
-    units = units_of(cls)
     apart = []
     for leaf, role in cls.roles().items():
         path = f"effects.{name}.{leaf}"
         if role.kind in ("shape", "frequency") and path in errors:
-            known = max(errors[path], least.get(units.get(leaf, ""), 0.0))
-            apart.append(known < abs(float(get_leaf(fitted.experiment, path))))
+            apart.append(errors[path] < abs(float(get_leaf(fitted.experiment, path))))
     plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
     return plain if apart and not any(apart) else None
-
-
-def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> Numbers:
-    """Values of free numbers, by path; theta may have others behind them."""
-    return {number.path: float(number.value(theta[i])) for i, number in enumerate(free)}

@@ -5,6 +5,7 @@ them is an effect with a name; if one pays after all effects with names have had
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,24 +26,15 @@ _LENGTHS = 1e-3, 1e-2, 0.1, 0.3, 0.6, 1.2
 
 def functions_of(signals: Sequence[MotionTorques]) -> list[Candidate]:
     """All of them, side by side, for a record in parts."""
-    found = []
+    functions = []
     for side in signals[0].sides:
         for kind, (name, knots, friction) in _FUNCTIONS.items():
-            along = np.concatenate([_coordinate(one, name, side)[one.real] for one in signals])
+            along = np.concatenate([_coordinate(part, name, side)[part.real] for part in signals])
             span = float(along.min()), float(along.max())
-
-            def hats(one: MotionTorques, name=name, span=span, knots=knots, friction=friction, side=side) -> np.ndarray:
-                found = _hats(_coordinate(one, name, side), span, knots)
-                return found * one.direction[side][:, None] if friction else found
-
-            found.append(_candidate(side, kind, knots, hats))
-
-        def stops(one: MotionTorques, side=side) -> np.ndarray:
-            position = _coordinate(one, "position", side)
-            return _stops(position, np.array(_LENGTHS) * np.std(position[one.real]))
-
-        found.append(_candidate(side, "memory", len(_LENGTHS), stops))
-    return found
+            hats = partial(_make_hats, name, side, span, knots, friction)
+            functions.append(_candidate(side, kind, knots, hats))
+        functions.append(_candidate(side, "memory", len(_LENGTHS), partial(_make_stops, side)))
+    return functions
 
 
 def _candidate(side: str, kind: str, width: int, shape: Callable[[MotionTorques], np.ndarray]) -> Candidate:
@@ -59,21 +51,26 @@ def _coordinate(signals: MotionTorques, name: str, side: str) -> np.ndarray:
     return np.asarray(values[side] if isinstance(values, dict) else values)
 
 
-def _hats(values: np.ndarray, span: tuple[float, float], count: int) -> np.ndarray:
+def _make_hats(
+    name: str, side: str, span: tuple[float, float], count: int, friction: bool, part: MotionTorques
+) -> np.ndarray:
     """Triangles of height 1 about evenly spaced knots, shape (samples, count)."""
     low, high = span
-    at = (values - low) / max(high - low, 1e-300) * (count - 1)
-    return np.maximum(1.0 - np.abs(at[:, None] - np.arange(count)[None, :]), 0.0)
+    index = (_coordinate(part, name, side) - low) / max(high - low, 1e-300) * (count - 1)
+    heights = np.maximum(1.0 - np.abs(index[:, None] - np.arange(count)[None, :]), 0.0)
+    return heights * part.direction[side][:, None] if friction else heights
 
 
-def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def _make_stops(side: str, part: MotionTorques) -> np.ndarray:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
-    way, longest = np.diff(position, prepend=position[0]), np.maximum(lengths, 1e-300)
-    (found,) = scan_signal(_stopped, [longest], [0.0 * lengths], [way])
-    return found
+    position = _coordinate(part, "position", side)
+    lengths = np.maximum(np.array(_LENGTHS) * np.std(position[part.real]), 1e-300)
+    way = np.diff(position, prepend=position[0])
+    (columns,) = scan_signal(_advance_stop, [lengths], [0.0 * lengths], [way])
+    return columns
 
 
-def _stopped(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
+def _advance_stop(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of an element: it bends by the way over its length, and slides beyond 1."""
     (length,), (now,), (way,) = values, carry, inputs
     now = jnp.clip(now + way / length, -1.0, 1.0)

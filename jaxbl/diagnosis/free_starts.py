@@ -56,44 +56,44 @@ class _Model(NamedTuple):
     experiment: Experiment
     windows: Windows
 
-    def states(self, starts: np.ndarray, which: np.ndarray) -> Arrays:
+    def states(self, starts: np.ndarray, indices: np.ndarray) -> Arrays:
         """Along some windows, from starts of shape (windows, states)."""
         start = jax.tree.structure(self.windows.start).unflatten(list(starts.T))
-        torque, time = self.windows.torque[which], self.windows.time[which]
+        torque, time = self.windows.torque[indices], self.windows.time[indices]
         return jax.tree.leaves(simulate_plants(self.experiment, start, torque, time))  # type: ignore[arg-type]
 
-    def residual(self, states: Arrays, which: np.ndarray) -> np.ndarray:
+    def residual(self, states: Arrays, indices: np.ndarray) -> np.ndarray:
         w = self.windows
-        found = jax.tree.structure(w.start).unflatten(states)
-        sides = [(w.measured[side][which] - found.position[side]) / w.noise[side] for side in self.experiment.sides]
+        motion = jax.tree.structure(w.start).unflatten(states)
+        sides = [(w.measured[side][indices] - motion.position[side]) / w.noise[side] for side in self.experiment.sides]
         return np.stack(sides, axis=-1)
 
-    def slope(self, states: Arrays, which: np.ndarray) -> np.ndarray:
+    def slope(self, states: Arrays, indices: np.ndarray) -> np.ndarray:
         """Derivative of the residual by the initial states, shape (windows, samples, sides, states)."""
         w, shape = self.windows, jax.tree.structure(self.windows.start)
         count, (runs, samples) = len(states), states[0].shape
         ways = [Direction(state=row) for row in np.eye(count).tolist()]
-        time = w.time[which][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
-        flat = shape.unflatten([one.ravel() for one in states])
-        changes, _ = step_derivatives(self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways)
+        time = w.time[indices][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
+        flat = shape.unflatten([state.ravel() for state in states])
+        changes, _ = step_derivatives(self.experiment, flat, np.asarray(w.torque[indices]).ravel(), time.ravel(), ways)
         steps = changes.reshape(count, count, runs, samples).transpose(3, 2, 1, 0)
         places: Any = shape.unflatten(range(count))
         rows = [places.position[side] for side in self.experiment.sides]
-        found = np.empty((samples, runs, len(rows), count))
+        slopes = np.empty((samples, runs, len(rows), count))
         reached = np.broadcast_to(np.eye(count), (runs, count, count))
         for i in range(samples):
-            found[i] = reached[:, rows]
+            slopes[i] = reached[:, rows]
             reached = steps[i] @ reached
         noise = np.array([float(w.noise[side]) for side in self.experiment.sides])
-        return -found.transpose(1, 0, 2, 3) / noise[:, None]
+        return -slopes.transpose(1, 0, 2, 3) / noise[:, None]
 
 
 def best_runs(
     experiment: Experiment,
     windows: Windows,
     passes: int,
-    rest: bool,
-    which: np.ndarray | None = None,
+    at_rest: bool,
+    indices: np.ndarray | None = None,
 ) -> Run:
     """Runs from the initial states that suit the first fifth of each window best, found by damped Gauss-Newton.
 
@@ -109,14 +109,14 @@ def best_runs(
     windows = dataclasses.replace(windows, start=start)
     # what was before a window is known where it goes on where another one ends
     steps = np.rint(np.diff(windows.time) / float(experiment.run.sample_period))
-    within = np.concatenate([[False], steps == windows.torque.shape[1]]) | windows.rest
-    if which is not None:
-        windows, within = windows.only(which), within[which]
+    within = np.concatenate([[False], steps == windows.torque.shape[1]]) | windows.at_rest
+    if indices is not None:
+        windows, within = windows.only(indices), within[indices]
     with np.errstate(invalid="ignore", over="ignore"):
-        return _search_starts(_Model(experiment, windows), passes, rest, within)
+        return _search_starts(_Model(experiment, windows), passes, at_rest, within)
 
 
-def _search_starts(model: _Model, passes: int, rest: bool, within: np.ndarray) -> Run:
+def _search_starts(model: _Model, passes: int, at_rest: bool, within: np.ndarray) -> Run:
     """Find the best start of each window; `within`: where what was before it is known."""
     windows, sides = model.windows, model.experiment.sides
     leaves, shape = jax.tree.flatten(windows.start)
@@ -124,59 +124,61 @@ def _search_starts(model: _Model, passes: int, rest: bool, within: np.ndarray) -
     best = np.stack([np.broadcast_to(leaf, len(windows.time)) for leaf in leaves], axis=1).astype(float)
     runs, count = best.shape
     samples = windows.torque.shape[1]
-    seen = count_seen(samples)
+    scored = count_seen(samples)
     moving = [places.velocity[side] for side in sides]
-    still, known = best.copy(), np.ones_like(best)
+    still, fitted = best.copy(), np.ones_like(best)
     still[:, moving] = 0.0
-    known[np.ix_(np.flatnonzero(windows.rest), moving)] = 0.0
-    for effect, own in zip(model.experiment.effects, places.effects, strict=True):
-        columns = jax.tree.leaves(own)
+    fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
+    for effect, state in zip(model.experiment.effects, places.effects, strict=True):
+        columns = jax.tree.leaves(state)
         if columns and (effect.state_from_measurement or effect.state_from_input):
-            known[np.ix_(np.flatnonzero(within | effect.state_from_input), columns)] = 0.0
+            fitted[np.ix_(np.flatnonzero(within | effect.state_from_input), columns)] = 0.0
     residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
     states = [np.zeros((runs, samples)) for _ in leaves]
     if not runs:
         return Run(residual, shape.unflatten(states), np.zeros(len(sides)))
-    cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()
+    cost, damping, following = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()
     going = np.ones(runs, bool)
     for i in range(passes):
-        if rest and i == passes // 2 + 1:
+        if at_rest and i == passes // 2 + 1:
             # from there nothing leads back: a side that friction holds does not feel a little velocity
-            tried, going = still.copy(), np.ones(runs, bool)
+            following, going = still.copy(), np.ones(runs, bool)
             damping[:] = RIDGE
-        which = np.flatnonzero(going)
-        if not len(which):
-            if rest and i <= passes // 2:
+        indices = np.flatnonzero(going)
+        if not len(indices):
+            if at_rest and i <= passes // 2:
                 continue
             break
-        found = model.states(tried[which], which)
-        value = model.residual(found, which)
-        squares = np.sum(value[:, :seen] ** 2, axis=(1, 2))
-        better = (squares < cost[which]) | ~np.isfinite(cost[which])
-        new = which[better]
-        damping[which] = np.where(better, np.maximum(0.01 * damping[which], RIDGE), np.maximum(30.0 * damping[which], 1e-2))
+        new_states = model.states(following[indices], indices)
+        value = model.residual(new_states, indices)
+        squares = np.sum(value[:, :scored] ** 2, axis=(1, 2))
+        better = (squares < cost[indices]) | ~np.isfinite(cost[indices])
+        new = indices[better]
+        damping[indices] = np.where(
+            better, np.maximum(0.01 * damping[indices], RIDGE), np.maximum(30.0 * damping[indices], 1e-2)
+        )
         if len(new):
-            best[new], cost[new], residual[new] = tried[new], squares[better], value[better]
-            for kept, one in zip(states, found, strict=True):
-                kept[new] = one[better]
-            slope[new] = model.slope([one[better] for one in found], new) * known[new][:, None, None, :]
-        flat = slope[which][:, :seen].reshape(len(which), -1, count)
+            best[new], cost[new], residual[new] = following[new], squares[better], value[better]
+            for stored, new_state in zip(states, new_states, strict=True):
+                stored[new] = new_state[better]
+            slope[new] = model.slope([new_state[better] for new_state in new_states], new) * fitted[new][:, None, None, :]
+        flat = slope[indices][:, :scored].reshape(len(indices), -1, count)
         size = np.sqrt(np.sum(flat**2, axis=1))
         # a state without influence stays where it is
         size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
         unit = flat / size[:, None, :]
-        towards = np.einsum("wrn,wr->wn", unit, residual[which][:, :seen].reshape(len(which), -1))
-        matrix = unit.transpose(0, 2, 1) @ unit + damping[which][:, None, None] * np.eye(count)
+        towards = np.einsum("wrn,wr->wn", unit, residual[indices][:, :scored].reshape(len(indices), -1))
+        matrix = unit.transpose(0, 2, 1) @ unit + damping[indices][:, None, None] * np.eye(count)
         change = np.linalg.solve(matrix, towards[:, :, None])[:, :, 0]
-        tried[which] = best[which] - change / size
-        going[which] = ~(np.einsum("wn,wn->w", change, towards) <= _SETTLED * cost[which])
-    first = slope[:, :seen].reshape(runs, -1, count)
+        following[indices] = best[indices] - change / size
+        going[indices] = ~(np.einsum("wn,wn->w", change, towards) <= _SETTLED * cost[indices])
+    first = slope[:, :scored].reshape(runs, -1, count)
     size = np.sqrt(np.sum(first**2, axis=1))
     # a state that the samples seen do not show stays where it is, and adds no noise
     size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)[:, None, :]
     unit, first = slope / size[:, :, None, :], first / size
     inverse = np.linalg.pinv(np.where(np.isfinite(first), first, 0.0), rcond=_RANK)
-    change = np.einsum("wnr,wr->wn", inverse, residual[:, :seen].reshape(runs, -1))
+    change = np.einsum("wnr,wr->wn", inverse, residual[:, :scored].reshape(runs, -1))
     left = residual - np.einsum("wrsn,wn->wrs", unit, change)
-    spread = np.einsum("wrsn,wnm,wrsm->wrs", unit[:, seen:], inverse @ inverse.transpose(0, 2, 1), unit[:, seen:])
+    spread = np.einsum("wrsn,wnm,wrsm->wrs", unit[:, scored:], inverse @ inverse.transpose(0, 2, 1), unit[:, scored:])
     return Run(left, shape.unflatten(states), np.sqrt(np.mean(spread, axis=(0, 1))))

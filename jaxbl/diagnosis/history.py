@@ -1,25 +1,32 @@
 """How a name was found: every model that was tried, what it gained, and what became of it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
+
+from jaxbl.json_types import JsonObject
 
 
 class Step(NamedTuple):
     """A model that was tried.
 
     Attributes:
-        tried: what was changed, such as `add motor.cogging`.
+        change: what was changed, such as `add motor.cogging`.
         nats: gain in log-evidence on the log, or in log-likelihood where numbers alone differ; None where it was not asked.
         standard_errors: by which the change makes the model better, by blocks of the log; as `nats`.
-        kept: whether the change was made.
-        why: the reason, in words.
+        accepted: whether the change was made.
+        reason: why, in words.
     """
 
-    tried: str
+    change: str
     nats: float | None
     standard_errors: float | None
-    kept: bool
-    why: str
+    accepted: bool
+    reason: str
+
+
+def describe_history(history: Sequence[Step]) -> list[JsonObject]:
+    """Write the steps as `diagnosis.json` has them."""
+    return [dict(zip(("tried", "nats", "standard_errors", "kept", "why"), step, strict=True)) for step in history]
 
 
 def describe_change(before: Mapping[str, object], after: Mapping[str, object]) -> str:

@@ -25,7 +25,7 @@ _CUTOFFS = np.geomspace(0.015, 2.0, 30)
 """Corner frequencies tried, rad a sample."""
 
 
-def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> tuple[float, float]:
+def unfelt(recorded: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> tuple[float, float]:
     """Share of the noise of the input, in its power, that did not drive the motion, and its standard error.
 
     What both inputs' prediction errors differ by is what that noise does to them. It is in the errors of the recorded input
@@ -35,8 +35,8 @@ def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> tuple[f
     Args:
         given, smooth: errors under the input as recorded and smoothed, part by part, rad; shape (samples, sides).
     """
-    spectrum = spectrum_of(given)
-    pairs = [np.stack([one, one - other], axis=2) for one, other in zip(given, smooth, strict=True)]
+    spectrum = spectrum_of(recorded)
+    pairs = [np.stack([errors, errors - other], axis=2) for errors, other in zip(recorded, smooth, strict=True)]
     products = np.sum([weighted_products(pair, spectrum) for pair in pairs], axis=0)
     size = max(float(products[1, 1]), np.finfo(float).tiny)
     return float(products[0, 1]) / size, size**-0.5
@@ -73,11 +73,11 @@ def _smooth_curve(values: np.ndarray) -> np.ndarray:
         weight = (2.0 * np.sin(0.5 * cutoff)) ** (-2.0 * _ORDER)
         matrix = weight * penalty
         matrix[0] += 1.0
-        found = solveh_banded(matrix, values, lower=True)
+        curve = solveh_banded(matrix, values, lower=True)
         freedom = np.mean(1.0 / (1.0 + weight * (2.0 * np.sin(0.5 * frequency)) ** (2 * _ORDER))) + _ORDER / count
-        score = np.mean((values - found) ** 2) / max(1.0 - freedom, 1e-3) ** 2
+        score = np.mean((values - curve) ** 2) / max(1.0 - freedom, 1e-3) ** 2
         if score < least:
-            best, least = found, score
+            best, least = curve, score
     return best
 
 

@@ -23,7 +23,7 @@ CHECKS = {
 
 
 class Judgement(NamedTuple):
-    """What the proof leaves of an explanation.
+    """An explanation as the proof leaves it.
 
     Attributes:
         verdict: as in `diagnosis.json`.
@@ -64,7 +64,7 @@ def judge(chosen: Chosen, proof: Proof, share: float | None, contradicting: bool
     fitted = chosen.fitted
     away = fitted.theta[: len(chosen.prior)] / chosen.prior
     untested = list(proof.untested) if proof.has_power else list(fitted.names)
-    torques = {name: proof.untested[name]._asdict() if name in proof.untested else {} for name in untested}
+    torques = {name: proof.untested.get(name, {}) for name in untested}
     answers = {
         "failed": proof.failed,
         "far": {number.path: float(z) for number, z in zip(fitted.free, away, strict=False) if abs(z) > LIMITS.far},

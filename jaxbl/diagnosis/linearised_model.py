@@ -13,6 +13,9 @@ References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detectin
 Automatica 24 (1988), for the local approach.
 """
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -40,7 +43,7 @@ from jaxbl.workers import map_in_threads
 
 from .candidates import SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
 from .evidence import Products
-from .neutral_effects import bucket, corrected, lean, with_torques
+from .neutral_effects import bucket, find_corrected, lean, with_torques
 from .thresholds import LIMITS
 
 _SAMPLES = 1024
@@ -54,45 +57,44 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
     count = len(segment)
     size = bucket(count, _SAMPLES)
 
-    def padded(values: np.ndarray) -> np.ndarray:
+    def pad(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
 
-    states = {side: padded(np.asarray(smoothed[side].state)) for side in sides}
-    deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
+    states = {side: pad(smoothed[side].state) for side in sides}
+    deviation = {side: pad(smoothed[side].deviation(1)) for side in sides}
     period = float(experiment.run.sample_period)
-    held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
-    read = np.stack([padded(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
-    time, torque = padded(segment.time), padded(segment.torque)
-    smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
-    driven: list[Any] = [time, torque, *smooth[:2]]
-    before: Any = segment.before
-    along = Path(*driven, before=before)
-    effects = effect_states(experiment, along)
-    motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
-    experiment, motion = lean(experiment, motion, [one.path for one in free])
+    held = {side: pad(smoothed[side].find_standstill(period).astype(float)) for side in sides}
+    read = np.stack([pad(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
+    time, torque = pad(segment.time), pad(segment.torque)
+    position, velocity, acceleration = ({side: states[side][:, i] for side in sides} for i in range(3))
+    effects = effect_states(experiment, Path(time, torque, position, velocity, before=segment.before))
+    motion = PlantState(position, velocity, jax.tree.map(np.asarray, effects))
+    experiment, motion = lean(experiment, motion, [number.path for number in free])
     # by side, not by name
-    names, each = sorted(sides), len(sides)
-    order = [names.index(side) + i * each for i in range(2) for side in sides]
-    at = 2 * each
-    for effect, own in zip(experiment.effects, motion.effects, strict=True):
-        states_of = len(jax.tree.leaves(own))
+    names, side_count = sorted(sides), len(sides)
+    order = [names.index(side) + i * side_count for i in range(2) for side in sides]
+    state_count = 2 * side_count
+    for effect, state in zip(experiment.effects, motion.effects, strict=True):
+        states_of = len(jax.tree.leaves(state))
         # what is known has no error that a predictor could have
-        order += [] if effect.state_from_input else range(at, at + states_of)
-        at += states_of
-    ways = _directions(free, theta, at, order, list(added.values()))
+        order += [] if effect.state_from_input else range(state_count, state_count + states_of)
+        state_count += states_of
+    ways = _directions(free, theta, state_count, order, list(added.values()))
     slope, value = step_derivatives(experiment, motion, torque, time, ways)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
     defect = np.zeros_like(value)
     # a path along which a model diverges has nothing finite
     with np.errstate(invalid="ignore", over="ignore"):
-        modelled = {side: (value[:, each + i] - vectors[:, each + i]) / period for i, side in enumerate(sides)}
+        modelled = {side: (value[:, side_count + i] - vectors[:, side_count + i]) / period for i, side in enumerate(sides)}
         # nothing happens from the last reading on
         defect[: count - 1] = value[: count - 1] - vectors[1:count]
-    a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
+    a, b, by_number = np.split(slope, (len(order), len(order) + side_count + 1), axis=2)
     weight = (np.arange(size) < count).astype(float)
-    given: list[Any] = [time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight, before]
-    return Part(*given)
+    return Part(
+        time, torque, read, position, velocity, acceleration, modelled, deviation, held, a, b, by_number, defect, weight,
+        segment.before,
+    )  # fmt: skip
 
 
 def _directions(
@@ -103,23 +105,8 @@ def _directions(
         *(Direction(state=row) for row in np.eye(states)[list(order)].tolist()),
         *(Direction({path: -1.0}) for path in added),
         Direction(torque=1.0),
-        *(Direction({one.path: float(one.slope(at))}) for one, at in zip(free, theta, strict=True)),
+        *(Direction({number.path: float(number.slope(value))}) for number, value in zip(free, theta, strict=True)),
     ]
-
-
-def gain_matrix(gain: np.ndarray, states: int) -> np.ndarray:
-    """Gain of the whole state, shape (states, sides): positions, velocities, and nothing on the effects' own states."""
-    sides = len(gain)
-    found = np.zeros((states, sides))
-    found[np.arange(sides), np.arange(sides)], found[sides + np.arange(sides), np.arange(sides)] = gain.T
-    return found
-
-
-def _closed(part: Part, gains: np.ndarray) -> np.ndarray:
-    """Step of the predictor's errors under a gain, A (1 - K C); by sample."""
-    found = np.array(part.step)
-    found[:, :, : gains.shape[1]] -= part.step @ gains
-    return found
 
 
 class _Columns:
@@ -128,39 +115,39 @@ class _Columns:
 
     def __init__(self, part: Part, forces: Forces):
         # behind the last sample there is nothing but filling
-        self.count, self.size = int(np.sum(np.asarray(part.weight) > 0.0)), len(part.time)
-        self.step, self.force, self.own, self.defect, self.readings = (
-            np.asarray(one)[: self.count] for one in (part.step, part.force, part.own, part.defect, part.readings)
+        self.count, self.size = int(np.sum(part.weight > 0.0)), len(part.time)
+        self.step, self.force, self.by_number, self.defect, self.readings = (
+            matrix[: self.count] for matrix in (part.step, part.force, part.by_number, part.defect, part.readings)
         )
         self.forces = forces
-        self.states = self.defect.shape[1]
-        self.width = 1 + self.own.shape[2] + forces.width + self.states
+        self.states, self.own_width = self.defect.shape[1], 1 + self.by_number.shape[2]
+        self.width = self.own_width + forces.width + self.states
         self.recursion = LinearPredictor.of(self.states, self.readings.shape[1], self.width)
 
     def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, Arrays]]:
         """Rows of some samples after the others, and the prediction errors there under each gain, rad, shape
         (sides, samples, columns)."""
         begun = np.zeros((self.states, self.width))
-        begun[:, self.width - self.states :] = np.eye(self.states)
+        begun[:, -self.states :] = np.eye(self.states)
         changes = [begun] * len(gains)
         length = max(_VALUES // self.width, 64)
         for first in range(0, self.count, length):
             rows = slice(first, min(first + length, self.count))
-            known = np.zeros((self.states, rows.stop - first, self.width))
-            known[:, :, 0] = self.defect[rows].T
-            known[:, :, 1 : 1 + self.own.shape[2]] = self.own[rows].transpose(1, 0, 2)
-            known[:, :, 1 + self.own.shape[2] : self.width - self.states] = self.forces.driving(self.force[rows], rows)
-            changes, errors = self.recursion(changes, gains, self.step[rows], known, self.readings[rows])
+            driven = np.zeros((self.states, rows.stop - first, self.width))
+            driven[:, :, 0] = self.defect[rows].T
+            driven[:, :, 1 : self.own_width] = self.by_number[rows].transpose(1, 0, 2)
+            driven[:, :, self.own_width : -self.states] = self.forces.driving(self.force[rows], rows)
+            changes, errors = self.recursion(changes, gains, self.step[rows], driven, self.readings[rows])
             yield rows, errors
 
 
 def _errors(part: Part, gain: np.ndarray, forces: Forces) -> np.ndarray:
     """Prediction errors, rad, by side; columns as of :class:`_Columns`; shape (samples, sides, columns)."""
     columns = _Columns(part, forces)
-    found = np.zeros((columns.size, columns.readings.shape[1], columns.width))
+    errors_of_all = np.zeros((columns.size, columns.readings.shape[1], columns.width))
     for rows, (errors,) in columns.along([gain]):
-        found[rows] = errors.transpose(1, 0, 2)
-    return found
+        errors_of_all[rows] = errors.transpose(1, 0, 2)
+    return errors_of_all
 
 
 def _grams(part: Part, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarray:
@@ -170,8 +157,8 @@ def _grams(part: Part, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarra
     total = np.zeros((len(gains), columns.readings.shape[1], columns.width, columns.width))
     # of a gain under which errors diverge
     with np.errstate(invalid="ignore", over="ignore"):
-        for _, found in columns.along(gains):
-            for sums, errors in zip(total, found, strict=True):
+        for _, errors_by_gain in columns.along(gains):
+            for sums, errors in zip(total, errors_by_gain, strict=True):
                 sums += np.matmul(errors.transpose(0, 2, 1), errors)
     return total
 
@@ -189,11 +176,14 @@ def _backwards(_: Leaves, adjoint: Leaves, inputs: Leaves) -> tuple[Leaves, Leav
 def _gradient(part: Part, gain: np.ndarray, left: np.ndarray) -> np.ndarray:
     """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
     states, sides = part.defect.shape[1], left.shape[1]
-    closed, added = _closed(part, gain_matrix(gain, states)), np.zeros((len(left), states))
-    added[:, :sides] = -left * np.asarray(part.weight)[:, None]
+    # A (1 - K C); nothing of the gain is on the effects' own states
+    gains, closed, added = np.zeros((states, sides)), np.array(part.step), np.zeros((len(left), states))
+    gains[: 2 * sides] = np.concatenate([np.diag(column) for column in gain.T])
+    closed[:, :, :sides] -= part.step @ gains
+    added[:, :sides] = -left * part.weight[:, None]
     inputs = [*closed.reshape(len(left), -1).T, *added.T]
-    found = scan_signal(_backwards, [], [np.zeros(1)] * states, [one[::-1] for one in inputs])
-    adjoints = np.stack([one[::-1, 0] for one in found], axis=1)
+    rows = scan_signal(_backwards, [], [np.zeros(1)] * states, [column[::-1] for column in inputs])
+    adjoints = np.stack([row[::-1, 0] for row in rows], axis=1)
     return np.einsum("tij,ti->tj", part.force, adjoints)
 
 
@@ -242,27 +232,29 @@ class Predictor:
     def __init__(self, linear: "Linear", smoothness: list[float], grams: Arrays):
         self.smoothness, self.count = smoothness, linear.count
         own_states = linear.states - 2 * len(linear.sides)
-        self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
-        sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
+        self.given = np.sum([_as_it_stands(gram, own_states) for gram in grams], axis=0)
+        sides, own_count, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
         width = grams[0].shape[1] - 1 - states
         # of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products
-        self.squares, self.coefficients = np.full(sides, np.inf), [np.zeros(one.shape[1]) for one in grams]
-        if not np.max([np.max(np.abs(one)) for one in grams]) < DIVERGED:
+        self.squares, self.coefficients = np.full(sides, np.inf), [np.zeros(gram.shape[1]) for gram in grams]
+        if not np.max([np.max(np.abs(gram)) for gram in grams]) < DIVERGED:
             return
         weight = np.ones(sides)
         prior, centre = np.full(width, np.inf), np.zeros(width)
-        prior[:own], centre[:own] = linear.prior, -linear.theta
+        prior[:own_count], centre[:own_count] = linear.prior, -linear.theta
         for turn in range(2):
-            weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
-            each = [_response_and_loss(one, states) for one in weighted]
-            total = np.sum([_without(one, states, by) for one, (by, _) in zip(weighted, each, strict=True)], axis=0)
+            weighted = [np.einsum("s,scd->cd", weight, gram) for gram in grams]
+            responses = [_response_and_loss(gram, states) for gram in weighted]
+            total = np.sum(
+                [_without(gram, states, response) for gram, (response, _) in zip(weighted, responses, strict=True)], axis=0
+            )
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            lost = sum(one for _, one in each) / variance
+            lost = sum(loss for _, loss in responses) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 return
             free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre)])
-            coefficients = [np.concatenate([free, -by @ free]) for by, _ in each]
-            left = [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(coefficients, grams, strict=True)]
+            coefficients = [np.concatenate([free, -response @ free]) for response, _ in responses]
+            left = [np.einsum("c,scd,d->s", vector, gram, vector) for vector, gram in zip(coefficients, grams, strict=True)]
             squares = np.sum(left, axis=0)
             if not (squares > 0.0).all():
                 return
@@ -308,11 +300,11 @@ class Linear:
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = set_free_parameters(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
-        self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
+        self.parts = [_part(self.experiment, free, self.theta, segment) for segment in segments]
         self.signals = [
             MotionTorques(self.experiment, part, segment.torques) for part, segment in zip(self.parts, segments, strict=True)
         ]
-        self.count = sum(int(one.real.sum()) for one in self.signals)
+        self.count = sum(int(signals.real.sum()) for signals in self.signals)
         self.states = self.parts[0].defect.shape[1]
         gain, self._inertia = _figures(self.experiment)
         self.input_gain = float(gain)
@@ -324,24 +316,24 @@ class Linear:
 
     def _drive(self) -> tuple[float, bool]:
         """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
-        driving = self.input_gain * rms(np.concatenate([one.torque[one.real] for one in self.signals]))
+        driving = self.input_gain * rms(np.concatenate([signals.torque[signals.real] for signals in self.signals]))
         taken = [
-            float(self._inertia[side]) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
-            for one in self.signals
+            float(self._inertia[side]) / signals.over(side) * signals.part.acceleration[side][signals.real]
+            for signals in self.signals
             for side in self.sides
         ]
         inertial = rms(np.concatenate(taken))
         return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
 
     def scales(self, name: str) -> Scales:
-        """How large things are on the record, as an effect sees them; frequencies are sought anew each time."""
+        """Measure how large things are on the record, as an effect sees them; frequencies are sought anew each time."""
         place = self.experiment.drive.resolve_place(name.partition(".")[0])
-        found, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
+        scales, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
         if "frequency" in kinds:
-            found = found._replace(frequencies=tuple(self.frequencies(place)))
+            scales = scales._replace(frequencies=tuple(self.frequencies(place)))
         if "harmonic" in kinds and place in self.sides:
-            found = found._replace(waves=tuple(self.waves(place)))
-        return found
+            scales = scales._replace(waves=tuple(self.waves(place)))
+        return scales
 
     def _scales_at(self, place: str) -> Scales:
         if place not in self._scales:
@@ -349,21 +341,21 @@ class Linear:
         return self._scales[place]
 
     def _measure_scales(self, place: str) -> Scales:
-        def joined(of) -> np.ndarray:
-            return np.concatenate([np.asarray(of(one.part))[one.real] for one in self.signals])
+        def join(of) -> np.ndarray:
+            return np.concatenate([of(signals.part)[signals.real] for signals in self.signals])
 
         side = place if place in self.sides else "motor"
-        position = joined(lambda part: part.position["load" if place == "transmission" else side])
+        position = join(lambda part: part.position["load" if place == "transmission" else side])
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
-            twist = joined(lambda part: part.position["motor"] - ratio * part.position["load"])
+            twist = join(lambda part: part.position["motor"] - ratio * part.position["load"])
         return Scales(
-            torque=float(np.max(np.abs(joined(lambda part: part.torque)))),
+            torque=float(np.max(np.abs(join(lambda part: part.torque)))),
             period=self.period,
             duration=self.count * self.period,
             twist=rms(twist),
             largest_twist=float(np.max(np.abs(twist))),
-            speed=rms(joined(lambda part: part.velocity[side])),
+            speed=rms(join(lambda part: part.velocity[side])),
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
             ratio=ratio,
@@ -373,13 +365,13 @@ class Linear:
 
     def _harmonics(self, side: str) -> tuple[float, ...]:
         """Periods a turn of the waves that effects on a side have."""
-        found: list[float] = []
+        harmonics: list[float] = []
         for effect in self.experiment.effects:
             roles = type(effect).roles()
             acts = any(float(getattr(effect, leaf)) != 0.0 for leaf, role in roles.items() if role.kind == "size")
             if acts and self.experiment.drive.resolve_place(effect.place) == side:
-                found += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
-        return tuple(found)
+                harmonics += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
+        return tuple(harmonics)
 
     def choices(self, name: str) -> float:
         """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""
@@ -407,14 +399,12 @@ class Linear:
 
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
         """Prediction errors under a given gain."""
-        (found,) = self._predictors([list(smoothness)], [forces_of((), one) for one in self.signals])
-        return found
+        (predictor,) = self._predictors([list(smoothness)], [Forces(())] * len(self.parts))
+        return predictor
 
     def errors(self, smoothness: Sequence[float]) -> Arrays:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
-        gain = self.gain(smoothness)
-        none = [forces_of((), one) for one in self.signals]
-        return [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
+        return [_errors(part, self.gain(smoothness), Forces(())) for part in self.parts]
 
     def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
         """The predictor with the least errors, some candidates taken in; the search begins at a smoothness of each side."""
@@ -429,9 +419,11 @@ class Linear:
         forces = [forces_of(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
-            found = self._predictors(options, forces)
-            costs = [float(np.sum(np.log(one.squares))) if (one.squares > 0.0).all() else np.inf for one in found]
-            return found[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
+            predictors = self._predictors(options, forces)
+            costs = [
+                np.sum(np.log(predictor.squares)) if (predictor.squares > 0.0).all() else np.inf for predictor in predictors
+            ]
+            return predictors[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
         if near is None:
             chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
@@ -446,16 +438,16 @@ class Linear:
         return chosen, forces
 
     def _predictors(self, options: list[list[float]], forces: list[Forces]) -> list[Predictor]:
-        gains = [self.gain(one) for one in options]
+        gains = [self.gain(smoothness) for smoothness in options]
         grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
-        return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
+        return [Predictor(self, smoothness, [gram[i] for gram in grams]) for i, smoothness in enumerate(options)]
 
     def frequencies(self, place: str) -> list[float]:
         """Frequencies (Hz) at which a disturbance of a side explains most, of the longest part."""
-        i = int(np.argmax([one.samples for one in self.signals]))
+        i = int(np.argmax([signals.samples for signals in self.signals]))
         span, top = self.signals[i].samples * self.period, self._highest
         few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
-        slope, power = self._answer(i, place, few, 2.0 * np.pi * np.asarray(self.parts[i].time))
+        slope, power = self._answer(i, place, few, 2.0 * np.pi * self.parts[i].time)
         size = 4 * 2 ** int(np.ceil(np.log2(len(slope))))
         frequency = np.fft.rfftfreq(size, self.period)
         inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
@@ -467,7 +459,7 @@ class Linear:
         few = np.unique(np.round(np.geomspace(1.0, max(count, 2), _COARSE)))
         by_place, power = np.zeros(_PLACES), 0.0 * few
         for i, signals in enumerate(self.signals):
-            position = np.asarray(signals.part.position[place])
+            position = signals.part.position[place]
             slope, more = self._answer(i, place, few, position)
             where = np.mod(position[: len(slope)] / (2.0 * np.pi), 1.0) * _PLACES
             by_place += np.bincount(np.minimum(where.astype(int), _PLACES - 1), slope, _PLACES)
@@ -478,11 +470,11 @@ class Linear:
 
     def _wave_count(self, place: str) -> int:
         """Number of waves a turn that samples still tell apart where the side moves as fast as in a quarter of the log."""
-        speed = np.concatenate([np.abs(np.asarray(one.part.velocity[place]))[one.real] for one in self.signals])
+        speed = np.concatenate([np.abs(signals.part.velocity[place])[signals.real] for signals in self.signals])
         return int(np.clip(0.5 * np.pi / max(float(np.quantile(speed, 0.25)) * self.period, 1e-9), 1, _MOST_WAVES))
 
     def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What a torque on a side does to the prediction errors of a part, under what the last call of :meth:`choose`
+        """Tell what a torque on a side does to the prediction errors of a part, under what the last call of :meth:`choose`
         chose, at what it left over: their derivative by the torque at each sample, shape (samples,); and the power of the
         response to waves of `few` periods along a `phase`, shape (waves,)."""
         assert self._last is not None
@@ -495,77 +487,76 @@ class Linear:
         left = _errors(part, gain, forces[i]) @ predictor.coefficients[i]
         along = few[:, None] * phase[None, :]
         waves = Forces([{side: np.concatenate([np.sin(along), np.cos(along)])}])
-        responses = _errors(part, gain, waves)[:, :, 1 + part.own.shape[2] : -self.states]
+        responses = _errors(part, gain, waves)[:, :, 1 + part.by_number.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         return _gradient(part, gain, left / deviation[None, :] ** 2)[: self.signals[i].samples, side], power
 
-    def left(self, smoothness: Sequence[float]) -> Arrays:
+    def find_errors_left(self, smoothness: Sequence[float]) -> Arrays:
         """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
         (samples, sides)."""
-        errors, predictor = self.errors(smoothness), self.predictor(smoothness)
-        left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
-        return [one[signals.real] for one, signals in zip(left, self.signals, strict=True)]
+        parts = self.errors(smoothness), self.predictor(smoothness).coefficients, self.signals
+        return [(errors @ coefficients)[signals.real] for errors, coefficients, signals in zip(*parts, strict=True)]
 
     def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> Products:
         """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
         eliminated; `noise`: rms of the errors by side, rad. Products of different
         candidates are there for some only."""
-        gain, own, groups = self.gain(smoothness), len(self.free), _groups(variants)
-        places, offsets, at = [], [], 1 + own
-        for one in variants:
-            places.append(tuple(range(at, at + one.width)))
-            at += one.width
-            offsets.append(at if one.offset else -1)
-            at += one.offset
+        gain, own_count, groups = self.gain(smoothness), len(self.free), _groups(variants)
+        places, offsets, end = [], [], 1 + own_count
+        for variant in variants:
+            places.append(tuple(range(end, end + variant.width)))
+            end += variant.width
+            offsets.append(end if variant.offset else -1)
+            end += variant.offset
 
         def products(signals: MotionTorques, forces: Forces) -> tuple[np.ndarray, np.ndarray]:
             gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
             return _eliminate(gram, self.states), self._power(forces, signals)
 
-        jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]
-        total, power = np.zeros((at, at)), np.zeros(at)
-        first = 1 + own
+        jobs = [(signals, forces_of(group, signals)) for signals in self.signals for group in groups]
+        total, power = np.zeros((end, end)), np.zeros(end)
+        first = 1 + own_count
         for gram, squares in map_in_threads(products, *zip(*jobs, strict=True)):
             last = first + len(squares)
-            index = np.array([*range(1 + own), *range(first, last)])
-            if first > 1 + own:
+            index = np.array([*range(1 + own_count), *range(first, last)])
+            if first > 1 + own_count:
                 # what all candidates of a part share counts once
-                gram[: 1 + own, : 1 + own] = 0.0
+                gram[: 1 + own_count, : 1 + own_count] = 0.0
             total[np.ix_(index, index)] += gram
             power[first:last] += squares
-            first = last if last < at else 1 + own
+            first = last if last < end else 1 + own_count
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
-            size = LIMITS.effect_size * self.drive / np.sqrt(power[1 + own :] / self.count)
+            size = LIMITS.effect_size * self.drive / np.sqrt(power[1 + own_count :] / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
-        for one, place in zip(variants, places, strict=True):
-            if one.offset or one.spread:
-                scale[list(place)] = one.spread or SPACING
-            elif (nominal := self.nominal(one.name)) is not None:
+        for variant, place in zip(variants, places, strict=True):
+            if variant.offset or variant.spread:
+                scale[list(place)] = variant.spread or SPACING
+            elif (nominal := self.nominal(variant.name)) is not None:
                 scale[list(place)] = np.minimum(scale[list(place)], LIMITS.number_error * nominal)
-        centre = np.zeros(at)
-        centre[1 : 1 + own] = -self.theta
-        return Products(total, own, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
+        centre = np.zeros(end)
+        centre[1 : 1 + own_count] = -self.theta
+        return Products(total, own_count, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
         """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
-        slopes = [float(one.slope(self.theta[i])) for i, one in enumerate(self.free)]
-        found = {}
-        for one, place in zip(variants, places, strict=True):
-            if (i := self.same(one.name)) is not None:
-                found[place[0]] = 1 + i, 1.0 / slopes[i]
-        for j, one in enumerate(self.free):
-            name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+        slopes = [float(number.slope(self.theta[i])) for i, number in enumerate(self.free)]
+        twins = {}
+        for variant, place in zip(variants, places, strict=True):
+            if (i := self.same(variant.name)) is not None:
+                twins[place[0]] = 1 + i, 1.0 / slopes[i]
+        for j, number in enumerate(self.free):
+            name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
             if leaf and (i := self.same(name)) is not None:
-                found[1 + j] = 1 + i, slopes[j] / slopes[i]
-        return found
+                twins[1 + j] = 1 + i, slopes[j] / slopes[i]
+        return twins
 
     def _power(self, torques: Forces, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
         over = {i: signals.over(side) for i, side in enumerate(self.sides)}
         return torques.squares(over | {-1: 1.0 / self.input_gain})
 
-    def shown(self) -> float:
+    def find_input_significance(self) -> float:
         """Standard deviations by which the prediction errors show the input; infinite where the record has none."""
         if not self.driven:
             return np.inf
@@ -580,40 +571,40 @@ class Linear:
 
     def same(self, name: str) -> int | None:
         """Index of the model's own number that an effect is the error of."""
-        path = corrected(name)
-        return next((i for i, one in enumerate(self.free) if one.path == path), None)
+        path = find_corrected(name)
+        return next((i for i, number in enumerate(self.free) if number.path == path), None)
 
     def nominal(self, name: str) -> float | None:
         """The number of the drive that an effect is the error of, if it is one and is not zero."""
-        path = corrected(name)
+        path = find_corrected(name)
         value = 0.0 if path is None else float(get_leaf(self.experiment, path))
         return value if value > 0.0 else None
 
 
 def _peaks(
-    at: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, apart: float
+    waves: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, apart: float
 ) -> list[float]:
     """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks."""
-    expected = np.exp(np.interp(np.log(np.maximum(at, 1e-9)), np.log(few), np.log(np.maximum(power, 1e-300))))
+    expected = np.exp(np.interp(np.log(np.maximum(waves, 1e-9)), np.log(few), np.log(np.maximum(power, 1e-300))))
     score = np.concatenate([[0.0], np.where(inside, score / expected, 0.0), [0.0]])
     peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]))
-    found: list[float] = []
+    peaks_found: list[float] = []
     for k in peaks[np.argsort(-score[1:-1][peaks])]:
-        if all(abs(at[k] - known) > apart for known in found):
-            found.append(float(at[k]))
-        if len(found) == _FREQUENCIES:
+        if all(abs(waves[k] - peak) > apart for peak in peaks_found):
+            peaks_found.append(float(waves[k]))
+        if len(peaks_found) == _FREQUENCIES:
             break
-    return found
+    return peaks_found
 
 
 def _groups(variants: Sequence[Candidate]) -> list[list[Candidate]]:
     """Neighbours whose columns are taken through the recursion together; one empty group if there are none."""
-    found: list[list[Candidate]] = [[]]
-    for one in variants:
-        if sum(other.width + other.offset for other in found[-1]) >= _TOGETHER:
-            found.append([])
-        found[-1].append(one)
-    return found
+    groups: list[list[Candidate]] = [[]]
+    for variant in variants:
+        if sum(other.width + other.offset for other in groups[-1]) >= _TOGETHER:
+            groups.append([])
+        groups[-1].append(variant)
+    return groups
 
 
 def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -638,22 +629,22 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
         return grams[:, 0, 0]
     weight = 1.0 / np.maximum(grams[:, 0, 0], 1e-300)
     total = np.einsum("s,scd->cd", weight, grams)
-    at = np.zeros(total.shape[0])
-    at[0] = 1.0
-    at[-states:] = -_response_and_loss(total, states)[0][:, 0]
-    return np.einsum("c,scd,d->s", at, grams, at)
+    vector = np.zeros(total.shape[0])
+    vector[0] = 1.0
+    vector[-states:] = -_response_and_loss(total, states)[0][:, 0]
+    return np.einsum("c,scd,d->s", vector, grams, vector)
 
 
 def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
-    """What the initial states, which may be all but alike, take off the other columns; and what rounding may take off the
-    square of the first column with it."""
+    """Find what the initial states, which may be all but alike, take off the other columns; and what rounding may take off
+    the square of the first column with it."""
     if not np.isfinite(gram[-states:, -states:]).all():  # of a model that diverges
         return np.zeros_like(gram[-states:, :-states]), 0.0
     unit, size = _influence(gram, states)
     values, vectors = np.linalg.eigh(unit)
     largest = np.max(np.abs(values))
-    kept = np.abs(values) > _ALIKE * largest
-    inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)) @ vectors.T
+    significant = np.abs(values) > _ALIKE * largest
+    inverse = (vectors * np.where(significant, 1.0 / np.where(significant, values, 1.0), 0.0)) @ vectors.T
     response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest

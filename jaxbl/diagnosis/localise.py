@@ -21,7 +21,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues
-from .residuals import Residual, SideResiduals, narrowed, noise_spectrum
+from .residuals import Residual, SideResiduals, narrow, noise_spectrum
 from .thresholds import LIMITS
 
 _BINS = 24
@@ -120,7 +120,7 @@ class SpectralPeak:
 
 @dataclass(frozen=True)
 class Localised:
-    """Where one side lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
+    """A place where one side lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
 
     Attributes:
         name: of the side.
@@ -203,89 +203,88 @@ def _excess_z(power: np.ndarray | float, noise: np.ndarray | float, variance: np
 def locate(
     residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], *, floor: float = 0.0
 ) -> Localised:
-    """Where one side lacks torque.
+    """Locate where one side lacks torque.
 
     Of several low-passes the one is taken behind which the power stands out most from the noise. Below the torque `floor`
     (N m) nothing is said to be missing.
     """
-    widest = max(one.bandwidth for one in residuals)
-    shortest = min(one.time[-1] - one.time[0] for one in residuals)
+    widest = max(residual.bandwidth for residual in residuals)
+    shortest = min(residual.time[-1] - residual.time[0] for residual in residuals)
     best: tuple[_Joined, list[np.ndarray]] | None = None
     for octave in range(7):
         cutoff = widest / 2.0**octave
         if cutoff * shortest < _SHORTEST and best is not None:
             break
-        pairs = [narrowed(one, cutoff) for one in residuals]
+        pairs = [narrow(residual, cutoff) for residual in residuals]
         joined = _Joined([low for low, _ in pairs])
         # a wider one shows more: a narrower one must be worth it
         if best is None or joined.z > _NARROWER * max(best[0].z, LIMITS.significant):
-            best = joined, [at for _, at in pairs]
+            best = joined, [rows for _, rows in pairs]
         if joined.power > _LOUD * joined.noise:
             break
     assert best is not None
-    joined, at = best
-    names = [name for name in coordinates[0] if all(name in one for one in coordinates)]
+    joined, rows_of = best
+    names = [name for name in coordinates[0] if all(name in values_of for values_of in coordinates)]
     values = {
         name: coordinates[0][name]._replace(
-            values=np.concatenate([one[name].values[rows] for one, rows in zip(coordinates, at, strict=True)])
+            values=np.concatenate(
+                [values_of[name].values[rows] for values_of, rows in zip(coordinates, rows_of, strict=True)]
+            )
         )
         for name in names
     }
     power, noise, z = joined.power, joined.noise, joined.z
     excess = max(power - noise, _LEVEL_UNKNOWN * noise)
-    found = {name: _over_coordinate(name, one, joined, excess) for name, one in values.items()}
-    longest = int(np.argmax([len(one.time) for one in residuals]))
+    over = {name: _over_coordinate(name, values_of, joined, excess) for name, values_of in values.items()}
+    longest = int(np.argmax([len(residual.time) for residual in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
     peaks = _find_peaks(residuals[longest], motion, joined.parts[longest])
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
     beyond = (z > LIMITS.significant and missing > floor) or any(
         (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
         or (region.excess_z > LIMITS.significant and region.excess > floor**2)
-        for one in found.values()
-        for region in one.regions
+        for coordinate in over.values()
+        for region in coordinate.regions
     )
-    beyond = beyond or any(one.excess_z > LIMITS.significant and one.amplitude > floor for one in peaks)
+    beyond = beyond or any(peak.excess_z > LIMITS.significant and peak.amplitude > floor for peak in peaks)
     return Localised(
         residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
-        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), found, peaks,
+        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), over, peaks,
     )  # fmt: skip
 
 
-def _binned(name: str, one: CoordinateValues, shares: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
+def _bin_samples(name: str, coordinate: CoordinateValues, shares: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
     """Ends of bins, the bin of each sample, and the number of bins; a class is a bin without ends.
 
     Bins hold shares of the samples, those of time and turns shares of the width.
     """
-    if one.classes:
-        return None, np.asarray(one.values), len(one.classes)
-    low, high = float(np.min(one.values)), float(np.max(one.values))
+    if coordinate.classes:
+        return None, coordinate.values, len(coordinate.classes)
+    low, high = float(np.min(coordinate.values)), float(np.max(coordinate.values))
     if name == "time" or name.endswith("turn") or high <= low:
         edges = np.linspace(low, max(high, np.nextafter(low, np.inf)), len(shares))
     else:
-        edges = np.unique(np.quantile(one.values, shares))
+        edges = np.unique(np.quantile(coordinate.values, shares))
     count = len(edges) - 1
-    return edges, np.clip(np.searchsorted(edges, one.values, "right") - 1, 0, count - 1), count
+    return edges, np.clip(np.searchsorted(edges, coordinate.values, "right") - 1, 0, count - 1), count
 
 
-def _over_coordinate(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> Coordinate:
-    edges, index, count = _binned(name, one, _SLOW_SHARES if name == "|speed|" else np.linspace(0.0, 1.0, _BINS + 1))
+def _over_coordinate(name: str, values_of: CoordinateValues, joined: _Joined, excess: float) -> Coordinate:
+    edges, index, count = _bin_samples(
+        name, values_of, _SLOW_SHARES if name == "|speed|" else np.linspace(0.0, 1.0, _BINS + 1)
+    )
     masks = (index[None, :] == np.arange(count)[:, None]).astype(float)
     number = np.maximum(masks.sum(axis=1), 1.0)
     power, noise = masks @ joined.torque**2, masks @ joined.deviation**2
     z = _excess_z(power, noise, joined.variance(masks, 2))
     mean = (masks @ joined.torque) / number
     error, mean_z = _mean_error(joined, index, count, mean, number, np.sqrt(joined.variance(masks, 1)) / number, name)
-    labels = one.classes or ("",) * count
+    labels = values_of.classes or ("",) * count
     ends = [(None, None)] * count if edges is None else list(itertools.pairwise(edges.tolist()))
-    regions = tuple(
-        Region(
-            labels[i], *ends[i], float(number[i] / joined.count), float((power[i] - noise[i]) / excess),
-            float((power[i] - noise[i]) / number[i]), float(z[i]), float(mean[i]), float(error[i]), float(mean_z[i]),
-        )
-        for i in range(count)
-        if masks[i].any()
-    )  # fmt: skip
-    return Coordinate(name, one.unit, one.symbol, regions, _explained_share(name, one, joined, excess))
+    beyond = power - noise
+    numbers = np.stack([number / joined.count, beyond / excess, beyond / number, z, mean, error, mean_z], axis=1).tolist()
+    regions = tuple(Region(labels[i], *ends[i], *numbers[i]) for i in range(count) if masks[i].any())
+    return Coordinate(name, values_of.unit, values_of.symbol, regions, _explained_share(name, values_of, joined, excess))
 
 
 def _mean_error(
@@ -315,8 +314,8 @@ def _mean_error(
 def _sums(torque: np.ndarray, row: np.ndarray, rows: int, index: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the samples of each row (block or fold) and bin, and their numbers; shape (rows, bins)."""
     cell = row * bins + index
-    found = [np.bincount(cell, weights, minlength=rows * bins).reshape(rows, bins) for weights in (torque, None)]
-    return found[0], found[1]
+    sums, numbers = (np.bincount(cell, weights, rows * bins).reshape(rows, bins) for weights in (torque, None))
+    return sums, numbers
 
 
 def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
@@ -324,67 +323,67 @@ def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
     if name != "time":
         return joined.block % _FOLDS
     fold = np.empty(joined.count, int)
-    for one, rows in zip(joined.parts, joined.slices, strict=True):
-        along = (one.time - one.time[0]) / (one.time[-1] - one.time[0])
+    for residual, rows in zip(joined.parts, joined.slices, strict=True):
+        along = (residual.time - residual.time[0]) / (residual.time[-1] - residual.time[0])
         fold[rows] = (along * count * _FOLDS).astype(int) % _FOLDS
     return fold
 
 
-def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> float:
+def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, excess: float) -> float:
     if joined.z < LIMITS.significant:
         # nothing to be shared out
         return 0.0
     best = 0.0
-    counts = [1] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / _IN_A_BIN, 2.0)]
+    counts = [1] if values_of.classes else [n for n in _COUNTS if n <= max(joined.effective / _IN_A_BIN, 2.0)]
     if name == "time":
         counts = [n for n in counts if n * _FOLDS <= max(joined.effective / _IN_A_BIN, 2 * _FOLDS)]
     for count in counts:
-        _, index, bins = _binned(name, one, np.linspace(0.0, 1.0, count + 1))
+        _, index, bins = _bin_samples(name, values_of, np.linspace(0.0, 1.0, count + 1))
         fold = _folds(joined, name, bins)
         sums, numbers = _sums(joined.torque, fold, _FOLDS, index, bins)
-        others = np.sum(numbers, axis=0) - numbers
-        predicted = ((np.sum(sums, axis=0) - sums) / np.maximum(others, 1))[fold, index]
+        other_counts = np.sum(numbers, axis=0) - numbers
+        predicted = ((np.sum(sums, axis=0) - sums) / np.maximum(other_counts, 1))[fold, index]
         gained = joined.power - np.sum((joined.torque - predicted) ** 2)
         best = max(best, float(gained))
     return min(best / excess, 1.0)
 
 
-def _find_peaks(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[SpectralPeak, ...]:
+def _find_peaks(residual: Residual, speed: np.ndarray | None, low: Residual) -> tuple[SpectralPeak, ...]:
     """Find narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
-    frequency, power, floor = residual_spectrum(one)
-    count = len(one.time)
-    seen = frequency <= 2.0 * one.bandwidth
-    frequency, power, floor = frequency[seen], power[seen], np.maximum(floor[seen], 1e-12 * np.max(floor))
+    frequency, power, floor = residual_spectrum(residual)
+    count = len(residual.time)
+    audible = frequency <= 2.0 * residual.bandwidth
+    frequency, power, floor = frequency[audible], power[audible], np.maximum(floor[audible], 1e-12 * np.max(floor))
     beyond = power - floor
     total = float(np.sum(low.torque**2) - np.sum(low.deviation**2)) / len(low.time) * count
-    total = max(total, _LEVEL_UNKNOWN * float(np.sum(one.deviation**2)))
+    total = max(total, _LEVEL_UNKNOWN * float(np.sum(residual.deviation**2)))
     motion = None
     if speed is not None:
-        moving = np.asarray(speed) - np.mean(speed)
+        moving = speed - np.mean(speed)
         motion = np.abs(np.fft.rfft(moving * np.hanning(count))) ** 2
     peaks: list[SpectralPeak] = []
     taken = np.arange(len(power)) < _SLOWEST
-    for at in np.argsort(-power):
+    for peak in np.argsort(-power):
         if len(peaks) == _PEAKS:
             break
-        if taken[at]:
+        if taken[peak]:
             continue
-        near = slice(max(at - 2, 0), at + 3)
+        near = slice(max(peak - 2, 0), peak + 3)
         taken[near] = True
         # a line of noise is exponential: so many times its mean is the largest of all
-        z = float(np.sqrt(max(2.0 * (power[at] / (1.1 * floor[at]) - np.log(len(power))), 0.0)))
-        if z < LIMITS.significant or power[at] < _NARROW * _around(power, at):
+        z = np.sqrt(max(2.0 * (power[peak] / (1.1 * floor[peak]) - np.log(len(power))), 0.0))
+        if z < LIMITS.significant or power[peak] < _NARROW * _around(power, peak):
             continue
-        here = float(np.sum(np.maximum(beyond[near], 0.0)))
+        here = np.sum(np.maximum(beyond[near], 0.0))
         share = here / max(total, here)
-        moved = motion is not None and float(np.sum(motion[near]) / np.sum(motion)) > _MOVED * share
-        peaks.append(SpectralPeak(float(frequency[at]), float(np.sqrt(2.0 * here / count)), share, z, moved))
+        moved = motion is not None and np.sum(motion[near]) / np.sum(motion) > _MOVED * share
+        peaks.append(SpectralPeak(float(frequency[peak]), np.sqrt(2.0 * here / count), share, z, moved))
     return tuple(peaks)
 
 
-def _around(power: np.ndarray, at: int) -> float:
-    low, high = max(at - _AROUND, 0), min(at + _AROUND + 1, len(power))
-    rows = np.r_[low : max(at - 3, low), min(at + 4, high) : high]
+def _around(power: np.ndarray, peak: int) -> float:
+    low, high = max(peak - _AROUND, 0), min(peak + _AROUND + 1, len(power))
+    rows = np.r_[low : max(peak - 3, low), min(peak + 4, high) : high]
     return float(np.median(power[rows])) if len(rows) else float("inf")
 
 
@@ -410,16 +409,16 @@ def localise(
     segments: Sequence[Segment],
     coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
 ) -> dict[str, Localised]:
-    """Where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and the
-    coordinates along them (:func:`.coordinates.all_coordinates`)."""
-    found, drives = {}, [_drives(experiment, one.kinematics) for one in segments]
+    """Locate where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and
+    the coordinates along them (:func:`.coordinates.all_coordinates`)."""
+    located, drives = {}, [_drives(experiment, segment.kinematics) for segment in segments]
     for side, pieces in residuals.items():
-        driving = np.concatenate([np.asarray(one[side]) for one in drives])
-        found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * rms(driving))
-    return found
+        driving = np.concatenate([np.asarray(driving_of[side]) for driving_of in drives])
+        located[side] = locate(pieces, coordinates[side], floor=RESOLUTION * rms(driving))
+    return located
 
 
 @jit
 def _drives(experiment: Experiment, kinematics: Kinematics) -> dict[str, jax.Array]:
     """Torque that drives each equation, N m."""
-    return {name: one.drive for name, one in balance(experiment, kinematics).items()}
+    return {name: equation.drive for name, equation in balance(experiment, kinematics).items()}

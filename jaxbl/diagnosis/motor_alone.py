@@ -32,7 +32,7 @@ from jaxbl.workers import announce
 from .confidence import Finding
 from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
-from .history import Step
+from .history import Step, describe_history
 from .judgement import judge_answers
 from .neutral_effects import candidates, with_added
 from .thresholds import LIMITS
@@ -43,15 +43,6 @@ _NOISE_ERROR = 0.25
 """Relative error of an estimated noise."""
 _LEAST = 0.01
 """Torque over the driving torque that is too small to be named: without the load's encoder ten times that with it."""
-
-
-class Found(NamedTuple):
-    """What a diagnosis consists of: the study with what was missing, `diagnosis.json`, the trace, and what was held out."""
-
-    model: Config
-    summary: JsonObject
-    trace: pd.DataFrame
-    holdout: Record
 
 
 class _Search(NamedTuple):
@@ -70,7 +61,7 @@ class _Search(NamedTuple):
     expected: Collection[str] = ()
 
     @property
-    def own(self) -> Sequence[FreeParameter]:
+    def free(self) -> Sequence[FreeParameter]:
         """The model's own numbers, which are the first."""
         return self.model.free[: len(self.none) - len(self.effects)]
 
@@ -93,89 +84,92 @@ class _Search(NamedTuple):
         return model.finish(model.evaluate(point._replace(theta=theta)))
 
 
-def sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str]:
+def list_sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str]:
     """Names of the effects that the motor alone can show and a model lacks: free play, and dry friction of one level.
 
     `exact`: names of effects that are surely not missing.
     """
-    found = []
-    taken = {(type(one).exclusive, one.place) for one in experiment.effects}
+    names = []
+    taken = {(type(effect).exclusive, effect.place) for effect in experiment.effects}
     for name in candidates(experiment):
         if name in exact:
             continue
         cls, place = EFFECTS[name], name.partition(".")[0]
-        numbers = [about.role.kind for _, about in parameters(cls) if about.role is not None]
+        numbers = [parameter.role.kind for _, parameter in parameters(cls) if parameter.role is not None]
         play = cls.free_play is not AbstractEffect.free_play and cls.suits(experiment.transmission)
         dry = cls.dry_friction is not AbstractEffect.dry_friction and numbers == ["size"]
         if play or (dry and place in ("motor", "load") and (cls.exclusive, place) not in taken):
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def _set_up(task: DiagnosisTask) -> _Search:
     config, record = task.config, task.record
     bare = on_record(config, record)
-    names, size, ratio = sought(bare, config.uncertainty.exact), input_rms(record), float(bare.drive.ratio("load"))
+    names, size, ratio = list_sought(bare, config.uncertainty.exact), input_rms(record), float(bare.drive.ratio("load"))
     # the fit chooses where it begins; these are scales
-    begun = {
+    first = {
         name: dict.fromkeys(units_of(EFFECTS[name]), 0.1 * size * (ratio if name.startswith("load.") else 1.0))
         for name in names
     }
-    added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in begun.items()]
-    model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
-    own = default_paths(config, bare)
-    paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()]
-    rest = config.log.initial_state == "rest"
-    segments = segments_of(record, ["motor"], rest)
-    free = make_free_parameters(model, [*own, *paths], signal_sizes(bare, segments))
+    added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in first.items()]
+    model = with_effects(bare, tuple(with_added(bare.effects, added, lambda effect: effect.name)))
+    own_paths = default_paths(config, bare)
+    paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in first.items()]
+    at_rest = config.log.initial_state == "rest"
+    segments = segments_of(record, ["motor"], at_rest)
+    free = make_free_parameters(model, [*own_paths, *paths], signal_sizes(bare, segments))
     width = widths(free, np.e)
-    width[: len(own)] = config.uncertainty.relative
-    effects = {name: len(own) + i for i, name in enumerate(names)}
+    width[: len(own_paths)] = config.uncertainty.relative
+    effects = {name: len(own_paths) + i for i, name in enumerate(names)}
     # what the model as given has: its own numbers, and next to none of the effects
-    none = np.array([0.0 if i < len(own) else np.log(_SMALL) for i in range(len(free))])
-    return _Search(UnseenLoad(model, free, width, segments, rest), effects, none, config.uncertainty.expected)
+    none = np.array([0.0 if i < len(own_paths) else np.log(_SMALL) for i in range(len(free))])
+    return _Search(UnseenLoad(model, free, width, segments, at_rest), effects, none, config.uncertainty.expected)
 
 
-def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
+def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Config, Record, JsonObject, pd.DataFrame]:
     """Do a diagnosis without the load's encoder; `done` is called after each of its three stages.
+
+    Returns:
+        The study with what was missing, what was held out, `diagnosis.json`, and the trace.
 
     Raises:
         InputError: a model that diverges.
     """
     search = _set_up(task)
-    model, gap, why = search.model, None, ""
+    model, gap, reason = search.model, None, ""
     play = next((name for name, i in search.effects.items() if is_gap(model.free[i])), None)
     if model.gap is not None:
         # the model's own, or one that it lacks
         gap = GapSearch(model).run()
-        point = gap.best if gap.needed or play is None else gap.without
+        point = gap.best if gap.is_needed or play is None else gap.without
     else:
         point = model.fit()
     if not np.isfinite(point.deviance):
         raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
     done()
     announce("comparing effects")
-    out = [play] if gap is not None and play is not None and not gap.needed else []
+    out = [play] if gap is not None and play is not None and not gap.is_needed else []
     history: list[Step] = []
-    point, gains = _needed(search, point, out, history)
-    if gap is not None and gap.needed and play is not None:
+    point, gains = _drop_needless(search, point, out, history)
+    if gap is not None and gap.is_needed and play is not None:
         gains[play] = gap.gain
-    point, width = _seen(search, point, out)
+    point, width = _drop_open(search, point, out)
     if gap is not None:
         # what is said of it is said of the model that is left
         gap = gap.of(point, width)
-        why = why_not(gap, model, np.e, task.record)
-    alone = alone_of(model, point, width, [search.effects[name] for name in out], gap, why)
+        reason = why_not(gap, model, np.e, task.record)
+    alone = alone_of(model, point, width, [search.effects[name] for name in out], gap, reason)
     done()
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
     held_out = task.holdout.open()
-    summary = _summary(task, held_out, search, alone, gains, out) | {"history": [step._asdict() for step in history]}
+    summary = _summary(task, held_out, search, alone, gains, out) | {"history": describe_history(history)}
     numbers = {name: _numbers(search, alone, name) for name in search.effects if name not in out}
-    own = {number.path: alone.values[number.path] for number in search.own}
-    study = extended_study(task.config, numbers, own, task.record)
+    numbers_of_model = {number.path: alone.values[number.path] for number in search.free}
+    study = extended_study(task.config, numbers, numbers_of_model, task.record)
     done()
-    return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)), held_out)
+    return study, held_out, summary, pd.DataFrame(columns_alone(task.record, alone))
 
 
 def _numbers(search: _Search, alone: Alone, name: str) -> Numbers:
@@ -184,22 +178,22 @@ def _numbers(search: _Search, alone: Alone, name: str) -> Numbers:
     return {path.rpartition(".")[2]: alone.values[path]}
 
 
-def _needed(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
+def _drop_needless(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
     """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
     tried goes into the history."""
     while True:
-        tried = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
+        points = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
         worth = search.without(out).spread(point).inflation
-        gains = {name: _gain(search, name, one, point, worth) for name, one in tried.items()}
+        gains = {name: _gain(search, name, candidate, point, worth) for name, candidate in points.items()}
         least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
         needless = least is not None and not gains[least] >= SHOWN
         for name, gain in gains.items():
-            why = f"{0.5 * SHOWN:g} nats are asked"
-            history.append(Step(f"remove {name}", -0.5 * gain, None, needless and name == least, why))
+            reason = f"{0.5 * SHOWN:g} nats are asked"
+            history.append(Step(f"remove {name}", -0.5 * gain, None, needless and name == least, reason))
         if least is None or not needless:
             return point, gains
         out.append(least)
-        point = tried[least]
+        point = points[least]
 
 
 def _gain(search: _Search, name: str, without: Point, point: Point, inflation: np.ndarray) -> float:
@@ -212,7 +206,7 @@ def _gain(search: _Search, name: str, without: Point, point: Point, inflation: n
     return float((without.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
 
 
-def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]:
+def _drop_open(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]:
     """The fit as of :meth:`UnseenLoad.settle`, without frictions whose size the log leaves open; these join `out`."""
     while True:
         point, width = search.without(out).settle(point)
@@ -227,19 +221,19 @@ def _seen(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]
 def _summary(
     task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Numbers, out: Sequence[str]
 ) -> JsonObject:
-    """As `diagnosis.json`."""
+    """Make `diagnosis.json`, but for the history."""
     record, model, values = task.record, search.model, alone.values
     noise, unit = model.noise, record.unit_of("motor.position", "rad")
-    deviation = np.sqrt(np.diag(alone.found.spread.covariance))
+    deviation = np.sqrt(np.diag(alone.search_fit.spread.covariance))
     errors = dict.fromkeys(values, float("nan"))
-    errors |= {one.path: values[one.path] * deviation[i] for i, one in enumerate(alone.found.free)}
+    errors |= {number.path: values[number.path] * deviation[i] for i, number in enumerate(alone.search_fit.free)}
     holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
     on_log = float(np.sqrt(alone.point.variance))
     limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
-    left, size = model.unexplained(alone.point), input_rms(record)
+    left, size = model.measure_unexplained(alone.point), input_rms(record)
     # noise of the recorded torque, which is known within a factor of two
     allowed = max(2.0 * model.torque_noise, _LEAST * size)
-    changes = zip(search.own, alone.point.theta / task.config.uncertainty.relative, strict=False)
+    changes = zip(search.free, alone.point.theta / task.config.uncertainty.relative, strict=False)
     far = {number.path: float(z) for number, z in changes if abs(z) > LIMITS.far}
     names = [
         name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
@@ -264,16 +258,16 @@ def _summary(
         findings.append(describe_finding(record, finding, values, errors, {}) | weight)
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
-    if alone.why:
-        kept = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.needed else ""
-        notes.append(f"No gap is shown: {alone.why}.{kept}")
+    if alone.reason:
+        fitted_gap = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.is_needed else ""
+        notes.append(f"No gap is shown: {alone.reason}.{fitted_gap}")
     part, gap = held_out.segments, gap_summary(alone)
     times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
         "verdict": judgement.verdict,
         "findings": findings,
-        "parameters": describe_parameters(record, search.own, values, errors),
+        "parameters": describe_parameters(record, search.free, values, errors),
         "where": {"motor": {"sentence": sentence}},
         "rest": {},
         "contradictions": [],

@@ -23,7 +23,7 @@ Effect = TypeVar("Effect")
 
 def candidates(experiment: Experiment) -> list[str]:
     """Names of the effects that a model's drive can have and that the model lacks."""
-    known = {effect.name for effect in experiment.effects}
+    present = {effect.name for effect in experiment.effects}
     places = {*experiment.sides, "load", "actuator"}
     if experiment.transmission is not None:
         places.add("transmission")
@@ -32,12 +32,12 @@ def candidates(experiment: Experiment) -> list[str]:
         place = name.partition(".")[0]
         # on a rigid drive the motor has all that both sides may have; only a load has the others
         twice = place == "load" and place not in experiment.sides and "motor" in cls.places
-        if cls.neutral() and place in places and name not in known and not twice:
+        if cls.neutral() and place in places and name not in present and not twice:
             names.append(name)
     return names
 
 
-def corrected(name: str) -> str | None:
+def find_corrected(name: str) -> str | None:
     """Return the dotted path of the drive's number that an effect is the error of; None where it is of none."""
     number = EFFECTS[name].corrects if name in EFFECTS else None
     return None if number is None else f"drive.{name.partition('.')[0]}_{number}"
@@ -76,7 +76,9 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
 
 def without(experiment: Experiment, name: str) -> Experiment:
     """Return a model with one of its effects at neutral numbers."""
-    return with_effects(experiment, tuple(_neutral(name) if one.name == name else one for one in experiment.effects))
+    return with_effects(
+        experiment, tuple(_neutral(name) if effect.name == name else effect for effect in experiment.effects)
+    )
 
 
 def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) -> tuple[Experiment, PlantState]:
@@ -86,20 +88,20 @@ def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) 
     along a log with all of them (benchmarks/NOTES.md).
     """
     may = {path.rpartition(".")[0].removeprefix("effects.") for path in free if path.startswith("effects.")}
-    both = [
-        (effect, own)
-        for effect, own in zip(experiment.effects, state.effects, strict=True)
-        if effect.name in may or jax.tree.leaves(own) or not _is_neutral(effect)
+    pairs = [
+        (effect, state)
+        for effect, state in zip(experiment.effects, state.effects, strict=True)
+        if effect.name in may or jax.tree.leaves(state) or not _is_neutral(effect)
     ]
-    effects, own = (tuple(some) for some in zip(*both, strict=True)) if both else ((), ())
-    return with_effects(experiment, effects), dataclasses.replace(state, effects=own)
+    effects, states = (tuple(column) for column in zip(*pairs, strict=True)) if pairs else ((), ())
+    return with_effects(experiment, effects), dataclasses.replace(state, effects=states)
 
 
 def _is_neutral(effect: AbstractEffect) -> bool:
     if effect.name not in EFFECTS or not EFFECTS[effect.name].neutral():
         return False
     pairs = zip(jax.tree.leaves(effect), jax.tree.leaves(_neutral(effect.name)), strict=True)
-    return all(np.array_equal(one, other) for one, other in pairs)
+    return all(np.array_equal(leaf, other) for leaf, other in pairs)
 
 
 class _AddedTorque(ConstantTorque):
@@ -111,21 +113,21 @@ class _AddedTorque(ConstantTorque):
 def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:
     """Return a model with a further resisting torque on each side, of zero, and its dotted path by side."""
     added = [_AddedTorque(side=side, torque=np.zeros(())) for side in experiment.sides]  # type: ignore[arg-type]
-    paths = {one.side: f"effects.{one.name}.torque" for one in added}
+    paths = {effect.side: f"effects.{effect.name}.torque" for effect in added}
     return with_effects(experiment, (*experiment.effects, *added)), paths
 
 
-def with_added(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
+def with_added(present: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
     """Effects that a model has, in their order, and others behind them; effects of the actuator before those given of a
     higher rank (:class:`jaxbl.drive.effects.ActuatorEffect`)."""
 
-    def rank(one: Effect) -> int:
-        return getattr(EFFECTS[name_of(one)], "rank", -1)
+    def rank(effect: Effect) -> int:
+        return getattr(EFFECTS[name_of(effect)], "rank", -1)
 
-    effects = list(given)
-    for one in added:
-        at = next((i for i, other in enumerate(effects) if 0 <= rank(one) < rank(other)), len(effects))
-        effects.insert(at, one)
+    effects = list(present)
+    for effect in added:
+        place = next((i for i, other in enumerate(effects) if 0 <= rank(effect) < rank(other)), len(effects))
+        effects.insert(place, effect)
     return effects
 
 

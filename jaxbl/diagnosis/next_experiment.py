@@ -27,7 +27,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, plant_trajectory
 
-from .diagnosis_summary import tied
+from .diagnosis_summary import find_tie
 from .neutral_effects import with_added
 
 _KINDS = "sine", "multisine", "chirp", "steps"
@@ -84,13 +84,13 @@ def write_next_experiment(
     Raises:
         InputError: the file cannot be written.
     """
-    pair = tied(summary)
+    pair = find_tie(summary)
     if pair is None:
         return "Nothing is tied: no experiment is needed to part effects, and none was written."
-    found = next_experiment(summary, read_config(folder / "model.toml"), record, torque, travel)
-    if found is None:
+    experiment = next_experiment(summary, read_config(folder / "model.toml"), record, torque, travel)
+    if experiment is None:
         return f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."
-    return f"To part {pair[0]} from {pair[1]}: {_written(found, record, path)}"
+    return f"To part {pair[0]} from {pair[1]}: {_write_input(experiment, record, path)}"
 
 
 def check_gap_sought(task: LogTask) -> None:
@@ -127,21 +127,23 @@ def write_gap_experiment(
     It is the input on which the model without a gap differs most from one with the largest gap that the log leaves open, or
     with the nominal one if that is smaller. Arguments as of :func:`write_next_experiment`; `summary` has `backlash`.
     """
-    said = summary["backlash"]
-    if said is None:
+    backlash = summary["backlash"]
+    if backlash is None:
         return (
             "No gap is sought: the model has one, or [uncertainty] exact says that it has none; no experiment was written."
         )
-    if said["shown"]:
+    if backlash["shown"]:
         return "No gap is in doubt: no experiment is needed to show one, and none was written."
-    half, model = float(min(said["at_most"], said["nominal"] or np.inf)), read_config(folder / "model.toml")
+    half, model = float(min(backlash["at_most"], backlash["nominal"] or np.inf)), read_config(folder / "model.toml")
     with jax.enable_x64(True):
-        models = [on_record(each, record) for each in (model, with_gap(model, said["path"], half))]
-        found = _parting(models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0)
-    what = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
-    if found is None:
-        return f"No input stays within the torque and travel allowed that would show {what}: --max-torque, --max-travel."
-    return f"To show {what}: {_written(found, record, path)}"
+        models = [on_record(config, record) for config in (model, with_gap(model, backlash["path"], half))]
+        experiment = _parting(
+            models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0
+        )
+    aim = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
+    if experiment is None:
+        return f"No input stays within the torque and travel allowed that would show {aim}: --max-torque, --max-travel."
+    return f"To show {aim}: {_write_input(experiment, record, path)}"
 
 
 def with_gap(model: Config, path: str, half: float) -> Config:
@@ -149,26 +151,27 @@ def with_gap(model: Config, path: str, half: float) -> Config:
     if path.startswith("effects."):
         data = model.to_dict()
         gap = f"transmission.{Backlash.kind}"
-        effects = [one for one in data.get("effects", []) if one["kind"] != gap]
-        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda one: one["kind"])
+        effects = [effect for effect in data.get("effects", []) if effect["kind"] != gap]
+        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda effect: effect["kind"])
         return read_config(data)
     return with_values(model, {path: half / (4.0 if path.endswith("dead_zone") else 1.0)})
 
 
-def _written(found: Input, record: Record, path: Path) -> str:
+def _write_input(experiment: Input, record: Record, path: Path) -> str:
     """Write an input as CSV; what it is, and where."""
-    time = record.sample_period * np.arange(len(found.torque))
+    time = record.sample_period * np.arange(len(experiment.torque))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
+        pd.DataFrame({"t": time, "u": experiment.torque}).to_csv(path, index=False, float_format="%.9g")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}; name another file") from None
-    clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
+    clear = "" if experiment.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
     unit = record.unit_of("motor.torque", "N m")
-    mean = f" about a mean of {found.mean:.3g} {unit}" if found.mean else ""
+    mean = f" about a mean of {experiment.mean:.3g} {unit}" if experiment.mean else ""
     return (
-        f"{found.kind} of {found.amplitude:.3g} {unit}{mean}, {found.frequency:.3g} Hz, "
-        f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
+        f"{experiment.kind} of {experiment.amplitude:.3g} {unit}{mean}, {experiment.frequency:.3g} Hz, "
+        f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {experiment.apart:.2g} nats{clear}: "
+        f"{path}"
     )
 
 
@@ -178,7 +181,7 @@ def next_experiment(
     """The input on which the last finding and its best alternative differ most; None where no input stays within limits.
 
     Args:
-        summary: of a diagnosis that has a tie (:func:`tied`).
+        summary: of a diagnosis that has a tie (:func:`find_tie`).
         model: the extended model.
         record: the log.
         torque: largest that is allowed, N m; left out: that of the log.
@@ -187,7 +190,7 @@ def next_experiment(
     data = model.to_dict() | summary["rival"]
     del data["effect"]
     with jax.enable_x64(True):
-        models = [on_record(each, record) for each in (model, read_config(data))]
+        models = [on_record(config, record) for config in (model, read_config(data))]
         return _parting(models, record, torque, travel)
 
 
@@ -200,28 +203,30 @@ def _parting(
     What another initial position or speed would make of the difference does not count.
     """
     assert record.torque is not None
-    one = models[0]
-    seen = [side for side in one.sides if side in record.positions]
-    noise = reading_noise(segments_of(record, seen))
-    largest = float(np.max(np.abs(record.torque))) if torque is None else torque
-    tried = [each._replace(torque=bias + each.torque, mean=bias) for each in _inputs(record, max(largest - abs(bias), 0.0))]
-    torques = jnp.asarray(np.stack([each.torque for each in tried]))
+    first_model = models[0]
+    sides = [side for side in first_model.sides if side in record.positions]
+    noise = reading_noise(segments_of(record, sides))
+    largest = np.max(np.abs(record.torque)) if torque is None else torque
+    inputs = [
+        trial._replace(torque=bias + trial.torque, mean=bias) for trial in _inputs(record, max(largest - abs(bias), 0.0))
+    ]
+    torques = jnp.asarray(np.stack([trial.torque for trial in inputs]))
     start = {
         side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
         for side, values in record.positions.items()
-        if side in seen
+        if side in sides
     }
-    if len(one.sides) == 2:
-        ratio = jnp.asarray(float(one.drive.ratio("load")))
+    if len(first_model.sides) == 2:
+        ratio = jnp.asarray(float(first_model.drive.ratio("load")))
         start.setdefault("load", start["motor"] / ratio)
         start["motor"] = start["load"] * ratio
     paths = [_runs(model, start, torques) for model in models]
-    apart, inside = np.zeros(len(tried)), np.ones(len(tried), bool)
-    for side in seen:
+    apart, inside = np.zeros(len(inputs)), np.ones(len(inputs), bool)
+    for side in sides:
         if travel is None:
-            reach = max(float(np.ptp(record.positions[side][part])) for part in record.segments)
+            reach = max(np.ptp(record.positions[side][part]) for part in record.segments)
         else:
-            reach = travel / (abs(float(one.drive.ratio(side))) if side != "motor" else 1.0)
+            reach = travel / (abs(float(first_model.drive.ratio(side))) if side != "motor" else 1.0)
         first, second = (np.asarray(path[side]) for path in paths)
         for path in (first, second):
             finite = np.isfinite(path).all(axis=1)
@@ -234,7 +239,7 @@ def _parting(
     if not inside.any():
         return None
     best = int(np.argmax(np.where(inside, apart, -1.0)))
-    return tried[best]._replace(apart=float(apart[best]))
+    return inputs[best]._replace(apart=float(apart[best]))
 
 
 def _inputs(record: Record, largest: float) -> list[Input]:
@@ -244,13 +249,13 @@ def _inputs(record: Record, largest: float) -> list[Input]:
     duration = min(sum(part.stop - part.start for part in record.segments) * period, _LONGEST)
     time = period * np.arange(round(duration / period))
     top = min(0.02 / period, 10.0)
-    found = []
+    inputs = []
     for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES):
         for kind in _KINDS:
             wave = _wave(kind, time, float(frequency))
             wave = wave / np.max(np.abs(wave))
-            found += [Input(kind, share * largest, float(frequency), share * largest * wave, 0.0) for share in _SHARES]
-    return found
+            inputs += [Input(kind, share * largest, float(frequency), share * largest * wave, 0.0) for share in _SHARES]
+    return inputs
 
 
 def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
@@ -271,7 +276,7 @@ def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
 def _runs(
     experiment: Experiment, position: dict[str, Array], torques: Float[Array, "inputs samples"]
 ) -> dict[str, Float[Array, "inputs samples"]]:
-    rest = experiment.plant.init(experiment.initial)
+    initial = experiment.plant.init(experiment.initial)
     still = jax.tree.map(jnp.zeros_like, position)
-    start = PlantState(position, still, rest.effects)
+    start = PlantState(position, still, initial.effects)
     return jax.vmap(lambda torque: plant_trajectory(experiment, start, torque).position)(torques)

@@ -65,31 +65,31 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
         driving: torque that drives the machine, rms, N m.
     """
     parts = [(path, _rows_of(log, rows)) for path, rows in task.record.logs]
-    parts = [(path, one) for path, one in parts if one.segments]
+    parts = [(path, part) for path, part in parts if part.segments]
     if len(parts) < 2 or not fitted.free:
         return []
     folder = commonpath([path.parent for path, _ in parts])
-    names, shown = [relpath(path, folder) for path, _ in parts], [_shown(fitted, one) for _, one in parts]
-    found = []
+    names, by_log = [relpath(path, folder) for path, _ in parts], [_read_numbers(fitted, part) for _, part in parts]
+    contradicting = []
     for k, number in enumerate(fitted.free):
         apart = {
-            (one, other): z
-            for one, other in itertools.combinations(range(len(shown)), 2)
-            if (z := _apart(shown[one], shown[other], k, _LEAST * driving)) > LIMITS.contradicting
+            (first, other): z
+            for first, other in itertools.combinations(range(len(by_log)), 2)
+            if (z := _apart(by_log[first], by_log[other], k, _LEAST * driving)) > LIMITS.contradicting
         }
         if not apart:
             continue
         value, slope = (float(of(fitted.theta[k])) for of in (number.value, number.slope))
-        both = [
-            OfLog(names[i], value + slope * float(shown[i].change[k]), abs(slope) * float(shown[i].error[k]))
+        pair = [
+            OfLog(names[i], value + slope * float(by_log[i].change[k]), abs(slope) * float(by_log[i].error[k]))
             for i in max(apart, key=lambda pair: apart[pair])
         ]
-        found.append(Contradiction(number.path, *sorted(both, key=lambda of: of.value)))
-    return found
+        contradicting.append(Contradiction(number.path, *sorted(pair, key=lambda of: of.value)))
+    return contradicting
 
 
-class _Shown(NamedTuple):
-    """What a log says of a model's theta: by how much each number should be changed, the standard error, the torque of a
+class _Reading(NamedTuple):
+    """A model's theta as a log shows it: by how much each number should be changed, the standard error, the torque of a
     change of 1 at the motor, rms, N m, and by how much noise in that torque makes the change too small: a regression loses
     the square of noise over size."""
 
@@ -99,18 +99,18 @@ class _Shown(NamedTuple):
     lost: np.ndarray
 
 
-def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
+def _read_numbers(fitted: FittedModel, log: ReferenceLog) -> _Reading:
     now, noises = log.missing(fitted.experiment), log.missing(fitted.experiment, "deviation")
     moved = [
-        log.missing(set_leaves(fitted.experiment, arrays({one.path: one.value(at + _STEP)})))
-        for one, at in zip(fitted.free, fitted.theta, strict=True)
+        log.missing(set_leaves(fitted.experiment, arrays({number.path: number.value(theta + _STEP)})))
+        for number, theta in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
     sides, torque, lost, count = [], np.zeros(len(moved)), np.full(len(moved), np.inf), 1
     for i, (side, every_row) in enumerate(now.items()):
         friction, moving = log.lacking_friction(fitted.experiment, side)
         missing, noise = every_row[moving], noises[side][moving]
-        slopes = np.stack([(one[side][moving] - missing) / _STEP for one in moved])
+        slopes = np.stack([(torques[side][moving] - missing) / _STEP for torques in moved])
         count += len(missing)
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             size = np.sqrt(np.nan_to_num(np.mean(slopes**2, axis=1)))
@@ -122,26 +122,26 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         size = max(rms(every_row), 1e-300)
         sides.append(BlockRegression.of(-missing / size, np.concatenate([slopes, beside]).T / size))
     regression = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
-    own = slice(len(moved))
-    change, error = regression.fit()[own], regression.errors()[own]
+    columns = slice(len(moved))
+    change, error = regression.fit()[columns], regression.errors()[columns]
     # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
     agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
     unit, size = regression.unit_matrix
-    inflation = np.diag(np.linalg.pinv(unit, rcond=1e-10, hermitian=True))[own]
-    alone = np.isfinite(size[own]) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
-    return _Shown(change, np.where(alone, error, np.inf), torque, lost)
+    inflation = np.diag(np.linalg.pinv(unit, rcond=1e-10, hermitian=True))[columns]
+    alone = np.isfinite(size[columns]) & ~agreeing & (lost < _LOST) & (inflation < _INFLATED) & (inflation > 0.0)
+    return _Reading(change, np.where(alone, error, np.inf), torque, lost)
 
 
-def _apart(one: _Shown, other: _Shown, k: int, least: float) -> float:
+def _apart(first: _Reading, other: _Reading, k: int, least: float) -> float:
     """Standard errors between two logs in a number; 0 where the difference makes less than a torque of `least`."""
-    apart = abs(one.change[k] - other.change[k]) - one.lost[k] - other.lost[k]
-    if not apart * max(one.torque[k], other.torque[k]) > least:
+    apart = abs(first.change[k] - other.change[k]) - first.lost[k] - other.lost[k]
+    if not apart * max(first.torque[k], other.torque[k]) > least:
         return 0.0
-    return float(apart / max(np.hypot(one.error[k], other.error[k]), 1e-300))
+    return float(apart / max(np.hypot(first.error[k], other.error[k]), 1e-300))
 
 
 def _rows_of(log: ReferenceLog, rows: slice) -> ReferenceLog:
     """Return the segments of a log that lie in some rows."""
-    within = [one for one in log.segments if rows.start <= one.rows.start and one.rows.stop <= rows.stop]
+    within = [segment for segment in log.segments if rows.start <= segment.rows.start and segment.rows.stop <= rows.stop]
     return dataclasses.replace(log, segments=within)

@@ -26,7 +26,7 @@ from jaxbl.records.linear_filters import filter_forwards, parzen_window
 from jaxbl.simulate import Experiment, Signals, State, TracedArrays, initial_observer_state, initial_state, replay
 
 from .neutral_effects import complete
-from .residuals import Residual, beyond_nominal, narrowed
+from .residuals import Residual, beyond_nominal, narrow
 
 _DRAWS = 6
 """Runs over the smoothed motion with drawn noise, by which the observers' own is measured: its deviation to a tenth."""
@@ -43,7 +43,7 @@ _MEMORY = 60.0
 
 
 class Observed(NamedTuple):
-    """What the observer of a side sees along a part of a record.
+    """Torque that the observer of a side sees along a part of a record.
 
     Attributes:
         residual: torque that the model lacks behind the equivalent control's low-pass (causal: late by its time constant),
@@ -57,12 +57,16 @@ class Observed(NamedTuple):
     stuck: float
 
     @property
-    def converged(self) -> bool:
-        """Whether the equivalent control says anything: it does not where the observer is not on its sliding surface."""
+    def has_converged(self) -> bool:
+        """True if the equivalent control says anything: it does not where the observer is not on its sliding surface."""
         return bool(np.isfinite(self.residual.torque).all()) and self.stuck < _OFTEN
 
 
-def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dict[str, list[Observed]]:
+SideObserved = dict[str, list[Observed]]
+"""What the observer of each side sees, part by part."""
+
+
+def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> SideObserved:
     """Torques that a model lacks on each side by its observers' equivalent control, N m.
 
     The observers begin each part at the smoothed position and velocity. Their own noise is found by runs of the same
@@ -71,26 +75,26 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
 
     The model has array leaves, the observers' gains, and the sample period of the record.
     """
-    found: dict[str, list[Observed]] = {side: [] for side in experiment.sides}
+    observed: SideObserved = {side: [] for side in experiment.sides}
     bare = eqx.tree_at(lambda e: e.identifier, experiment, None, is_leaf=lambda x: x is None)
     for i, segment in enumerate(segments):
         random, part = np.random.default_rng(i), segment.kinematics
         # a structure for which there is a program
         beyond = beyond_nominal(complete(experiment), segment)
-        known, readings = {}, {}
+        modelled, readings = {}, {}
         for side in experiment.sides:
             smoothed = segment.smoothed[side]
-            known[side] = _held(*beyond[side]) / float(experiment.drive.inertia(side))
+            modelled[side] = _hold_torque(*beyond[side]) / float(experiment.drive.inertia(side))
             drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
-            runs = np.concatenate([segment.readings[side][None], np.asarray(part.position[side]) + drawn])
+            runs = np.concatenate([segment.readings[side][None], part.position[side] + drawn])
             readings[side] = runs
-        controls = _controls(bare, segment.torque, readings, known, part)
+        controls = _controls(bare, segment.torque, readings, modelled, part)
         for side in experiment.sides:
-            found[side].append(_observed(experiment, side, part, np.asarray(controls[side])))
-    return found
+            observed[side].append(_observe_side(experiment, side, part, np.asarray(controls[side])))
+    return observed
 
 
-def _held(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
+def _hold_torque(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
     """Torque to be held from each sample to the next, so that the implicit observer's position moves as under the true one.
 
     Held from sample k on, p_k moves the observer's positions by second differences of h^2 (p_{k-1} + p_k) / (2 J), where
@@ -105,30 +109,30 @@ def _held(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
 
 @jit
 def _controls(
-    experiment: Experiment, torque: Array, readings: TracedArrays, known: TracedArrays, part: Kinematics
+    experiment: Experiment, torque: Array, readings: TracedArrays, added: TracedArrays, part: Kinematics
 ) -> dict[str, Float[Array, "runs samples"]]:
     """Filtered equivalent control of each side, rad/s^2, for several readings of one motion."""
 
     def keep(state: State, signals: Signals) -> dict[str, Any]:
         return {side: signals.side(side).equivalent_control for side in experiment.sides}
 
-    def one(measured: TracedArrays) -> TracedArrays:
+    def run(measured: TracedArrays) -> TracedArrays:
         begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
         motion = {side: (part.position[side][0], part.velocity[side][0]) for side in experiment.sides}
-        at = {side: initial_observer_state(experiment, side, *found) for side, found in motion.items()}
-        state = State(None, at, begin.equivalent_control, begin.identifier)
-        return replay(experiment, torque, measured, record=keep, state=state, added_accelerations=known)[1]
+        observers = {side: initial_observer_state(experiment, side, *first) for side, first in motion.items()}
+        state = State(None, observers, begin.equivalent_control, begin.identifier)
+        return replay(experiment, torque, measured, record=keep, state=state, added_accelerations=added)[1]
 
-    return jax.vmap(one)(readings)
+    return jax.vmap(run)(readings)
 
 
 def _share(experiment: Experiment) -> float:
-    """Of the difference that the equivalent control's low-pass takes in at each sample."""
+    """Share of the difference that the equivalent control's low-pass takes in at each sample."""
     constant, period = float(experiment.equivalent_control.time_constant), float(experiment.run.sample_period)
     return -math.expm1(-period / constant) if constant > 0.0 else 1.0
 
 
-def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.ndarray) -> Observed:
+def _observe_side(experiment: Experiment, side: str, part: Kinematics, controls: np.ndarray) -> Observed:
     share, period = _share(experiment), float(experiment.run.sample_period)
     constant = float(experiment.equivalent_control.time_constant)
     skipped = min(max(math.ceil(_SETTLING / share), _LEAST_SKIPPED), len(part.time) // 4)
@@ -159,7 +163,7 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
     return Observed(residual, skipped, stuck)
 
 
-def compared(
+def compare_observers(
     experiment: Experiment, observed: Sequence[Observed], residuals: Sequence[Residual], cutoff: float
 ) -> dict[str, Any]:
     """The observers' residual of a side beside the smoother's, both behind both low-passes: the observers' and a common one
@@ -170,25 +174,25 @@ def compared(
         smoother's, and `smoother_rms`, that one behind the same low-passes, N m; `bandwidth` of the narrower low-pass, Hz.
         Numbers are None where the observers do not converge.
     """
-    if not all(one.converged for one in observed):
+    if not all(piece.has_converged for piece in observed):
         return {"converged": False} | dict.fromkeys(("rms", "noise", "correlation", "smoother_rms", "bandwidth"))
     share = _share(experiment)
-    own, other, noise, bandwidth = [], [], [], cutoff
-    for one, smooth in zip(observed, residuals, strict=True):
+    seen_torques, other, noise, bandwidth = [], [], [], cutoff
+    for piece, smooth in zip(observed, residuals, strict=True):
         late = filter_forwards(smooth.torque, [share], [share - 1.0])
-        low, _ = narrowed(one.residual, cutoff)
-        beside = dataclasses.replace(one.residual, torque=late[one.skipped :])
-        own.append(low.torque)
+        low, _ = narrow(piece.residual, cutoff)
+        beside = dataclasses.replace(piece.residual, torque=late[piece.skipped :])
+        seen_torques.append(low.torque)
         noise.append(low.deviation)
-        other.append(narrowed(beside, cutoff)[0].torque)
+        other.append(narrow(beside, cutoff)[0].torque)
         bandwidth = low.bandwidth
-    mine, theirs = np.concatenate(own), np.concatenate(other)
-    both = math.sqrt(float(np.mean(mine**2) * np.mean(theirs**2)))
+    mine, theirs = np.concatenate(seen_torques), np.concatenate(other)
+    size = math.sqrt(np.mean(mine**2) * np.mean(theirs**2))
     return {
         "converged": True,
         "rms": rms(mine),
         "noise": rms(np.concatenate(noise)),
-        "correlation": float(np.mean(mine * theirs)) / both if both > 0.0 else None,
+        "correlation": np.mean(mine * theirs) / size if size > 0.0 else None,
         "smoother_rms": rms(theirs),
         "bandwidth": bandwidth,
     }

@@ -33,27 +33,6 @@ from .setup import Setup, quiet
 from .thresholds import LIMITS
 
 
-class Control(NamedTuple):
-    """The best model with another effect in place of one of them, which must not do as well on the proof.
-
-    Attributes:
-        effect: the other one.
-        errors: rms, by channel.
-        z: standard errors by which the errors of the model with the effects that were found are smaller.
-    """
-
-    effect: str
-    errors: Errors
-    z: float
-
-
-class Untested(NamedTuple):
-    """An effect that the proof does not test: its torque there, and on the log that was fitted, N m, rms at the motor."""
-
-    torque: float
-    on_log: float
-
-
 class Proof(NamedTuple):
     """A model beside what was held out.
 
@@ -63,9 +42,11 @@ class Proof(NamedTuple):
         expected: errors of a complete model, by channel.
         failed: channels in which the model leaves more, but for the weak ones.
         worse: whether the model as given predicts better, all channels together.
-        control: of the model, or None.
+        controls: the best model with another effect in place of one of them, which must not do as well, as in
+            `diagnosis.json`.
         weak: channels that test nothing, since a complete model may leave more than the motion or the driving torque.
-        untested: effects without which the model would pass as well.
+        untested: effects without which the model would pass as well: their torque there, and on the log that was fitted
+            (`on_log`), N m, rms at the motor.
         gap: errors before and after, noise, and the free run, as in `diagnosis.json`.
     """
 
@@ -76,9 +57,9 @@ class Proof(NamedTuple):
     expected: dict[str, Expected]
     failed: list[str]
     worse: bool
-    control: Control | None
+    controls: JsonObject
     weak: list[str]
-    untested: dict[str, Untested]
+    untested: JsonObject
     gap: JsonObject
 
     @property
@@ -89,20 +70,20 @@ class Proof(NamedTuple):
 
 def open_held_out(setup: Setup) -> tuple[Record, ReferenceLog]:
     """Open what was held out, as models are compared with it; it is cleaned and smoothed as the log was."""
-    record, rest = setup.task.holdout.open(), setup.task.config.log.initial_state == "rest"
-    segments = quiet(segments_of(record, setup.nominal.sides, rest), setup.input_noise.unfelt)
-    return record, ReferenceLog(segments, setup.fitted.bandwidth, rest and setup.task.separate)
+    record, at_rest = setup.task.holdout.open(), setup.task.config.log.initial_state == "rest"
+    segments = quiet(segments_of(record, setup.nominal.sides, at_rest), setup.input_noise.unfelt)
+    return record, ReferenceLog(segments, setup.fitted.bandwidth, at_rest and setup.task.separate)
 
 
 def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog]:
     """Give a model the zeros that another log counts from, by the first fifth of its segments; and the rest of that log."""
     cuts = [(segment, round(FIRST_FIFTH * len(segment))) for segment in log.segments]
-    first, rest = (replace(log, segments=part) for part in zip(*((s[:cut], s[cut:]) for s, cut in cuts), strict=True))
+    first, later = (replace(log, segments=part) for part in zip(*((s[:cut], s[cut:]) for s, cut in cuts), strict=True))
     names = [owner_of(number)[0] for number in chosen.fitted.free]
     zeros = [i for i, name in enumerate(names) if name in EFFECTS and EFFECTS[name].in_log]
     for i in zeros:
         chosen = chosen._replace(fitted=_fit_zero(chosen.fitted, i, first))
-    return (chosen, replace(rest, rest=False)) if zeros else (chosen, log)
+    return (chosen, replace(later, at_rest=False)) if zeros else (chosen, log)
 
 
 def _fit_zero(fitted: FittedModel, i: int, log: ReferenceLog) -> FittedModel:
@@ -110,9 +91,9 @@ def _fit_zero(fitted: FittedModel, i: int, log: ReferenceLog) -> FittedModel:
     number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
     free = make_free_parameters(fitted.experiment, [number.path], 1.0)
     spread = np.array([ZERO_SPREAD / free[0].scale])
-    found = ModelFits(fitted.experiment, free, spread, log.segments).fit({}, np.zeros(1))
-    theta[i] = number.theta(free[0].value(found.theta[0]))
-    white[i, i] = found.covariance[0, 0] * (free[0].scale / number.scale) ** 2
+    zero = ModelFits(fitted.experiment, free, spread, log.segments).fit({}, np.zeros(1))
+    theta[i] = number.theta(free[0].value(zero.theta[0]))
+    white[i, i] = zero.covariance[0, 0] * (free[0].scale / number.scale) ** 2
     return fitted._replace(theta=theta, white=white, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
 
 
@@ -131,8 +112,8 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
-        bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.seen,
-        _control(chosen, log, after),
+        bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
+        _compare_rival(chosen, log, after),
         weak,
         _find_untested(setup, chosen, log, expected),
         _describe_gap(setup, chosen, record, log, before, after),
@@ -141,44 +122,46 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
 
 def _reach(log: ReferenceLog) -> Errors:
     """Measure how far a log reaches: travel and largest speed of each side, and largest torque of the input."""
-    found = {name: float(np.ptp(values)) for name, values in log.readings().items()}
+    reach = {name: np.ptp(values) for name, values in log.readings().items()}
     for side in log.noise:
-        speeds = np.concatenate([np.asarray(segment.smoothed[side].velocity) for segment in log.segments])
-        found[f"velocity_{side}"] = float(np.max(np.abs(speeds)))
+        speeds = np.concatenate([segment.smoothed[side].velocity for segment in log.segments])
+        reach[f"velocity_{side}"] = float(np.max(np.abs(speeds)))
     torques = np.concatenate([segment.torque for segment in log.segments])
-    return found | {"torque_motor": float(np.max(np.abs(torques)))}
+    return reach | {"torque_motor": float(np.max(np.abs(torques)))}
 
 
 def _sizes(log: ReferenceLog, experiment: Experiment, driving: float) -> Errors:
-    """What is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives it, N m,
-    rms; `driving`: that of the input."""
-    found = {name: float(np.std(values)) for name, values in log.readings().items()}
-    return found | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
+    """Size of what is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives
+    it, N m, rms; `driving`: that of the input."""
+    sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
+    return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 
 
-def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Mapping[str, Expected]) -> dict[str, Untested]:
+def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Mapping[str, Expected]) -> JsonObject:
     """Effects without which the model would leave no more than a complete one may."""
-    found = {}
+    untested, model = {}, chosen.fitted.experiment
     for name in chosen.fitted.names:
-        less = without(chosen.fitted.experiment, name)
+        less = without(model, name)
         if not list_failed(log.with_slow(log.compare(less)), expected):
-            found[name] = Untested(*(_torque_between(part, chosen.fitted.experiment, less) for part in (log, setup.fitted)))
-    return found
+            parts = {"torque": log, "on_log": setup.fitted}
+            untested[name] = {key: _torque_between(part, model, less) for key, part in parts.items()}
+    return untested
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:
     """Torque by which two models differ along a log, at the motor, rms, N m."""
-    pair = [log.missing(each) for each in (model, other)]
+    pair = [log.missing(experiment) for experiment in (model, other)]
     return float(
         np.hypot.reduce([rms(pair[0][side] - pair[1][side]) / float(model.drive.ratio(side)) for side in model.sides])
     )
 
 
-def _control(chosen: Chosen, log: ReferenceLog, after: Comparison) -> Control | None:
+def _compare_rival(chosen: Chosen, log: ReferenceLog, after: Comparison) -> JsonObject:
     if chosen.rival is None:
-        return None
+        return {}
     other = log.compare(chosen.rival.fitted.experiment)
-    return Control(chosen.rival.effect, other.errors, standard_errors_better(log, other, after))
+    z = standard_errors_better(log, other, after)
+    return {"wrong": {"effect": chosen.rival.effect, "rmse": other.errors, "z": z}}
 
 
 def _describe_gap(
@@ -187,7 +170,7 @@ def _describe_gap(
     """Errors before and after, and the noise."""
     noise = log.noise_of(after)
     reach, there = _reach(setup.fitted), _reach(log)
-    found: JsonObject = {
+    summary: JsonObject = {
         "holdout": {
             "file": str(record.path.resolve()),
             "separate": setup.task.separate,
@@ -207,10 +190,10 @@ def _describe_gap(
     for name, experiment in (("before", setup.nominal), ("after", chosen.fitted.experiment)):
         errors, growth = log.free_run(experiment)
         if not growth < PREDICTABLE:
-            found["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
+            summary["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
             break
-        found["free_run"][name] = errors
-    return found
+        summary["free_run"][name] = errors
+    return summary
 
 
 _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}

@@ -25,7 +25,7 @@ from jaxbl.simulate import Experiment, NamedArrays
 
 from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques
-from .residuals import SideResiduals, as_smoothed, low_passed, narrowed, residual_torques
+from .residuals import SideResiduals, as_smoothed, low_passed, narrow, residual_torques
 
 BLOCKS = 16
 """Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
@@ -79,12 +79,12 @@ class ReferenceLog:
     Attributes:
         segments: of the log.
         bandwidth: of the low-pass that missing torques are looked at behind, Hz, by side.
-        rest: whether each segment begins at rest.
+        at_rest: whether each segment begins at rest.
     """
 
     segments: Sequence[Segment]
     bandwidth: Mapping[str, float]
-    rest: bool = False
+    at_rest: bool = False
 
     @property
     def period(self) -> float:
@@ -103,10 +103,10 @@ class ReferenceLog:
 
     def noise_floor(self, torques: SideResiduals) -> Errors:
         """Noise of each channel: what a perfect model would leave."""
-        found = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
+        floor = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
         for side in self.noise:
-            found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
-        return found | {name: _rms([one]) for name, one in self._narrowed(torques, "deviation").items()}
+            floor[f"velocity_{side}"] = _rms([segment.smoothed[side].deviation(1) for segment in self.segments])
+        return floor | {name: _rms([noise]) for name, noise in self._narrow_torques(torques, "deviation").items()}
 
     def noise_of(self, compared: Comparison) -> Errors:
         """Noise of each channel, slow torques among them: what the smoother finds or, where that is more, the white part of
@@ -114,15 +114,15 @@ class ReferenceLog:
 
         Of a rough motion the smoother takes noise for motion; what a torque does to a position is never white.
         """
-        found = self.noise_floor(compared.torques) | _all_rms(self.slow(compared.torques, "deviation"))
+        noises = self.noise_floor(compared.torques) | _all_rms(self.slow(compared.torques, "deviation"))
         for side, noise in self.noise.items():
             position = POSITION_CHANNELS[side]
             more = max(1.0, estimate_white_noise(list(compared.samples[position])) / noise)
-            for name in found:
+            for name in noises:
                 if name == position or name.partition(" ")[0].endswith(f"_{side}"):
-                    found[name] *= more
-            found[position] *= np.hypot(1.0, compared.noise.get(position, 0.0))
-        return found
+                    noises[name] *= more
+            noises[position] *= np.hypot(1.0, compared.noise.get(position, 0.0))
+        return noises
 
     def with_slow(self, compared: Comparison) -> Errors:
         """Errors of a comparison, and those of slow torques besides: `torque_motor below 12 Hz`, ..."""
@@ -130,41 +130,42 @@ class ReferenceLog:
 
     def slow(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
         """Missing torques, or their noise, behind narrower low-passes, N m, by `torque_motor below 12 Hz` and so on."""
-        found = {}
+        slow_torques = {}
         for side, pieces in torques.items():
             for cutoff in (self.bandwidth[side] / factor for factor in _SLOW):
-                if 2.0 * cutoff * sum(len(one.time) * one.period for one in pieces) >= _LEAST_VALUES:
-                    values = [getattr(narrowed(one, cutoff)[0], name) for one in pieces]
-                    found[f"torque_{side} below {cutoff:.3g} Hz"] = np.concatenate(values)
-        return found
+                if 2.0 * cutoff * sum(len(piece.time) * piece.period for piece in pieces) >= _LEAST_VALUES:
+                    values = [getattr(narrow(piece, cutoff)[0], name) for piece in pieces]
+                    slow_torques[f"torque_{side} below {cutoff:.3g} Hz"] = np.concatenate(values)
+        return slow_torques
 
-    def _narrowed(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
+    def _narrow_torques(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
         """Missing torques, or their noise, behind the low-pass, N m."""
         return {
-            f"torque_{side}": np.concatenate([getattr(narrowed(one, self.bandwidth[side])[0], name) for one in pieces])
+            f"torque_{side}": np.concatenate([getattr(narrow(piece, self.bandwidth[side])[0], name) for piece in pieces])
             for side, pieces in torques.items()
         }
 
     def largest_departures(self, experiment: Experiment) -> Errors:
-        """How far a model departs from each side's motion on short windows from the smoothed states, over its range.
+        """Measure how far a model departs from each side's motion on short windows from the smoothed states, over its range.
 
         Or over the way on which the input would move a free motor within a window, where that is more: a model that lacks
         the friction of a slow drive goes as far.
         """
-        force = max(float(np.max(np.abs(one.torque))) for one in self.segments) * float(experiment.plant.input_gain)
+        force = max(np.max(np.abs(segment.torque)) for segment in self.segments) * float(experiment.plant.input_gain)
         free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
         experiment, _ = with_torques(experiment)
-        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.rest)[0])
-        simulated, found = _run(experiment, windows, windows.start).position, {}
+        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.at_rest)[0])
+        simulated, departures = _run(experiment, windows, windows.start).position, {}
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(
-                *(float(np.ptp(one.readings[side])) for one in self.segments), free / float(experiment.drive.ratio(side))
+                *(np.ptp(segment.readings[side]) for segment in self.segments),
+                free / float(experiment.drive.ratio(side)),
             )
-            found[side] = apart / span if np.isfinite(apart) else np.inf
-        return found
+            departures[side] = apart / span if np.isfinite(apart) else np.inf
+        return departures
 
-    def compare(self, whole: Experiment, models: Sequence[Experiment] = ()) -> Comparison:
+    def compare(self, experiment: Experiment, models: Sequence[Experiment] = ()) -> Comparison:
         """Errors of a model at this log's period on short windows, and the torques that it lacks.
 
         Args:
@@ -172,11 +173,11 @@ class ReferenceLog:
             models: one for each part of the log (:func:`parts_of_blocks`), such as ones whose numbers were fitted without
                 it, whose errors there are taken in place of the model's.
         """
-        torques, parts, noises = self._lacking(whole), [], []
-        for i, model in enumerate(models or [whole]):
+        torques, parts, noises = self.find_lacking(experiment), [], []
+        for i, model in enumerate(models or [experiment]):
             part = i, len(models) or 1
             samples, noise = self._samples(model, self.samples, _STATES, part)
-            narrowed = self._narrowed(self._lacking(model) if models else torques)
+            narrowed = self._narrow_torques(self.find_lacking(model) if models else torques)
             parts.append(samples | {name: torque[_rows_of(len(torque), part)] for name, torque in narrowed.items()})
             noises.append(noise)
         samples = {}
@@ -185,9 +186,10 @@ class ReferenceLog:
             rows = np.concatenate([_rows_of(len(errors), (i, len(parts))) for i in range(len(parts))])
             samples[name] = errors[np.argsort(rows)]
         noise = {name: rms(np.array([added_noise[name] for added_noise in noises])) for name in noises[0]}
-        return Comparison(_all_rms(samples), torques, samples, float(whole.plant.input_gain), noise)
+        return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain), noise)
 
-    def _lacking(self, experiment: Experiment) -> SideResiduals:
+    def find_lacking(self, experiment: Experiment) -> SideResiduals:
+        """Torques that a model lacks, by side, segment by segment."""
         return residual_torques(at_period(experiment, self.period), self.segments)
 
     def readings(self) -> NamedArrays:
@@ -205,31 +207,31 @@ class ReferenceLog:
         what was before; its friction does not jump.
         """
         experiment = at_period(experiment, self.period)
-        if experiment.plant.has_memory or any(one.transmitted is not None for one in self.segments):
+        if experiment.plant.has_memory or any(segment.transmitted is not None for segment in self.segments):
             return {}
         run, firsts = self._runs(experiment, self.samples, _STATES)
         pieces = []
         for i, first in enumerate(firsts):
-            whole = next(one for one in self.segments if one.rows.start <= first < one.rows.stop)
+            segment = next(segment for segment in self.segments if segment.rows.start <= first < segment.rows.stop)
             readings = {side: np.asarray(run.states.position[side])[i] for side in experiment.sides}
             smoothed = {
-                side: smooth(one, self.period, known=(whole.smoothed[side].noise, whole.smoothed[side].jerk))
-                for side, one in readings.items()
+                side: smooth(values, self.period, noise_and_jerk=(segment.smoothed[side].noise, segment.smoothed[side].jerk))
+                for side, values in readings.items()
             }
             rows = slice(int(first), int(first) + self.samples)
-            inside = slice(rows.start - whole.rows.start, rows.stop - whole.rows.start)
-            known = whole.torque[:1] if whole.before is None else whole.before
-            before = np.concatenate([np.repeat(known[:1], _BEFORE), known, whole.torque[: inside.start]])[-_BEFORE:]
+            inside = slice(rows.start - segment.rows.start, rows.stop - segment.rows.start)
+            earlier = segment.torque[:1] if segment.before is None else segment.before
+            before = np.concatenate([np.repeat(earlier[:1], _BEFORE), earlier, segment.torque[: inside.start]])[-_BEFORE:]
             pieces.append(
-                Segment(rows, whole.time[inside], self.period, whole.torque[inside], readings, smoothed, before=before)
+                Segment(rows, segment.time[inside], self.period, segment.torque[inside], readings, smoothed, before=before)
             )
         torques = residual_torques(experiment, pieces)
-        return _all_rms(self._narrowed(torques) | self.slow(torques))
+        return _all_rms(self._narrow_torques(torques) | self.slow(torques))
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
-        torques = self._lacking(experiment)
-        return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
+        torques = self.find_lacking(experiment)
+        return {side: self._narrow_torques({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
 
     def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
         """A dry friction and a steady torque of 1 N m on a side, behind the low-pass as in :meth:`missing`, shape
@@ -237,10 +239,10 @@ class ReferenceLog:
         effects = [effect for effect in experiment.effects if effect.place == side]
         dry = not any(type(effect).exclusive for effect in effects)
         steady = not any(isinstance(effect, ConstantTorque) for effect in effects)
-        pieces, columns = self._lacking(experiment)[side], []
+        pieces, columns = self.find_lacking(experiment)[side], []
         for segment, piece in zip(self.segments, pieces, strict=True):
             smoothed = segment.smoothed[side]
-            moving = ~np.asarray(smoothed.held(self.period))
+            moving = ~smoothed.find_standstill(self.period)
             signals = np.stack([dry * np.sign(smoothed.velocity), steady * np.ones(len(segment)), moving])
             columns.append(low_passed(as_smoothed(signals, smoothed, self.period), piece, self.bandwidth[side]))
         friction = np.concatenate(columns, axis=1)
@@ -255,47 +257,47 @@ class ReferenceLog:
         experiment, longest = at_period(experiment, self.period), max(map(len, self.segments))
         spare = max(longest.bit_length() - 4, 0)
         length = longest >> spare << spare
-        one = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
-        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN)[0])
-        smoothed = one.segments[0].smoothed
-        deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
-        return errors, one._growth(experiment, length, deviation)
+        log = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
+        errors = _all_rms(log._samples(experiment, length, _STATES_OF_ONE_RUN)[0])
+        smoothed = log.segments[0].smoothed
+        deviation = {side: float(np.median(part.deviation(1))) for side, part in smoothed.items()}
+        return errors, log._growth(experiment, length, deviation)
 
     def _samples(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[NamedArrays, Errors]:
         """Errors of positions and speeds on windows of a length, where windows are foretold; shape (windows, samples). And
         what noise adds by way of the initial states, as of a comparison."""
         run, firsts = self._runs(experiment, length, passes, part)
         rows = firsts[:, None] + np.arange(length)[None, :]
-        found = {
+        errors_of = {
             POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
         }
         for side in experiment.sides:
             smoothed = np.full(self.segments[-1].rows.stop, np.nan)
-            for one in self.segments:
-                smoothed[one.rows] = one.smoothed[side].velocity
-            found[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
+            for segment in self.segments:
+                smoothed[segment.rows] = segment.smoothed[side].velocity
+            errors_of[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
         noise = {POSITION_CHANNELS[side]: float(run.noise[i]) for i, side in enumerate(experiment.sides)}
-        return {name: errors[:, count_seen(length) :] for name, errors in found.items()}, noise
+        return {name: errors[:, count_seen(length) :] for name, errors in errors_of.items()}, noise
 
     def _runs(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[Run, np.ndarray]:
         """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
         # the loop of steps is that of linearisations, which have these torques
         experiment, _ = with_torques(at_period(experiment, self.period))
-        windows, firsts = windows_of(self.segments, experiment, length, self.rest)
-        which = _rows_of(len(firsts), part)
-        return best_runs(experiment, windows, passes, self.rest, which), firsts[which]
+        windows, firsts = windows_of(self.segments, experiment, length, self.at_rest)
+        indices = _rows_of(len(firsts), part)
+        return best_runs(experiment, windows, passes, self.at_rest, indices), firsts[indices]
 
     def _growth(self, experiment: Experiment, length: int, deviation: Mapping[str, float]) -> float:
         """Change of the positions by a standard deviation of the initial speeds, over the motion; the largest."""
         experiment, _ = with_torques(experiment)
-        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, length, self.rest)[0])
+        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, length, self.at_rest)[0])
         start, step = windows.start, 1e-3
         moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
-        begun = start, PlantState(start.position, moved, start.effects)
-        one, other = (_run(experiment, windows, state).position for state in begun)
+        starts = start, PlantState(start.position, moved, start.effects)
+        position, other = (_run(experiment, windows, state).position for state in starts)
         # of what diverges, or of a side that never moved, nothing can be predicted
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            change = {side: _rms([np.asarray(other[side][0] - one[side][0])]) / step for side in experiment.sides}
+            change = {side: _rms([np.asarray(other[side][0] - position[side][0])]) / step for side in experiment.sides}
             return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
 
 
@@ -317,9 +319,9 @@ def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantSt
 
 
 def _all_rms(samples: NamedArrays) -> Errors:
-    return {name: _rms([one]) for name, one in samples.items()}
+    return {name: _rms([errors]) for name, errors in samples.items()}
 
 
 def _rms(pieces: Sequence[np.ndarray]) -> float:
-    values = np.concatenate([np.ravel(one) for one in pieces])
+    values = np.concatenate([np.ravel(piece) for piece in pieces])
     return rms(values) if np.isfinite(values).all() else float("inf")

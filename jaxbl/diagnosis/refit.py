@@ -20,7 +20,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters, set_free_parameters
 from jaxbl.estimation.intervals import spread_of
 from jaxbl.estimation.logs import arrays
-from jaxbl.estimation.regression import begun
+from jaxbl.estimation.regression import begin_states
 from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
@@ -79,22 +79,22 @@ class ModelFits:
         self.given = self.linearise({}, 0.0 * prior)
         self._units: dict[tuple[str, ...], float] = {}
 
-    def linearise(self, numbers: EffectNumbers, own: np.ndarray) -> Linear:
+    def linearise(self, numbers: EffectNumbers, theta: np.ndarray) -> Linear:
         """Linearise a model with some effects about the motion of the log."""
         added = make_free_parameters(with_numbers(self.nominal, numbers), paths_of(numbers), self._torque)
         widths = [EFFECTS[name].roles()[leaf].width for name in numbers for leaf in fitted_numbers(name)]
-        at, prior = np.concatenate([own, np.zeros(len(added))]), np.concatenate([self.prior, widths])
-        return Linear(with_numbers(self.nominal, numbers), (*self.free, *added), at, prior, self.segments)
+        start, prior = np.concatenate([theta, np.zeros(len(added))]), np.concatenate([self.prior, widths])
+        return Linear(with_numbers(self.nominal, numbers), (*self.free, *added), start, prior, self.segments)
 
     @property
     def _torque(self) -> float:
         """Return the size of the input, N m."""
-        return float(np.std(np.concatenate([one.torque for one in self.segments])))
+        return float(np.std(np.concatenate([segment.torque for segment in self.segments])))
 
     def fit(
         self,
         numbers: EffectNumbers,
-        own: np.ndarray,
+        theta: np.ndarray,
         begin: FittedModel | None = None,
         new: Sequence[str] = (),
         promise: float = 0.0,
@@ -110,19 +110,21 @@ class ModelFits:
                 to a dry friction may lead over a hill.
         """
         end = None if begin is None else begin.end
-        before = own if end is None else end.own
-        starts = [(1.0, own, end), *([(0.0, before, end)] if new and end else [])]
+        before = theta if end is None else end.theta
+        starts = [(1.0, theta, end), *([(0.0, before, end)] if new and end else [])]
         if np.any(np.abs(before) > LIMITS.far * self.prior):
             # numbers that are far from what is known of them stand for what is missing: no step may lead back from there
-            starts.append((1.0, 0.0 * own, None))
+            starts.append((1.0, 0.0 * theta, None))
         best, fit = None, None
-        for share, at, where in starts:
+        for share, start, where in starts:
             if best is not None and share == 0.0 and end is not None and end.cost - best.cost >= promise:
                 continue
-            tried = _Fit(self, {name: _scale(name, one, share) if name in new else one for name, one in numbers.items()})
-            point = tried.run(at, where)
+            trial = _Fit(
+                self, {name: _scale(name, values, share) if name in new else values for name, values in numbers.items()}
+            )
+            point = trial.run(start, where)
             if best is None or point.cost < best.cost:
-                best, fit = point, tried
+                best, fit = point, trial
         assert best is not None and fit is not None
         return fit.finish(best)
 
@@ -150,20 +152,20 @@ class _Fit:
         self.fits, self.numbers, self.segments = fits, numbers, fits.segments
         # the error of a number that is free anyway: the number alone is fitted, and less is known of it
         self.released = {name: i for name in numbers if (i := fits.given.same(name)) is not None}
-        added = {name: one for name, one in numbers.items() if name not in self.released}
+        added = {name: values for name, values in numbers.items() if name not in self.released}
         self.experiment = with_numbers(fits.nominal, added)
         prior = fits.prior.copy()
         prior[list(self.released.values())] = np.hypot(prior[list(self.released.values())], LIMITS.number_error)
         free, theta, width = [], [], []
-        for one in make_free_parameters(self.experiment, paths_of(added), 1.0):
-            name, leaf = owner_of(one)
-            if one.role == "size":
+        for number in make_free_parameters(self.experiment, paths_of(added), 1.0):
+            name, leaf = owner_of(number)
+            if number.role == "size":
                 unit = fits.unit(name, leaf, numbers)
-                free.append(one._replace(nominal=0.0, scale=unit, positive=False))
+                free.append(number._replace(nominal=0.0, scale=unit, positive=False))
                 theta.append(numbers[name][leaf] / unit)
                 width.append(1.0)
             else:
-                free.append(one)
+                free.append(number)
                 theta.append(0.0)
                 width.append(EFFECTS[name].roles()[leaf].width)
         self.free, self.added = (*fits.free, *free), np.array(theta)
@@ -180,17 +182,19 @@ class _Fit:
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
 
-    def run(self, own: np.ndarray, begin: FitEnd | None) -> _Point:
+    def run(self, theta: np.ndarray, begin: FitEnd | None) -> _Point:
         """Fit from the model's own numbers; the predictor is chosen anew until that gains nothing."""
-        own = own.copy()
+        theta = theta.copy()
         for name, i in self.released.items():
-            one = self.fits.free[i]
-            own[i] = one.theta(max(one.nominal + next(iter(self.numbers[name].values())), LEAST_LEFT * one.nominal))
-        theta = np.concatenate([own, self.added])
+            number = self.fits.free[i]
+            theta[i] = number.theta(
+                max(number.nominal + next(iter(self.numbers[name].values())), LEAST_LEFT * number.nominal)
+            )
+        theta = np.concatenate([theta, self.added])
         if begin is None:
             sides = self.experiment.sides
-            first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
-            start = [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
+            first = [{side: segment.smoothed[side].state[0] for side in sides} for segment in self.segments]
+            start = [np.array([state[side][order] for order in (0, 1) for side in sides]) for state in first]
         else:
             start = begin.start
         best = self._descend(self.at(theta, start, self._choose(theta) if begin is None else begin.smoothness))
@@ -201,13 +205,13 @@ class _Fit:
             # along the smoothed motion what is chosen does not hang on what was chosen before
             first = [self._choose(best.theta)] if turn == 0 else []
             options = [*first, best.linear.choose(()).smoothness, near]
-            others = [
-                self.at(best.theta, best.start, one)
-                for i, one in enumerate(options)
-                if one != best.predictor.smoothness and one not in options[:i]
+            points = [
+                self.at(best.theta, best.start, smoothness)
+                for i, smoothness in enumerate(options)
+                if smoothness != best.predictor.smoothness and smoothness not in options[:i]
             ]
             # the one that promises most is followed
-            other = min(others, key=self._promise, default=best)
+            other = min(points, key=self._promise, default=best)
             if not self._promise(other) < best.cost - _SETTLED:
                 break
             other = self._descend(other)
@@ -229,17 +233,20 @@ class _Fit:
         for _ in range(_STEPS):
             if best.cost - self._promise(best) < _SETTLED or share < _LEAST_STEP:
                 break
-            by = best.predictor.coefficients
+            coefficients = best.predictor.coefficients
             # a size that is far too large may go back to none at once
-            none = np.where([one.role == "size" for one in self.free], -best.theta, 0.0)
-            change = share * np.clip(by[0][1 : 1 + len(self.free)], np.minimum(-1.0, none), np.maximum(1.0, none))
-            start = [one + share * at[-best.linear.states :][: len(one)] for one, at in zip(best.start, by, strict=True)]
-            tried = self.at(best.theta + change, start, best.predictor.smoothness)
-            if not tried.cost < best.cost:
+            none = np.where([number.role == "size" for number in self.free], -best.theta, 0.0)
+            change = share * np.clip(coefficients[0][1 : 1 + len(self.free)], np.minimum(-1.0, none), np.maximum(1.0, none))
+            start = [
+                state + share * vector[-best.linear.states :][: len(state)]
+                for state, vector in zip(best.start, coefficients, strict=True)
+            ]
+            following = self.at(best.theta + change, start, best.predictor.smoothness)
+            if not following.cost < best.cost:
                 share *= 0.25
                 continue
-            gained = best.cost - tried.cost
-            best, share = tried, min(1.0, 3.0 * share)
+            gained = best.cost - following.cost
+            best, share = following, min(1.0, 3.0 * share)
             # where errors are not linear in the numbers a step may promise more than there is
             if gained < _SETTLED:
                 break
@@ -251,53 +258,55 @@ class _Fit:
         experiment = set_free_parameters(self.experiment, self.free, theta)
         gain = Linear.gain_of(smoothness, self.segments[0].period)
         gains = {side: gain[j] for j, side in enumerate(sides)}
-        found = []
+        path = []
         for segment, first in zip(self.segments, start, strict=True):
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
-            effects = begun(experiment, segment.torque[:1], segment.before)
+            effects = begin_states(experiment, segment.torque[:1], segment.before)
             state = PlantState(position, velocity, effects)
             states = simulate_plant(*lean(experiment, state), segment.torque, segment.time[0], segment.readings, gains)
             filtered = {}
             for side in sides:
-                own = segment.smoothed[side]
+                smoothed = segment.smoothed[side]
                 # of numbers under which the predictor diverges nothing finite is left
                 with np.errstate(invalid="ignore", over="ignore"):
                     error = segment.readings[side] - states.position[side]
                     # the first state is that of the predictor before it has seen anything
                     error[0] = 0.0
-                    seen = np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
-                state = np.concatenate([seen, np.asarray(own.state)[:, 2:]], axis=1)
-                filtered[side] = own._replace(state=state)  # type: ignore[arg-type]
-            found.append(dataclasses.replace(segment, smoothed=filtered))
-        return found
+                    corrected = (
+                        np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
+                    )
+                state = np.concatenate([corrected, smoothed.state[:, 2:]], axis=1)
+                filtered[side] = smoothed._replace(state=state)  # type: ignore[arg-type]
+            path.append(dataclasses.replace(segment, smoothed=filtered))
+        return path
 
     def finish(self, point: _Point) -> FittedModel:
         """Make the model, its covariance, and its errors; each quarter's by numbers fitted without it."""
         experiment = set_free_parameters(self.experiment, self.free, point.theta)
         end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.predictor.smoothness, point.cost)
-        own, sides = len(self.free), len(self.experiment.sides)
-        none = np.full((own, own), np.inf)
-        found = FittedModel(
-            tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, own)),
+        count, sides = len(self.free), len(self.experiment.sides)
+        none = np.full((count, count), np.inf)
+        fitted = FittedModel(
+            tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, count)),
             self.log_odds, end=end,
         )  # fmt: skip
         if not np.isfinite(point.cost):
-            return found
+            return fitted
         linear, pieces = point.linear, []
         size = np.sqrt(point.predictor.given / linear.count)
         for errors, signals in zip(linear.errors(point.predictor.smoothness), linear.signals, strict=True):
             flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
             states = flat[:, -linear.states :]
             norm = np.sqrt(np.sum(states**2, axis=0))
-            shown = norm > SILENT * np.max(norm)
-            basis = np.linalg.qr(states[:, shown] / norm[shown])[0]
-            rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
-            pieces.append(rest.reshape(-1, sides, 1 + own)[signals.real])
+            visible = norm > SILENT * np.max(norm)
+            basis = np.linalg.qr(states[:, visible] / norm[visible])[0]
+            projected = flat[:, : 1 + count] - basis @ (basis.T @ flat[:, : 1 + count])
+            pieces.append(projected.reshape(-1, sides, 1 + count)[signals.real])
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
         foretold = errors[:, :, 0].copy()
-        changes = np.zeros((QUARTERS, own))
+        changes = np.zeros((QUARTERS, count))
         covariance = inverse = np.zeros((0, 0))
-        if own:
+        if count:
             prior = np.diag(self.width**-2.0)
             spread = spread_of(errors[None, :, :, 0], slopes[None], 2 * sides)
             inverse = np.linalg.inv(spread.information + prior)
@@ -306,36 +315,36 @@ class _Fit:
             for rows, part in zip(np.array_split(np.arange(len(errors)), BLOCKS), parts_of_blocks(QUARTERS), strict=True):
                 foretold[rows] += slopes[rows] @ changes[part]
         return self._release(
-            found._replace(
+            fitted._replace(
                 covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold,
-                log_evidence=found.log_odds - 0.5 * point.cost
+                log_evidence=fitted.log_odds - 0.5 * point.cost
                 + 0.5 * float(np.linalg.slogdet(inverse)[1]) - float(np.sum(np.log(self.width))),
             )
         )  # fmt: skip
 
-    def _release(self, found: FittedModel) -> FittedModel:
+    def _release(self, fitted: FittedModel) -> FittedModel:
         """Give effects what is wrong with numbers that are free; the log tells their sums alone."""
         for name, i in self.released.items():
             number, (path,) = self.fits.free[i], paths_of([name])
-            value, slope = (float(of(found.theta[i])) for of in (number.value, number.slope))
+            value, slope = (float(of(fitted.theta[i])) for of in (number.value, number.slope))
             numbers = {path: value - number.nominal, number.path: number.nominal}
-            experiment = set_leaves(complete(found.experiment, [name]), arrays(numbers))
+            experiment = set_leaves(complete(fitted.experiment, [name]), arrays(numbers))
             (added,) = make_free_parameters(experiment, [path], 1.0)
             added = added._replace(nominal=0.0, scale=number.slope(0.0), positive=False)
-            known, factor = self.fits.prior[i] ** 2, slope / float(added.scale)
-            rows = np.eye(len(found.theta) + 1)[:, :-1]
+            variance, factor = self.fits.prior[i] ** 2, slope / float(added.scale)
+            rows = np.eye(len(fitted.theta) + 1)[:, :-1]
             rows[-1, i], rows[i, i] = factor, 0.0
             spread = np.zeros(len(rows))
             spread[i], spread[-1] = 1.0, -1.0
-            shared = known * np.outer(spread, spread)
-            assert found.left_out is not None
-            theta = rows @ found.theta
+            shared = variance * np.outer(spread, spread)
+            assert fitted.left_out is not None
+            theta = rows @ fitted.theta
             theta[-1] = (value - number.nominal) / float(added.scale)
-            found = found._replace(
-                experiment=experiment, free=(*found.free, added), theta=theta, left_out=found.left_out @ rows.T,
-                covariance=rows @ found.covariance @ rows.T + shared, white=rows @ found.white @ rows.T + shared,
+            fitted = fitted._replace(
+                experiment=experiment, free=(*fitted.free, added), theta=theta, left_out=fitted.left_out @ rows.T,
+                covariance=rows @ fitted.covariance @ rows.T + shared, white=rows @ fitted.white @ rows.T + shared,
             )  # fmt: skip
-        return found
+        return fitted
 
 
 def _in_gear(name: str) -> bool:
@@ -377,19 +386,13 @@ def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
     return [f"effects.{name}.{leaf}" for name in names for leaf in fitted_numbers(name)]
 
 
-def owner_of(one: FreeParameter) -> tuple[str, str]:
+def owner_of(number: FreeParameter) -> tuple[str, str]:
     """Return the effect that a number is of, and its name there."""
-    name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+    name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
     return name, leaf
 
 
 def with_numbers(experiment: Experiment, values: EffectNumbers) -> Experiment:
     """A model with all effects (:func:`.neutral_effects.complete`), some of them with these numbers."""
-    return set_leaves(
-        complete(experiment, values),
-        {
-            f"effects.{name}.{leaf}": np.asarray(value, float)
-            for name, numbers in values.items()
-            for leaf, value in numbers.items()
-        },
-    )
+    leaves = {f"effects.{name}.{leaf}": value for name, numbers in values.items() for leaf, value in numbers.items()}
+    return set_leaves(complete(experiment, values), arrays(leaves))

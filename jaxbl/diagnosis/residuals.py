@@ -80,7 +80,7 @@ class _Response:
 
 @lru_cache(maxsize=32)
 def _response(smoothness: float, size: int) -> _Response:
-    """By the spectrum of the sampled white-jerk model, x' = F x + w with F = I + N."""
+    """Response by the spectrum of the sampled white-jerk model, x' = F x + w with F = I + N."""
     frequency = np.linspace(0.0, np.pi, size // 2 + 1)
     frequency[0] = 1e-3 * frequency[1]
     d = np.expm1(1j * frequency)
@@ -112,8 +112,8 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
         rate = np.cumsum(columns - steady, axis=0) * period
         # second differences of the position are the values
         position = np.concatenate([np.zeros((1, len(steady))), np.cumsum(rate, axis=0)[:-1] * period])
-        found = steady + smoothed_accelerations(position, period, (smoothed.noise, smoothed.jerk))
-    return found.T.reshape(values.shape)
+        accelerations = steady + smoothed_accelerations(position, period, (smoothed.noise, smoothed.jerk))
+    return accelerations.T.reshape(values.shape)
 
 
 def _mean_around(values: Samples) -> Samples:
@@ -121,11 +121,11 @@ def _mean_around(values: Samples) -> Samples:
     return values.at[1:-1].add(jnp.diff(values, n=2) / 12.0)
 
 
-def _torques(experiment: Experiment, position: dict, velocity: dict, *rest: Any) -> tuple[dict[str, Array], ...]:
+def _torques(experiment: Experiment, position: dict, velocity: dict, *motion: Any) -> tuple[dict[str, Array], ...]:
     """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
     :meth:`jaxbl.drive.plant.Plant.side_torques`."""
-    acting, drive = experiment.plant.side_torques(position, velocity, *rest), experiment.drive
-    total = {side: one - drive.viscous(side) * velocity[side] for side, (one, _) in acting.items()}
+    acting, drive = experiment.plant.side_torques(position, velocity, *motion), experiment.drive
+    total = {side: total_of - drive.viscous(side) * velocity[side] for side, (total_of, _) in acting.items()}
     return total, {side: jnp.asarray(level, velocity[side].dtype) for side, (_, level) in acting.items()}
 
 
@@ -174,14 +174,14 @@ class _Equation(NamedTuple):
 def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
     """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
     states, torque = effect_path(experiment, part)
-    given = part.position, part.velocity, states, torque, part.time, part.transmitted
-    drive, found = experiment.drive, {}
+    arguments = part.position, part.velocity, states, torque, part.time, part.transmitted
+    drive, equations = experiment.drive, {}
 
-    def of(position: dict, velocity: dict, *rest: Any) -> tuple[Any, Any]:
-        total, level = both = _torques(experiment, position, velocity, *rest)
-        return {side: total[side] - level[side] * jnp.sign(velocity[side]) for side in total}, both
+    def of(position: dict, velocity: dict, *motion: Any) -> tuple[Any, Any]:
+        total, level = torques = _torques(experiment, position, velocity, *motion)
+        return {side: total[side] - level[side] * jnp.sign(velocity[side]) for side in total}, torques
 
-    slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(*given)
+    slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(*arguments)
     for side in experiment.sides:
         total, (by_position, by_velocity) = totals[side], slopes[side]
         friction, turning = _dry(experiment, side, part, states, torque, (total, levels[side]), held[side])
@@ -192,14 +192,14 @@ def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Ar
         added = (inertia - drive.inertia(side)) * acceleration
         nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
         by_velocity = by_velocity | {side: by_velocity[side] - turning}
-        found[side] = _Equation(
+        equations[side] = _Equation(
             inertia, inertia * acceleration, modelled, total - added - nominal, friction, by_position, by_velocity
         )
-    return found
+    return equations
 
 
 def _along(experiment: Experiment, segment: Segment) -> dict[str, _Equation]:
-    held = {side: np.asarray(one.held(segment.period)) for side, one in segment.smoothed.items()}
+    held = {side: smoothed.find_standstill(segment.period) for side, smoothed in segment.smoothed.items()}
     return jax.tree.map(np.asarray, _equations(experiment, segment.kinematics, held))
 
 
@@ -209,7 +209,7 @@ def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[
     What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
     on its own, the dry friction that is to be subtracted.
     """
-    return {side: (one.beyond, one.friction) for side, one in _along(experiment, segment).items()}
+    return {side: (equation.beyond, equation.friction) for side, equation in _along(experiment, segment).items()}
 
 
 def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> SideResiduals:
@@ -220,17 +220,17 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
     leave open.
     The model has array leaves, and the sample period of the record.
     """
-    found: SideResiduals = {side: [] for side in experiment.sides}
+    residuals: SideResiduals = {side: [] for side in experiment.sides}
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])
         equations = _along(experiment, segment)
-        for side, pieces in found.items():
-            one, slopes = equations[side], (equations[side].by_position, equations[side].by_velocity)
-            missing = one.taken - as_smoothed(one.modelled, segment.smoothed[side], segment.period)
+        for side, pieces in residuals.items():
+            equation, slopes = equations[side], (equations[side].by_position, equations[side].by_velocity)
+            missing = equation.taken - as_smoothed(equation.modelled, segment.smoothed[side], segment.period)
             level = abs(float(experiment.drive.torque_gain(side))) * sensor
-            variance, spectrum = _noise(segment, side, slopes, float(one.inertia), level, responses)
-            lags = min(int(_REACH / min(one.corner for one in responses.values())) + 2, len(segment))
+            variance, spectrum = _noise(segment, side, slopes, float(equation.inertia), level, responses)
+            lags = min(int(_REACH / min(response.corner for response in responses.values())) + 2, len(segment))
             correlation, tiny = np.fft.irfft(spectrum)[:lags], np.finfo(float).tiny
             pieces.append(
                 Residual(
@@ -238,17 +238,18 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
                     correlation / max(correlation[0], tiny), responses[side].corner / (2.0 * np.pi * segment.period),
                 )
             )  # fmt: skip
-    return found
+    return residuals
 
 
 def _responses(segment: Segment) -> dict[str, _Response]:
-    """Of each side's smoother, over as many frequencies as the slowest of them needs."""
+    """Responses of each side's smoother, over as many frequencies as the slowest of them needs."""
     smoothness = {
-        side: float(one.jerk) * segment.period**5 / float(one.noise) ** 2 for side, one in segment.smoothed.items()
+        side: float(smoothed.jerk) * segment.period**5 / float(smoothed.noise) ** 2
+        for side, smoothed in segment.smoothed.items()
     }
-    slowest = min(_corner(one) for one in smoothness.values())
+    slowest = min(_corner(value) for value in smoothness.values())
     size = int(2 ** np.ceil(np.log2(64.0 * 2.0 * np.pi / slowest)))
-    return {side: _response(one, min(max(size, 1024), _LARGEST)) for side, one in smoothness.items()}
+    return {side: _response(value, min(max(size, 1024), _LARGEST)) for side, value in smoothness.items()}
 
 
 def _noise(
@@ -272,14 +273,14 @@ def _noise(
             continue
         gain = float(smoothed.noise) * segment.period ** -np.arange(3.0)[:, None] * responses[name].gain
         # deviations of the smoothed states, away from the ends and near them
-        own = np.diagonal(np.asarray(smoothed.covariance), axis1=1, axis2=2).T
-        near = own / np.median(own, axis=1)[:, None]
+        variances = np.diagonal(smoothed.covariance, axis1=1, axis2=2).T
+        near = variances / np.median(variances, axis=1)[:, None]
         # noise lasts about as long as the low-pass does
         by_position, by_velocity = (gaussian_filter1d(np.asarray(slope[name]), 1.0 / corner) for slope in slopes)
         for order, slope in enumerate((by_position, by_velocity)):
             passed = _mean(np.abs(low_pass * gain[order]) ** 2)
             share = passed / _mean(np.abs(gain[order]) ** 2)
-            variance = variance + slope**2 * share * own[order]
+            variance = variance + slope**2 * share * variances[order]
             # a slope that comes and goes spreads the noise over all frequencies
             shape = low_pass**2 * passed / _mean(low_pass**2)
             spectrum = spectrum + np.mean(slope) ** 2 * np.abs(low_pass * gain[order]) ** 2 + np.var(slope) * shape
@@ -291,13 +292,13 @@ def _noise(
     return variance, spectrum
 
 
-def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
+def narrow(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     """A residual behind a further zero-phase low-pass (Gaussian), without ends, no more samples than needed; their indices.
 
     Noise of accelerations grows with the square of the frequency: what is slow shows better without what is fast. At
     `cutoff` (Hz) half of the power passes.
     """
-    width, stride, at = _filter(residual, cutoff)
+    width, stride, indices = _filter(residual, cutoff)
     reach = len(residual.correlation) + int(8.0 * width)
     size = 2 ** int(np.ceil(np.log2(2 * reach)))
     spectrum = noise_spectrum(residual.correlation, size)
@@ -307,13 +308,13 @@ def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     share = max(passed[0], np.finfo(float).tiny)
     low = replace(
         residual,
-        time=residual.time[at],
-        torque=gaussian_filter1d(residual.torque, width)[at],
-        deviation=np.sqrt(share * gaussian_filter1d(residual.deviation**2, width)[at]),
+        time=residual.time[indices],
+        torque=gaussian_filter1d(residual.torque, width)[indices],
+        deviation=np.sqrt(share * gaussian_filter1d(residual.deviation**2, width)[indices]),
         correlation=passed[:reach:stride] / share,
         bandwidth=min(cutoff, residual.bandwidth),
     )
-    return low, at
+    return low, indices
 
 
 def _filter(residual: Residual, cutoff: float) -> tuple[float, int, np.ndarray]:
@@ -326,15 +327,15 @@ def _filter(residual: Residual, cutoff: float) -> tuple[float, int, np.ndarray]:
 
 
 def low_passed(values: np.ndarray, residual: Residual, cutoff: float) -> np.ndarray:
-    """Signals along a residual behind the low-pass of :func:`narrowed`; shape (..., samples)."""
-    width, _, at = _filter(residual, cutoff)
-    return gaussian_filter1d(values, width, axis=-1)[..., at]
+    """Signals along a residual behind the low-pass of :func:`narrow`; shape (..., samples)."""
+    width, _, indices = _filter(residual, cutoff)
+    return gaussian_filter1d(values, width, axis=-1)[..., indices]
 
 
 def noise_spectrum(correlation: np.ndarray, size: int) -> np.ndarray:
     """Spectral density over the variance, from 0 to half the sampling rate, of noise with a correlation from lag 0 on."""
-    both = np.zeros(size)
+    symmetric = np.zeros(size)
     lags = min(len(correlation), size // 2)
-    both[:lags] = correlation[:lags]
-    both[size - lags + 1 :] = correlation[lags - 1 : 0 : -1]
-    return np.maximum(np.fft.rfft(both).real, 0.0)
+    symmetric[:lags] = correlation[:lags]
+    symmetric[size - lags + 1 :] = correlation[lags - 1 : 0 : -1]
+    return np.maximum(np.fft.rfft(symmetric).real, 0.0)

@@ -32,44 +32,49 @@ _PLACE = {
 }
 
 
-def sentence_of(found: Localised, unit: str = "N m") -> str:
+def sentence_of(located: Localised, unit: str = "N m") -> str:
     """One sentence: which side, where, and how much of the residual power lies there."""
-    side = f"{found.name} side"
-    if not found.significant:
-        return f"{side}: nothing beyond noise ({found.noise:.2g} {unit} rms up to {found.bandwidth:.3g} Hz)"
-    size = f"{found.missing:.2g} {unit} rms"
-    best = max((one.explained for one in found.coordinates.values()), default=0.0)
-    telling = next((one for one in found.coordinates.values() if one.explained >= best - _SIMPLER), None)
+    side = f"{located.name} side"
+    if not located.significant:
+        return f"{side}: nothing beyond noise ({located.noise:.2g} {unit} rms up to {located.bandwidth:.3g} Hz)"
+    size = f"{located.missing:.2g} {unit} rms"
+    best = max((coordinate.explained for coordinate in located.coordinates.values()), default=0.0)
+    telling = next(
+        (coordinate for coordinate in located.coordinates.values() if coordinate.explained >= best - _SIMPLER), None
+    )
     place = "" if telling is None else _PLACE.get(telling.name, f"a function of {telling.name}")
-    crowd = _crowded(found)
+    crowd = _find_crowded(located)
     clauses = []
     if crowd is not None and (best < _TELLING or crowd[0] > _TELLING):
         clauses.append(crowd[1])
-    own = [one for one in found.peaks if not one.in_motion]
-    if own and own[0].power_share > max(best, _TELLING) - _SIMPLER:
+    lines = [peak for peak in located.peaks if not peak.in_motion]
+    if lines and lines[0].power_share > max(best, _TELLING) - _SIMPLER:
         clauses.append(
-            f"at {own[0].frequency:.4g} Hz; {_percent(own[0].power_share)} of the residual power is a narrow peak there"
+            f"at {lines[0].frequency:.4g} Hz; {_percent(lines[0].power_share)} of the residual power is a narrow peak there"
         )
     elif telling is not None and best >= _TELLING:
         values = _class_means(telling, unit)
         clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
-    if not clauses and found.excess_z < LIMITS.significant:
-        return f"{side}, {_faint(found, unit)}"
+    if not clauses and located.excess_z < LIMITS.significant:
+        return f"{side}, {_faint(located, unit)}"
     if not clauses:
         hint = f" (most: {_percent(best)}, {place})" if best > _HINT else ""
         clauses.append(f"spread over the log: no function of speed, position, load or time alone explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
 
 
-def _faint(found: Localised, unit: str) -> str:
+def _faint(located: Localised, unit: str) -> str:
     """The region that stands out most where the whole does not."""
-    each = [(one, region) for one in found.coordinates.values() for region in one.regions]
-    one, region = max(each, key=lambda pair: max(abs(pair[1].mean_z), pair[1].excess_z))
+    regions = [(coordinate, region) for coordinate in located.coordinates.values() for region in coordinate.regions]
+    coordinate, region = max(regions, key=lambda pair: max(abs(pair[1].mean_z), pair[1].excess_z))
     z = max(abs(region.mean_z), region.excess_z)
-    if found.peaks and found.peaks[0].excess_z > z:
-        peak = found.peaks[0]
+    if located.peaks and located.peaks[0].excess_z > z:
+        peak = located.peaks[0]
         return f"faint: a narrow peak of {peak.amplitude:.2g} {unit} at {peak.frequency:.4g} Hz"
-    place = region.label or f"where {region.low:.3g} < {one.symbol or one.name} < {region.high:.3g} {one.unit}".rstrip()
+    place = (
+        region.label
+        or f"where {region.low:.3g} < {coordinate.symbol or coordinate.name} < {region.high:.3g} {coordinate.unit}".rstrip()
+    )
     if abs(region.mean_z) >= region.excess_z:
         return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
     return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
@@ -81,22 +86,22 @@ def _percent(share: float) -> str:
 
 def _class_means(coordinate: Coordinate, unit: str) -> str:
     """Mean torques of the few classes of a coordinate."""
-    shown = [one for one in coordinate.regions if one.label and abs(one.mean_z) > LIMITS.significant]
-    return f" ({', '.join(f'{one.mean:+.2g} {unit} {one.label}' for one in shown)})" if shown else ""
+    significant = [region for region in coordinate.regions if region.label and abs(region.mean_z) > LIMITS.significant]
+    return f" ({', '.join(f'{region.mean:+.2g} {unit} {region.label}' for region in significant)})" if significant else ""
 
 
-def _crowded(found: Localised) -> tuple[float, str] | None:
+def _find_crowded(located: Localised) -> tuple[float, str] | None:
     """The region that holds much of the power in little of the time: its share of power less that of time, and a clause."""
     best: tuple[float, str] | None = None
-    for one in found.coordinates.values():
-        if one.name in (EVERYWHERE, "direction", "input", "acceleration", "twist rate"):
+    for coordinate in located.coordinates.values():
+        if coordinate.name in (EVERYWHERE, "direction", "input", "acceleration", "twist rate"):
             continue
-        power, time = (np.array([getattr(r, key) for r in one.regions]) for key in ("power_share", "time_share"))
-        z = np.array([r.excess_z for r in one.regions])
-        if one.name == "reversals":
-            near = np.array([r.label.startswith("reversals") for r in one.regions])
+        power, time = (np.array([getattr(r, key) for r in coordinate.regions]) for key in ("power_share", "time_share"))
+        z = np.array([r.excess_z for r in coordinate.regions])
+        if coordinate.name == "reversals":
+            near = np.array([r.label.startswith("reversals") for r in coordinate.regions])
             groups = [near] if near.any() else []
-        elif any(r.label for r in one.regions):
+        elif any(r.label for r in coordinate.regions):
             groups = [np.arange(len(power)) == i for i in range(len(power))]
         else:
             numbers = np.arange(len(power))
@@ -108,13 +113,13 @@ def _crowded(found: Localised) -> tuple[float, str] | None:
                 continue
             # of regions that hold as much, the simpler coordinate's
             if best is None or score > best[0] + _SIMPLER:
-                best = score, f"{_region_text(one, rows)}"
+                best = score, f"{_region_text(coordinate, rows)}"
     return best
 
 
 def _region_text(coordinate: Coordinate, rows: np.ndarray) -> str:
-    chosen = [one for one, taken in zip(coordinate.regions, rows, strict=True) if taken]
-    share = _percent(sum(one.power_share for one in chosen))
+    chosen = [region for region, taken in zip(coordinate.regions, rows, strict=True) if taken]
+    share = _percent(sum(region.power_share for region in chosen))
     if chosen[0].label:
         if coordinate.name == "reversals":
             return f"at speed reversals; {share} of the residual power lies near them"

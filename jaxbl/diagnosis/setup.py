@@ -14,7 +14,7 @@ from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.simulate import Experiment
 
-from .coordinates import CoordinateValues, all_coordinates
+from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_task import DiagnosisTask, input_rms
 from .input_noise import smoothed_input, unfelt
 from .linearised_model import Linear
@@ -67,12 +67,12 @@ class Setup(NamedTuple):
     sliding: list[str]
     bare: Experiment
     nominal: Experiment
-    own: tuple[FreeParameter, ...]
+    free: tuple[FreeParameter, ...]
     prior: np.ndarray
     recorded: Sequence[Segment]
     fitted: ReferenceLog
     lacking: SideResiduals
-    coordinates: dict[str, list[dict[str, CoordinateValues]]]
+    coordinates: SideCoordinates
     located: dict[str, Localised]
     input_noise: InputNoise
 
@@ -89,52 +89,54 @@ def set_up(task: DiagnosisTask) -> Setup:
     # one structure for all models, so that they share their compiled programs
     nominal = complete(bare)
     _check_order(bare)
-    rest = config.log.initial_state == "rest"
-    recorded = segments_of(record, nominal.sides, rest)
-    own = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
-    prior = np.full(len(own), config.uncertainty.relative)
-    _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
+    at_rest = config.log.initial_state == "rest"
+    recorded = segments_of(record, nominal.sides, at_rest)
+    free = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
+    prior = np.full(len(free), config.uncertainty.relative)
+    _check_stable(task, nominal, ReferenceLog(recorded, {}, at_rest))
     noise = _input_noise(input_rms(record), nominal, recorded)
     segments = quiet(recorded, noise.unfelt)
     lacking = residual_torques(nominal, segments)
     sliding = [side for side in nominal.sides if record.statistics.channels[POSITION_CHANNELS[side]].unit == "m"]
     coordinates = all_coordinates(nominal, segments, lacking, sliding)
     located = localise(nominal, lacking, segments, coordinates)
-    bandwidth = {name: one.bandwidth for name, one in located.items()}
-    fitted = ReferenceLog(segments, bandwidth, rest)
-    return Setup(task, sliding, bare, nominal, own, prior, recorded, fitted, lacking, coordinates, located, noise)
+    bandwidth = {name: place.bandwidth for name, place in located.items()}
+    fitted = ReferenceLog(segments, bandwidth, at_rest)
+    return Setup(task, sliding, bare, nominal, free, prior, recorded, fitted, lacking, coordinates, located, noise)
 
 
 def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:
     """Segments with their inputs smoothed; `noise`: the inputs' standard deviation that the drive did not feel, N m."""
     if not noise > 0.0:
         return segments
-    return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
+    return [dataclasses.replace(segment, torque=smoothed_input(segment.torque, noise)) for segment in segments]
 
 
 def _input_noise(size: float, nominal: Experiment, segments: Sequence[Segment]) -> InputNoise:
     """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
     `size`, that is not asked."""
-    noise = estimate_white_noise([one.torque for one in segments])
+    noise = estimate_white_noise([segment.torque for segment in segments])
     if not _NOISY * size < noise:
         return InputNoise(0.0, noise)
     # the model as given: numbers that may change would absorb some of the noise
-    given, smooth = (Linear(nominal, (), np.zeros(0), np.zeros(0), some) for some in (segments, quiet(segments, noise)))
-    smoothness = given.choose(()).smoothness
-    share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
+    recorded, smooth = (
+        Linear(nominal, (), np.zeros(0), np.zeros(0), driven) for driven in (segments, quiet(segments, noise))
+    )
+    smoothness = recorded.choose(()).smoothness
+    share, error = unfelt(recorded.find_errors_left(smoothness), smooth.find_errors_left(smoothness))
     # nats that it did not feel it, rather than did
-    shown = (share - 0.5) / error**2
+    nats = (share - 0.5) / error**2
     # below none it says nothing: a controller that hands the encoder's noise on, or what the model lacks, hides the share
     possible = 1.0 if share < -_BELOW * error else float(np.sqrt(np.clip(share + 2.0 * error, 0.0, 1.0)))
-    return InputNoise(noise if shown > _SHOWN else 0.0, possible * noise)
+    return InputNoise(noise if nats > _SHOWN else 0.0, possible * noise)
 
 
 def _check_order(bare: Experiment) -> None:
     """Refuse a model of which two effects share a name, and are called by positions that others would shift."""
     names = [effect.name for effect in bare.effects]
     twice = next((name for name in names if names.count(name) > 1), None)
-    every = complete(bare, candidates(bare)).effects
-    if twice is not None and [effect.name for effect in every[: len(names)]] != names:
+    effects = complete(bare, candidates(bare)).effects
+    if twice is not None and [effect.name for effect in effects[: len(names)]] != names:
         raise InputError(f"effects: two are {twice}; list them before those of the actuator")
 
 

@@ -11,7 +11,7 @@ from jaxbl.drive.parameters import parameter
 class Thresholds:
     """States each of them with its unit, its meaning and its reason."""
 
-    seen: float = parameter(
+    difference: float = parameter(
         "standard errors",
         "by which a single channel shows a difference: what a stepwise regression by blocks asks",
         default=1.0,
@@ -88,9 +88,7 @@ def use_thresholds(**changes: float) -> Iterator[None]:
     before = dataclasses.asdict(LIMITS)
     dataclasses.replace(LIMITS, **changes)  # refuses what there is not
     try:
-        for name, value in changes.items():
-            object.__setattr__(LIMITS, name, value)
+        vars(LIMITS).update(changes)
         yield
     finally:
-        for name, value in before.items():
-            object.__setattr__(LIMITS, name, value)
+        vars(LIMITS).update(before)

@@ -19,7 +19,7 @@ from jaxbl.records.least_squares import BlockRegression
 from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
 from .linearised_model import Linear
 from .reference_log import ReferenceLog
-from .residuals import SideResiduals, as_smoothed, low_passed, narrowed
+from .residuals import SideResiduals, as_smoothed, low_passed, narrow
 from .thresholds import LIMITS
 
 _BLOCKS = 10
@@ -62,19 +62,21 @@ class TorqueRegression:
             variants: candidates to be tried.
         """
         self.variants, forces = list(variants), []
-        for one in linear.signals:
+        for signals in linear.signals:
             # the model's own acceleration, where torque is missing, is not that of the log
-            measured = MotionTorques(linear.experiment, replace(one.part, modelled=one.part.acceleration), one.shared)
+            measured = MotionTorques(
+                linear.experiment, replace(signals.part, modelled=signals.part.acceleration), signals.shared
+            )
             there = measured.of([get_leaf(linear.experiment, f"effects.{name}") for name in names])
-            gone = [{place: -torque for place, torque in one.items()} for one in there]
+            gone = [{place: -torque for place, torque in torques.items()} for torques in there]
             forces.append(Forces([*there, *gone, *columns_of([*base, *variants], measured)]))
         self.places: dict[Candidate, tuple[np.ndarray, list[int]]] = {}
-        self.names, at = names, 2 * len(names)
+        self.names, place = names, 2 * len(names)
         for candidate in (*base, *variants):
-            end = at + candidate.width
-            self.places[candidate] = np.arange(at, end), [end] if candidate.offset else []
-            at = end + candidate.offset
-        self.base = np.concatenate([np.zeros(0), *(self.places[one][0] for one in base)]).astype(int)
+            end = place + candidate.width
+            self.places[candidate] = np.arange(place, end), [end] if candidate.offset else []
+            place = end + candidate.offset
+        self.base = np.concatenate([np.zeros(0), *(self.places[candidate][0] for candidate in base)]).astype(int)
         self.sides = []
         for i, side in enumerate(lacking):
             rows = []
@@ -82,8 +84,8 @@ class TorqueRegression:
                 # what acts on the input acts on the motor, which is the first side
                 columns = force.on(i, len(segment)) + (force.on(-1, len(segment)) if i == 0 else 0.0)
                 columns = as_smoothed(columns, segment.smoothed[side], segment.period)
-                seen = low_passed(columns, residual, log.bandwidth[side])
-                rows.append(np.vstack([seen, narrowed(residual, log.bandwidth[side])[0].torque]))
+                filtered = low_passed(columns, residual, log.bandwidth[side])
+                rows.append(np.vstack([filtered, narrow(residual, log.bandwidth[side])[0].torque]))
             *columns, target = np.concatenate(rows, axis=1)
             # each side over its own missing torque
             size = np.sqrt(np.sum(target**2))
@@ -96,52 +98,52 @@ class TorqueRegression:
         """Propose the best variant of each effect that surely takes something away, the best effect first."""
         before = self._cross_validate([])[0] if self.variants else []
         best: dict[str, TorqueProposal] = {}
-        for one in self.variants:
-            found = self._try([], one, before)
-            if found is not None and found[0].share > (best[one.name].share if one.name in best else 0.0):
-                best[one.name] = found[0]
-        return sorted(best.values(), key=lambda one: -one.share)
+        for variant in self.variants:
+            trial = self._try([], variant, before)
+            if trial is not None and trial[0].share > (best[variant.name].share if variant.name in best else 0.0):
+                best[variant.name] = trial[0]
+        return sorted(best.values(), key=lambda proposal: -proposal.share)
 
     def propose_together(self) -> dict[str, Numbers]:
         """Propose effects that take most away one after the other, with their numbers together."""
         chosen: list[Candidate] = []
         squares = self._cross_validate([])[0] if self.variants else []
-        linear = [one for one in self.variants if not one.offset]
+        linear = [variant for variant in self.variants if not variant.offset]
         while len(chosen) < _MOST:
-            tried = []
-            for one in linear:
-                if not any(replaces(one.name, other.name) or replaces(other.name, one.name) for other in chosen):
-                    found = self._try(chosen, one, squares)
-                    if found is not None and found[0].share > SHOWN:
-                        tried.append((found[0].share, one, found[1]))
-            if not tried:
+            trials = []
+            for variant in linear:
+                if not any(replaces(variant.name, other.name) or replaces(other.name, variant.name) for other in chosen):
+                    trial = self._try(chosen, variant, squares)
+                    if trial is not None and trial[0].share > SHOWN:
+                        trials.append((trial[0].share, variant, trial[1]))
+            if not trials:
                 break
-            most = max(tried, key=lambda each: each[0])
-            plain = [each for each in tried if contains(most[1].name, each[1].name) and each[0] > most[0] - SHOWN]
-            _, best, squares = max(plain or [most], key=lambda each: each[0])
+            most = max(trials, key=lambda trial: trial[0])
+            plain = [trial for trial in trials if contains(most[1].name, trial[1].name) and trial[0] > most[0] - SHOWN]
+            _, best, squares = max(plain or [most], key=lambda trial: trial[0])
             chosen.append(best)
         values = self._cross_validate(chosen)[1] if chosen else np.zeros(0)
-        numbers, at = {}, 0
-        for one in chosen:
-            of = one.numbers(values[at : at + one.width].tolist())
-            at += one.width
+        numbers, place = {}, 0
+        for variant in chosen:
+            of = variant.numbers(values[place : place + variant.width].tolist())
+            place += variant.width
             if of is not None:
-                numbers[one.name] = of
+                numbers[variant.name] = of
         return numbers
 
     def _try(
-        self, beside: Sequence[Candidate], one: Candidate, before: Sequence[np.ndarray]
+        self, beside: Sequence[Candidate], variant: Candidate, before: Sequence[np.ndarray]
     ) -> tuple[TorqueProposal, list[np.ndarray]] | None:
         """Try a candidate beside others; None where it takes nothing away, or its numbers are not allowed."""
-        after, values = self._cross_validate([*beside, one])
+        after, values = self._cross_validate([*beside, variant])
         gains = np.sum([(old - new) / np.mean(old) for old, new in zip(before, after, strict=True)], axis=0)
         z = float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
         ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
-        at = sum(other.width for other in beside)
-        numbers = one.numbers(values[at : at + one.width].tolist())
-        if numbers is None or not z > LIMITS.seen:
+        place = sum(other.width for other in beside)
+        numbers = variant.numbers(values[place : place + variant.width].tolist())
+        if numbers is None or not z > LIMITS.difference:
             return None
-        return TorqueProposal(one.name, numbers, 1.0 - float(np.sqrt(ratio))), after
+        return TorqueProposal(variant.name, numbers, 1.0 - float(np.sqrt(ratio))), after
 
     def _cross_validate(self, chosen: Sequence[Candidate]) -> tuple[list[np.ndarray], np.ndarray]:
         """Find the mean squared errors of each block left out, by side, and the coefficients by all blocks.
@@ -151,10 +153,10 @@ class TorqueRegression:
         An effect that is replaced is taken out of the model. Columns act on all sides with one coefficient, each side over
         its own missing torque.
         """
-        gone = [i for i, name in enumerate(self.names) if any(replaces(one.name, name) for one in chosen)]
-        kept = [i for i in range(len(self.names)) if i not in gone]
-        columns = np.concatenate([*(self.places[one][0] for one in chosen), kept, self.base]).astype(int)
-        fixed = [place for one in chosen for place in self.places[one][1]] + [len(self.names) + i for i in gone]
+        gone = [i for i, name in enumerate(self.names) if any(replaces(variant.name, name) for variant in chosen)]
+        remaining = [i for i in range(len(self.names)) if i not in gone]
+        columns = np.concatenate([*(self.places[variant][0] for variant in chosen), remaining, self.base]).astype(int)
+        fixed = [place for variant in chosen for place in self.places[variant][1]] + [len(self.names) + i for i in gone]
         sides = [side.select(columns, fixed) for side in self.sides]
         joined = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
         fits = joined.fit_without_each()

@@ -20,7 +20,7 @@ from jaxbl.simulate import Experiment, with_effects
 
 from .blocks import QUARTERS, standard_errors_better
 from .reference_log import BLOCKS, Comparison, Errors, ReferenceLog, parts_of_blocks
-from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrowed
+from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrow
 from .thresholds import LIMITS
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
@@ -76,8 +76,8 @@ class Tabulation:
         return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
 
     def summarise(self, errors: Errors, z: float) -> JsonObject:
-        """As JSON; `errors` are those of the model with them on what was held out, `z` the standard errors by which it is
-        better there."""
+        """Write the tables as JSON; `errors` are those of the model with them on what was held out, `z` the standard errors
+        by which it is better there."""
         return {
             "tables": {
                 side: [{"over": table.over, "points": table.points, "torques": table.torques, "errors": table.errors}
@@ -111,48 +111,51 @@ def tabulate(
     for side in experiment.sides:
         if any(effect.name == f"{side}.{Tabulated.kind}" for effect in experiment.effects):
             continue
-        tables = _fitted(log, lacking[side], side, rotary=side not in sliding)
+        tables = _fit_tables(log, lacking[side], side, rotary=side not in sliding)
         if not tables:
             continue
-        every = {**(best.tables if best else {}), side: tables}
-        model = _with_tables(experiment, every)
-        quarters = [_with_tables(experiment, every, quarter) for quarter in range(QUARTERS)]
+        tables_of_all = {**(best.tables if best else {}), side: tables}
+        model = _with_tables(experiment, tables_of_all)
+        quarters = [_with_tables(experiment, tables_of_all, quarter) for quarter in range(QUARTERS)]
         with_tables, before = log.compare(model, models=quarters), best.compared if best else compared
         if standard_errors_better(log, before, with_tables) > LIMITS.sure:
-            best = Tabulation(every, model, with_tables, standard_errors_better(log, compared, with_tables))
+            best = Tabulation(tables_of_all, model, with_tables, standard_errors_better(log, compared, with_tables))
     return best
 
 
-def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary: bool) -> list[Table]:
+def _fit_tables(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary: bool) -> list[Table]:
     """Tables of the torque that a side lacks, by cross-validation; none where they take nothing away."""
     cutoff = log.bandwidth[side]
-    target = -np.concatenate([narrowed(one, cutoff)[0].torque for one in lacking])
+    target = -np.concatenate([narrow(residual, cutoff)[0].torque for residual in lacking])
     choices = _choices(log.segments, side, rotary)
     widths = {over: len(points) for over, points in choices.items()}
     columns = {
         over: np.concatenate(
-            [_columns(segment, one, side, over, points, cutoff) for segment, one in zip(log.segments, lacking, strict=True)]
+            [
+                _columns(segment, residual, side, over, points, cutoff)
+                for segment, residual in zip(log.segments, lacking, strict=True)
+            ]
         )
         for over, points in choices.items()
     }
     nothing = np.array([np.mean(part**2) for part in np.array_split(target, BLOCKS)])
-    found = []
+    fits_found = []
     for overs in _sets(list(choices)):
         if len(target) < _LEAST * sum(widths[over] for over in overs):
             continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
         fits = [_Fit.of(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
-        fit = min(fits, key=lambda one: float(np.mean(one.squares)))
+        fit = min(fits, key=lambda candidate: np.mean(candidate.squares))
         gain = nothing - fit.squares
         sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(BLOCKS)
         if sure and 1.0 - np.sqrt(np.mean(fit.squares) / np.mean(nothing)) > _GAIN:
-            found.append((overs, fit))
-    if not found:
+            fits_found.append((overs, fit))
+    if not fits_found:
         return []
-    _, best = min(found, key=lambda one: float(np.mean(one[1].squares)))
+    _, best = min(fits_found, key=lambda candidate: np.mean(candidate[1].squares))
     # the fewest tables of those within one standard error of the best
     limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(BLOCKS)
-    overs, fit = next((overs, one) for overs, one in found if np.mean(one.squares) <= limit)
+    overs, fit = next((overs, candidate) for overs, candidate in fits_found if np.mean(candidate.squares) <= limit)
     ends = np.cumsum([widths[over] for over in overs])[:-1]
     parts = (np.split(values, ends, axis=-1) for values in (fit.values, fit.errors, fit.left_out))
     return [Table(*columns) for columns in zip(overs, [choices[over] for over in overs], *parts, strict=True)]
@@ -160,28 +163,28 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
 
 def _sets(overs: Sequence[str]) -> list[list[str]]:
     """Coordinates alone, then a position with the speed."""
-    return [*([one] for one in overs), *([one, "speed"] for one in overs if one != "speed")]
+    return [*([over] for over in overs), *([over, "speed"] for over in overs if over != "speed")]
 
 
 def _choices(segments: Sequence[Segment], side: str, rotary: bool) -> dict[str, np.ndarray]:
     """Points over each coordinate that a log shows."""
-    position, speed = (np.concatenate([np.asarray(one.smoothed[side].state)[:, i] for one in segments]) for i in (0, 1))
-    found = {"position": np.linspace(position.min(), position.max(), _POINTS["position"])}
+    position, speed = (np.concatenate([segment.smoothed[side].state[:, i] for segment in segments]) for i in (0, 1))
+    points = {"position": np.linspace(position.min(), position.max(), _POINTS["position"])}
     if rotary and np.ptp(position) > _TURN:
-        found["turn"] = np.linspace(0.0, _TURN, _POINTS["turn"])
+        points["turn"] = np.linspace(0.0, _TURN, _POINTS["turn"])
     # apart from one another by a share of the range, so that rows of equal samples make no point twice
     spread = np.quantile(speed, np.linspace(0.0, 1.0, _POINTS["speed"]))
     even = np.linspace(speed.min(), speed.max(), _POINTS["speed"])
-    found["speed"] = 0.9 * spread + 0.1 * even
-    return found
+    points["speed"] = 0.9 * spread + 0.1 * even
+    return points
 
 
 def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: np.ndarray, cutoff: float) -> np.ndarray:
     """Torque of height 1 at each point of a table along a segment, as missing torques are seen; (samples, points)."""
     smoothed = segment.smoothed[side]
-    values = np.asarray(smoothed.state)[:, 1 if over == "speed" else 0]
+    values = smoothed.state[:, 1 if over == "speed" else 0]
     values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
-    hats = np.stack([np.interp(values, points, one) for one in np.eye(len(points))])
+    hats = np.stack([np.interp(values, points, heights) for heights in np.eye(len(points))])
     return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
 
 
@@ -197,11 +200,11 @@ class _Fit:
 
     @classmethod
     def of(cls, matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> "_Fit":
-        penalty, at = _RIDGE * np.eye(matrix.shape[1]), 0
+        penalty, start = _RIDGE * np.eye(matrix.shape[1]), 0
         for width in widths:
             second = np.diff(np.eye(width), n=2, axis=0)
-            penalty[at : at + width, at : at + width] += stiffness * second.T @ second
-            at += width
+            penalty[start : start + width, start : start + width] += stiffness * second.T @ second
+            start += width
         penalty *= np.mean(matrix**2) * len(target)
         regression = BlockRegression.of(target, matrix, BLOCKS, penalty)
         left_out = np.stack([regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)])
@@ -210,21 +213,21 @@ class _Fit:
 
 def _numbers(tables: Sequence[Table]) -> JsonObject:
     """Tables as numbers of the effect."""
-    found: JsonObject = {}
-    for one in tables:
-        points, torques = ("speeds", "speed_torques") if one.over == "speed" else ("positions", "position_torques")
-        found |= {points: one.points.tolist(), torques: one.torques.tolist()} | (
-            {"turn": True} if one.over == "turn" else {}
+    numbers: JsonObject = {}
+    for table in tables:
+        points, torques = ("speeds", "speed_torques") if table.over == "speed" else ("positions", "position_torques")
+        numbers |= {points: table.points.tolist(), torques: table.torques.tolist()} | (
+            {"turn": True} if table.over == "turn" else {}
         )
-    return found
+    return numbers
 
 
 def _with_tables(experiment: Experiment, tables: Mapping[str, Sequence[Table]], without: int | None = None) -> Experiment:
     """A model with tables on its sides; `without`: the quarter of the log that they are fitted without."""
     added = []
-    for side, some in tables.items():
+    for side, of_side in tables.items():
         if without is not None:
-            some = [replace(table, torques=table.left_out[without]) for table in some]
-        numbers = {key: tuple(one) if isinstance(one, list) else one for key, one in _numbers(some).items()}
+            of_side = [replace(table, torques=table.left_out[without]) for table in of_side]
+        numbers = {key: tuple(number) if isinstance(number, list) else number for key, number in _numbers(of_side).items()}
         added.append(as_arrays(Tabulated(side=side, **numbers), float))
     return with_effects(experiment, (*added, *experiment.effects))

@@ -30,15 +30,15 @@ class Spectrum(NamedTuple):
     def at(self, samples: int) -> np.ndarray:
         """Power at the frequencies of that many samples, shape (frequencies, sides)."""
         where = np.log(np.maximum(np.fft.rfftfreq(samples), 0.5 / samples))
-        known = np.log(self.frequency)
-        return np.exp(np.stack([np.interp(where, known, np.log(one)) for one in self.power.T], axis=1))
+        bands = np.log(self.frequency)
+        return np.exp(np.stack([np.interp(where, bands, np.log(power)) for power in self.power.T], axis=1))
 
 
 def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
     """Spectrum of errors, part by part, each of shape (samples, sides)."""
-    powers = [np.abs(_transformed(one)) ** 2 for one in errors]
-    weights = [_weights(len(one)) for one in errors]
-    frequency = np.concatenate([np.fft.rfftfreq(len(one)) for one in errors])
+    powers = [np.abs(_transform(part)) ** 2 for part in errors]
+    weights = [_weights(len(part)) for part in errors]
+    frequency = np.concatenate([np.fft.rfftfreq(len(part)) for part in errors])
     order = np.argsort(frequency, kind="stable")
     frequency, power, weight = frequency[order], np.concatenate(powers)[order], np.concatenate(weights)[order]
     edges = _edges(len(frequency))
@@ -52,34 +52,34 @@ def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
 def weighted_products(errors: np.ndarray, spectrum: Spectrum) -> np.ndarray:
     """Products of columns of errors, shape (samples, sides, columns), with one another, each frequency over its power in the
     spectrum of what they leave; shape (columns, columns)."""
-    found = np.zeros((errors.shape[2], errors.shape[2]))
+    products = np.zeros((errors.shape[2], errors.shape[2]))
     size = np.sqrt(_weights(len(errors))[:, None] / spectrum.at(len(errors)))
     for side in range(errors.shape[1]):
-        one = _transformed(errors[:, side]) * size[:, side, None]
-        found += np.real(one.conj().T @ one)
-    return found
+        transformed = _transform(errors[:, side]) * size[:, side, None]
+        products += np.real(transformed.conj().T @ transformed)
+    return products
 
 
-def _transformed(errors: np.ndarray) -> np.ndarray:
+def _transform(errors: np.ndarray) -> np.ndarray:
     return np.fft.rfft(errors, axis=0) / np.sqrt(len(errors))
 
 
 def _weights(samples: int) -> np.ndarray:
-    """How often each frequency counts: all but the first, and the last of an even number, stand for two."""
-    found = np.full(samples // 2 + 1, 2.0)
-    found[0] = 1.0
+    """Weight of each frequency: all but the first, and the last of an even number, stand for two."""
+    weights = np.full(samples // 2 + 1, 2.0)
+    weights[0] = 1.0
     if samples % 2 == 0:
-        found[-1] = 1.0
-    return found
+        weights[-1] = 1.0
+    return weights
 
 
 def _edges(count: int) -> list[int]:
-    """Of bands of growing width, none of fewer frequencies than :data:`_LEAST_FREQUENCIES` if there are as many."""
-    found = [0]
+    """Edges of bands of growing width, none of fewer frequencies than :data:`_LEAST_FREQUENCIES` if there are as many."""
+    edges = [0]
     for edge in np.round(np.geomspace(_LEAST_FREQUENCIES, count, _BANDS)).astype(int):
-        if edge - found[-1] >= _LEAST_FREQUENCIES:
-            found.append(int(edge))
-    if len(found) == 1:
+        if edge - edges[-1] >= _LEAST_FREQUENCIES:
+            edges.append(int(edge))
+    if len(edges) == 1:
         return [0, count]
-    found[-1] = count
-    return found
+    edges[-1] = count
+    return edges

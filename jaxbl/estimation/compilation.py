@@ -48,7 +48,7 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
     these from within a compiled function."""
 
     @functools.cache
-    def compiled() -> Callable[..., Result]:
+    def compile_function() -> Callable[..., Result]:
         # equinox hands what it does not know itself to `jax.jit`
         return eqx.filter_jit(function, compiler_options=_options())  # pyright: ignore[reportCallIssue]
 
@@ -58,12 +58,17 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return function(*args, **kwargs)
         if program_cache.cache_folder() is None:
-            return compiled()(*args, **kwargs)
+            return compile_function()(*args, **kwargs)
         arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
-        rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
+        static = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
         # of NumPy's none is weak
-        weak = [isinstance(one, jax.Array) and one.aval.weak_type for one in arrays]
-        key = function, structure, rest, tuple((one.shape, one.dtype, by) for one, by in zip(arrays, weak, strict=True))
+        weak = [isinstance(array, jax.Array) and array.aval.weak_type for array in arrays]
+        key = (
+            function,
+            structure,
+            static,
+            tuple((array.shape, array.dtype, is_weak) for array, is_weak in zip(arrays, weak, strict=True)),
+        )
         program = _programs.get(key)
         if program is None:
             while len(_programs) >= _MOST:
@@ -95,12 +100,12 @@ class _Program(NamedTuple):
     result: Any
 
     def __call__(self, arrays: list[jax.Array]) -> Any:
-        found = iter(self.compiled(*arrays))
+        outputs = iter(self.compiled(*arrays))
 
-        def filled(one: Any) -> Any:
-            return next(found) if isinstance(one, _Array) else one
+        def fill(leaf: Any) -> Any:
+            return next(outputs) if isinstance(leaf, _Array) else leaf
 
-        return jax.tree.map(filled, self.result, is_leaf=lambda one: isinstance(one, _Array))
+        return jax.tree.map(fill, self.result, is_leaf=lambda leaf: isinstance(leaf, _Array))
 
 
 @functools.cache
@@ -120,14 +125,14 @@ _programs: OrderedDict[Any, _Program] = OrderedDict()
 def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], arrays: list[jax.Array]) -> _Program:
     """A program from disk, or compiled and put there."""
     key = program_cache.program_key("program", function, args, kwargs)
-    found = program_cache.load(key)
-    if found is not None:
+    stored = program_cache.load(key)
+    if stored is not None:
         _initialise()
-        code, count, devices, result = found
-        given = jax.tree.structure((tuple(arrays), {}))
+        code, count, devices, result = stored
+        inputs = jax.tree.structure((tuple(arrays), {}))
         try:
             loaded = deserialize_and_load(
-                code, given, jax.tree.structure([0] * count), execution_devices=jax.local_devices()[:devices]
+                code, inputs, jax.tree.structure([0] * count), execution_devices=jax.local_devices()[:devices]
             )
             return _Program(loaded, result)
         except Exception:  # whatever another version of JAX, or another machine, makes of it
@@ -135,11 +140,11 @@ def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], 
     dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
     structure, results = jax.tree.structure(dynamic), []
 
-    def flat(*given: Any) -> list[Any]:
-        args, kwargs = eqx.combine(structure.unflatten(given), static)
+    def flat(*inputs: Any) -> list[Any]:
+        args, kwargs = eqx.combine(structure.unflatten(inputs), static)
         out = function(*args, **kwargs)
-        results.append(jax.tree.map(lambda one: _Array() if eqx.is_array(one) else one, out))
-        return [one for one in jax.tree.leaves(out) if eqx.is_array(one)]
+        results.append(jax.tree.map(lambda leaf: _Array() if eqx.is_array(leaf) else leaf, out))
+        return [leaf for leaf in jax.tree.leaves(out) if eqx.is_array(leaf)]
 
     flat.__name__ = getattr(function, "__name__", "program")
     least = jax.config.values[_LEAST]

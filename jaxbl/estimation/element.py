@@ -21,14 +21,16 @@ from jaxbl.records.inspection import element_displacement, fit_record_element, m
 
 from .logs import SealedRecord
 
-# number -> where a study has it: an effect and its key
-_EFFECTS = {
-    "damping": (f"transmission.{Damping.kind}", "damping"),
-    "dry_friction": (f"motor.{CoulombFriction.kind}", "torque"),
-    "hysteresis": (f"transmission.{Hysteresis.kind}", "torque"),
-    "length": (f"transmission.{Hysteresis.kind}", "length"),
-    "friction_coefficient": (f"transmission.{LoadFriction.kind}", "coefficient"),
+_PATHS = {
+    "stiffness": "transmission.stiffness",
+    "half_gap": "transmission.half_gap",
+    "damping": f"effects.transmission.{Damping.kind}.damping",
+    "dry_friction": f"effects.motor.{CoulombFriction.kind}.torque",
+    "hysteresis": f"effects.transmission.{Hysteresis.kind}.torque",
+    "length": f"effects.transmission.{Hysteresis.kind}.length",
+    "friction_coefficient": f"effects.transmission.{LoadFriction.kind}.coefficient",
 }
+"""Paths in a study."""
 
 
 @dataclass(frozen=True)
@@ -57,18 +59,18 @@ class ElementTask:
 
 @dataclass(frozen=True)
 class ElementIdentification:
-    """What a log says of a transmission on a test rig.
+    """A transmission on a test rig as its log shows it.
 
     Attributes:
         task: the log.
-        found: its numbers.
+        element: its numbers.
         summary: as in `identification.json`.
         trace: one row a sample: `t`, `u`, `displacement`, `torque` of what was found (empty before the first reversal).
         tables: `[transmission]` and `[[effects]]` of a study with these numbers, to be included in one that has `[drive]`.
     """
 
     task: ElementTask
-    found: Element
+    element: Element
     summary: JsonObject
     trace: pd.DataFrame
     tables: JsonObject
@@ -107,8 +109,8 @@ def identify_element(
     Raises:
         InputError: an unfit log or table, or a log that shows no stiffness.
     """
-    given = table.model_dump(exclude_unset=True) if isinstance(table, LogTable) else dict(table)
-    return run_element(read_element_task(log, read_log_table(given | {"kind": "element"}), gear_ratio, holdout=holdout))
+    keys = table.model_dump(exclude_unset=True) if isinstance(table, LogTable) else dict(table)
+    return run_element(read_element_task(log, read_log_table(keys | {"kind": "element"}), gear_ratio, holdout=holdout))
 
 
 def run_element(task: ElementTask) -> ElementIdentification:
@@ -118,34 +120,26 @@ def run_element(task: ElementTask) -> ElementIdentification:
         InputError: a log that shows no stiffness.
     """
     record = task.record
-    found = fit_record_element(record, task.gear_ratio)
-    if found is None:
+    element = fit_record_element(record, task.gear_ratio)
+    if element is None:
         raise InputError(
             f"{record.path}: the displacement never turns back, or hardly moves; a log of a transmission should load it to "
             "and fro"
         )
-    stiffness = found.numbers["stiffness"]
-    if "stiffness" in found.open or stiffness.value <= 0.0:
+    stiffness = element.numbers["stiffness"]
+    if "stiffness" in element.open or stiffness.value <= 0.0:
         raise InputError(
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness.value:.3g} ± "
             f"{stiffness.error:.2g} {stiffness.unit}); see columns and signs in [log]"
         )
     moved = element_displacement(record, task.gear_ratio)
-    trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": found.torque})
-    return ElementIdentification(task, found, to_jsonable(_summary(task, found)), trace, _tables(found))
+    trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": element.torque})
+    return ElementIdentification(task, element, to_jsonable(_summary(task, element)), trace, _tables(element))
 
 
-def _path(name: str) -> str:
-    """Where a study has a number, or the name itself."""
-    if name in ("stiffness", "half_gap"):
-        return f"transmission.{name}"
-    effect, key = _EFFECTS.get(name, ("", ""))
-    return f"effects.{effect}.{key}" if effect else name
-
-
-def _summary(task: ElementTask, found: Element) -> JsonObject:
+def _summary(task: ElementTask, element: Element) -> JsonObject:
     record = task.record
-    kept = {name: number for name, number in found.numbers.items() if name not in found.open}
+    numbers = {name: number for name, number in element.numbers.items() if name not in element.open}
     summary = {
         "title": f"Transmission of {record.path.name}",
         "kind": "element",
@@ -153,33 +147,32 @@ def _summary(task: ElementTask, found: Element) -> JsonObject:
         "file": str(record.path.resolve()),
         "samples": len(record.time),
         "sample_period": record.sample_period,
-        "parameters": {_path(name): number.to_dict() | {"nominal": None} for name, number in kept.items()},
+        "parameters": {_PATHS.get(name, name): number.to_dict() | {"nominal": None} for name, number in numbers.items()},
         "refused": [
-            {"direction": {_path(name): 1.0}, "why": "this log leaves it open by more than half of its value"}
-            for name in found.open
+            {"direction": {_PATHS.get(name, name): 1.0}, "why": "this log leaves it open by more than half of its value"}
+            for name in element.open
         ],
-        "method": {"element": {"terms": found.terms, "gains": found.gains, "reversals": found.reversals}},
-        "torque": {"element": {"rms": found.residual, "relative": found.share, "unit": found.numbers["offset"].unit}},
+        "method": {"element": {"terms": element.terms, "gains": element.gains, "reversals": element.reversals}},
+        "torque": {"element": {"rms": element.residual, "relative": element.share, "unit": element.numbers["offset"].unit}},
         "warnings": record.warnings,
         "notes": record.notes,
     }
     if task.holdout is not None:
-        error = element_error(found, make_rig_log(task.holdout, task.gear_ratio))
+        error = element_error(element, make_rig_log(task.holdout, task.gear_ratio))
         rms, relative = error or (None, None)
         summary["holdout"] = {"file": str(task.holdout.path.resolve()), "torque": {"rms": rms, "relative": relative}}
     return summary
 
 
-def _tables(found: Element) -> JsonObject:
-    value = {name: one.value for name, one in found.numbers.items() if name not in found.open}
+def _tables(element: Element) -> JsonObject:
+    value = {name: number.value for name, number in element.numbers.items() if name not in element.open}
     law = DeadZone if "half_gap" in value else LinearShaft
-    transmission = {"law": law.name, "stiffness": value["stiffness"]}
-    if "half_gap" in value:
-        transmission["half_gap"] = value["half_gap"]
-    effects: dict[str, JsonObject] = {}
-    for name, (kind, key) in _EFFECTS.items():
+    tables: dict[str, JsonObject] = {"transmission": {"law": law.name}}
+    for name, path in _PATHS.items():
         if name in value:
-            effects.setdefault(kind, {"kind": kind})[key] = value[name]
+            owner, _, key = path.removeprefix("effects.").rpartition(".")
+            tables.setdefault(owner, {"kind": owner})[key] = value[name]
+    transmission = tables.pop("transmission")
     # a hysteresis whose length is open has no torque that a study could simulate
-    whole = [one for one in effects.values() if one["kind"] != _EFFECTS["length"][0] or len(one) == 3]
-    return {"transmission": transmission} | ({"effects": whole} if whole else {})
+    complete = [effect for kind, effect in tables.items() if not kind.endswith(Hysteresis.kind) or len(effect) == 3]
+    return {"transmission": transmission} | ({"effects": complete} if complete else {})

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
+from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 
@@ -119,7 +119,9 @@ def make_free_parameters(
         if path in paths[: len(free)]:
             raise InputError(f"'{path}' is named twice; once is enough")
         nominal, parameter = float(get_leaf(experiment, path)), parameters[path]
-        role, minimum = parameter.role.kind if parameter.role else "", 0.0 if is_positive(parameter) else None
+        role = parameter.role.kind if parameter.role else ""
+        limits = parameter.minimum, parameter.above
+        minimum = 0.0 if any(limit is not None and limit >= 0.0 for limit in limits) else None
         # an angle has no relative size
         scale = 1.0 if role == "angle" else abs(nominal) or sizes.scale_number(experiment, path, parameter.unit)
         positive = minimum is not None and nominal > 0.0
@@ -127,9 +129,9 @@ def make_free_parameters(
     return tuple(free)
 
 
-def is_positive(parameter: Parameter) -> bool:
-    """True if a number must not become negative."""
-    return any(limit is not None and limit >= 0.0 for limit in (parameter.minimum, parameter.above))
+def free_values(free: Sequence[FreeParameter], theta: np.ndarray) -> dict[str, float]:
+    """Values of free numbers, by path; theta may have others behind them."""
+    return {number.path: float(number.value(theta[i])) for i, number in enumerate(free)}
 
 
 def set_free_parameters(experiment: Experiment, free: Sequence[FreeParameter], theta: Array | np.ndarray) -> Experiment:

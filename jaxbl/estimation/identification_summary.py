@@ -18,15 +18,15 @@ from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors, regress
-from .search import Found, is_noise
+from .search import SearchFit, is_noise
 from .segments import at_period, long_enough, reading_noise, segments_of, windows_of
 from .trajectory import Fit, projected_residual
 
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
-    """How far a model misses the torques of a log after decimation, by equation, with units."""
-    found = errors(experiment, parts, factor) if parts else {}
-    return {name: one | {"unit": record.unit_of(name, "N m")} for name, one in found.items()}
+    """Measure how far a model misses the torques of a log after decimation, by equation, with units."""
+    equations = errors(experiment, parts, factor) if parts else {}
+    return {name: figures | {"unit": record.unit_of(name, "N m")} for name, figures in equations.items()}
 
 
 def describe_position(record: Record, side: str, noise: float, **errors: float) -> JsonObject:
@@ -35,23 +35,23 @@ def describe_position(record: Record, side: str, noise: float, **errors: float) 
 
 
 def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> JsonObject:
-    """How well the numbers found serve another log, beside the nominal ones, in windows of `samples` where it is so long."""
-    rebased = [at_period(one, record.sample_period) for one in (nominal, fitted)]
-    rest = config.log.initial_state == "rest"
-    segments = segments_of(record, nominal.sides, rest)
+    """Test the fitted numbers on another log beside the nominal ones, in windows of `samples` where it is so long."""
+    rebased = [at_period(model, record.sample_period) for model in (nominal, fitted)]
+    at_rest = config.log.initial_state == "rest"
+    segments = segments_of(record, nominal.sides, at_rest)
     noise = reading_noise(segments)
     longest = max(map(len, segments))
-    windows, _ = windows_of(segments, nominal, min(samples, longest), rest)
-    left = [jit(projected_residual)(one, windows)[0] for one in rebased]
+    windows, _ = windows_of(segments, nominal, min(samples, longest), at_rest)
+    left = [jit(projected_residual)(model, windows)[0] for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
-        before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
+        before, after = (noise[side] * float(jnp.sqrt(jnp.mean(residual[:, :, i] ** 2))) for residual in left)
         position[side] = describe_position(record, side, noise[side], rms=after, nominal_rms=before)
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
-    before, torque = (torque_errors(record, one, parts, factor) for one in rebased)
-    for name, one in torque.items():
-        one["nominal_rms"], one["nominal_relative"] = before[name]["rms"], before[name]["relative"]
+    before, torque = (torque_errors(record, model, parts, factor) for model in rebased)
+    for name, figures in torque.items():
+        figures["nominal_rms"], figures["nominal_relative"] = before[name]["rms"], before[name]["relative"]
     return {
         "file": str(record.path.resolve()),
         "window": windows.torque.shape[1] * record.sample_period,
@@ -60,21 +60,21 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     }
 
 
-def _derived(experiment: Experiment, found: Found) -> JsonObject:
-    """What else the law's numbers say (half_gap beside dead_zone), with standard errors by the delta method."""
+def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject:
+    """Derive further numbers of the law (half_gap beside dead_zone), with standard errors by the delta method."""
     if experiment.transmission is None:
         return {}
 
-    def others(theta: jax.Array) -> JsonObject:
-        at = set_free_parameters(experiment, found.free, theta)
-        assert at.transmission is not None
-        known = {path.rpartition(".")[2] for path in leaf_paths(at) if path.startswith("transmission.")}
-        return {name: value for name, value in at.transmission.truth().items() if name not in known}
+    def compute_others(theta: jax.Array) -> JsonObject:
+        model = set_free_parameters(experiment, search_fit.free, theta)
+        assert model.transmission is not None
+        names = {path.rpartition(".")[2] for path in leaf_paths(model) if path.startswith("transmission.")}
+        return {name: value for name, value in model.transmission.truth().items() if name not in names}
 
-    values, slopes = others(found.fit.theta), jax.jacfwd(others)(found.fit.theta)
+    values, slopes = compute_others(search_fit.fit.theta), jax.jacfwd(compute_others)(search_fit.fit.theta)
     derived = {}
     for name, value in values.items():
-        error = float(jnp.sqrt(slopes[name] @ found.spread.covariance @ slopes[name]))
+        error = float(jnp.sqrt(slopes[name] @ search_fit.spread.covariance @ slopes[name]))
         reach = [float(value) - NORMAL * error, float(value) + NORMAL * error]
         derived[f"transmission.{name}"] = {"value": float(value), "standard_error": error, "interval": reach}
     return derived
@@ -99,57 +99,60 @@ def by_regression(
     nominal: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, record: Record
 ) -> JsonObject:
     """Least squares on the equations of motion; numbers that they do not show are left out."""
-    found = regress(nominal, free, parts, factor)
-    information = np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian)
+    regression_fit = regress(nominal, free, parts, factor)
+    information = np.einsum("wtsp,wtsq->pq", regression_fit.jacobian, regression_fit.jacobian)
     values, vectors = np.linalg.eigh(information)
     blind = values < 1.0 / UNSEEN**2
-    seen = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
-    parameters = _parameters(record, free, found, spread(found))
-    at = {path: jnp.asarray(one["value"]) for path, one in parameters.items()}
+    visible = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
+    parameters = _parameters(record, free, regression_fit, spread(regression_fit))
+    numbers = {path: jnp.asarray(parameter["value"]) for path, parameter in parameters.items()}
     return {
-        "parameters": {free[i].path: parameters[free[i].path] for i in seen},
+        "parameters": {free[i].path: parameters[free[i].path] for i in visible},
         "measured_transmitted_torque": record.transmitted is not None,
         "bandwidth": 0.5 / (factor * record.sample_period),
-        "torque": torque_errors(record, set_leaves(nominal, at), parts, factor),
-        "converged": found.converged,
+        "torque": torque_errors(record, set_leaves(nominal, numbers), parts, factor),
+        "converged": regression_fit.converged,
     }
 
 
-def by_trajectories(found: Found, record: Record) -> JsonObject:
-    """How the trajectory fit went."""
+def by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
+    """Describe how the trajectory fit went."""
 
     def by_path(values: Any) -> JsonObject:
-        return dict(zip([one.path for one in found.free], values, strict=True))
+        return dict(zip([parameter.path for parameter in search_fit.free], values, strict=True))
 
     return {
-        "kind": "prediction_error" if found.smoothness else "output_error",
-        "window": found.samples * record.sample_period,
-        "windows": len(found.firsts),
-        "converged": found.fit.converged,
-        "starts": len(found.starts),
-        "starts_agreeing": sum(start["agrees"] for start in found.starts),
-        "variance_over_noise": found.spread.variance,
-        "inflation": by_path(found.spread.inflation),
-        "smoothness": found.smoothness,
-        "between_windows": {} if found.between is None else by_path(found.between),
+        "kind": "prediction_error" if search_fit.smoothness else "output_error",
+        "window": search_fit.samples * record.sample_period,
+        "windows": len(search_fit.firsts),
+        "converged": search_fit.fit.converged,
+        "starts": len(search_fit.starts),
+        "starts_agreeing": sum(start["agrees"] for start in search_fit.starts),
+        "variance_over_noise": search_fit.spread.variance,
+        "inflation": by_path(search_fit.spread.inflation),
+        "smoothness": search_fit.smoothness,
+        "between_windows": {} if search_fit.between is None else by_path(search_fit.between),
     }
 
 
-def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> JsonObject:
+def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profiles: Mapping[str, Profile]) -> JsonObject:
     """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
-    noise = {side: float(one) for side, one in found.windows.noise.items()}
-    record, width = task.record, found.spread.covariance
+    noise = {side: float(deviation) for side, deviation in search_fit.windows.noise.items()}
+    record, width = task.record, search_fit.spread.covariance
     deviation = np.sqrt(np.diag(width))
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
         correlation = width / np.outer(deviation, deviation)
-    parameters = _parameters(record, found.free, found.fit, found.spread)
-    for path, one in profiles.items():
-        parameters[path] |= {"profile_interval": one.interval, "profile": np.column_stack([one.values, one.deviance])}
-    parameters |= _derived(fitted, found)
+    parameters = _parameters(record, search_fit.free, search_fit.fit, search_fit.spread)
+    for path, profile in profiles.items():
+        parameters[path] |= {
+            "profile_interval": profile.interval,
+            "profile": np.column_stack([profile.values, profile.deviance]),
+        }
+    parameters |= _derive_numbers(fitted, search_fit)
     residual = {
         side: describe_position(
-            record, side, noise[side], rms=noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2)))
+            record, side, noise[side], rms=noise[side] * float(jnp.sqrt(jnp.mean(search_fit.fit.residual[:, :, i] ** 2)))
         )
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }
@@ -157,28 +160,29 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         **task.heading,
         "parameters": parameters,
         "correlation": {
-            "parameters": [one.path for one in found.free],
+            "parameters": [parameter.path for parameter in search_fit.free],
             "matrix": correlation,
         },
         "refused": [
-            {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
+            {"direction": refusal.direction, "why": _explain_refusal(refusal), "relative_deviation": refusal.deviation}
+            for refusal in search_fit.refused
         ],
-        "held": found.held,
-        "condition": found.condition,
+        "held": search_fit.held,
+        "condition": search_fit.condition,
         "residual": residual,
-        "steps": found.steps,
+        "steps": search_fit.steps,
         "rejected": None if all(map(is_noise, residual.values())) else {"lacks": None},
-        "notes": [*record.notes, *_step_note(found, fitted.run.substeps)],
+        "notes": [*record.notes, *_step_note(search_fit, fitted.run.substeps)],
     }
 
 
-def _step_note(found: Found, study_steps: int) -> list[str]:
+def _step_note(search_fit: SearchFit, study_steps: int) -> list[str]:
     """A sentence about plant steps that are finer than the study's."""
-    if found.steps == study_steps:
+    if search_fit.steps == study_steps:
         return []
     return [
-        f"The fit has {found.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would be off "
-        "by more than a tenth of their standard errors."
+        f"The fit has {search_fit.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would "
+        "be off by more than a tenth of their standard errors."
     ]
 
 
@@ -205,7 +209,7 @@ _SHOWN_BY = {
 """End of a number's path -> what motion, or what else, would show it."""
 
 
-def _why(refusal: Refusal) -> str:
+def _explain_refusal(refusal: Refusal) -> str:
     names = list(refusal.direction)
     if len(names) == 1:
         text = f"this log hardly depends on {names[0]}"

@@ -21,7 +21,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
-from .free_parameters import FreeParameter, make_free_parameters
+from .free_parameters import FreeParameter, free_values, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
@@ -29,12 +29,12 @@ from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .regression import find_motion_share, remembers_input
 from .search import ParameterSearch
-from .segments import Segment, led_in, long_enough, segments_of, signal_sizes
+from .segments import Segment, long_enough, segments_of, signal_sizes, skip_unknown_input
 
 
 @dataclasses.dataclass(frozen=True)
 class Identification:
-    """What a log says of a machine.
+    """A machine as its log shows it.
 
     Attributes:
         config: the study, with its nominal numbers.
@@ -71,12 +71,12 @@ def read_identification_task(
     """
     config, missing = read_model(model)
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
-    given = {key: value for key, value in asked.items() if value is not None}
-    config = config.with_keys("identify", **given)
+    keys = {key: value for key, value in asked.items() if value is not None}
+    config = config.with_keys("identify", **keys)
     record, other = read_with_holdout(config, log, holdout)
-    if any(remembers_input(one.build()) for one in config.effects):
-        rest = config.log.initial_state == "rest"
-        record, other = led_in(record, rest), None if other is None else led_in(other, rest)
+    if any(remembers_input(effect.build()) for effect in config.effects):
+        at_rest = config.log.initial_state == "rest"
+        record, other = skip_unknown_input(record, at_rest), None if other is None else skip_unknown_input(other, at_rest)
     return LogTask(config, missing, record, None if other is None else SealedRecord(other))
 
 
@@ -123,40 +123,39 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         paths = list(settings.parameters or default_paths(config, nominal))
         if not paths:
             raise InputError("model: no number to identify: all are in [uncertainty] exact; take one out")
-        rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
-        segments = segments_of(record, sides, rest)
+        at_rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
+        segments = segments_of(record, sides, at_rest)
         free = make_free_parameters(nominal, paths, signal_sizes(nominal, segments))
         done()
         if alone:
             return _from_motor(task, nominal, free, segments, done)
-        found = ParameterSearch(nominal, segments, settings, rest=rest, name=str(record.path)).run(free)
+        search_fit = ParameterSearch(nominal, segments, settings, at_rest=at_rest, name=str(record.path)).run(free)
         done()
         # by NumPy, as in the summary: JAX's exponential function may differ in the last digit
-        theta = np.asarray(found.fit.theta)
-        values = {one.path: float(one.value(theta[i])) for i, one in enumerate(found.free)}
+        values = free_values(search_fit.free, np.asarray(search_fit.fit.theta))
         fitted = set_leaves(nominal, arrays(values))
         profiles = {}
         if settings.profile:
-            profiles = profile(nominal, found.free, found.windows, found.fit, found.spread)
+            profiles = profile(nominal, search_fit.free, search_fit.windows, search_fit.fit, search_fit.spread)
         done()
         gains, gain_values = gains_for(task.missing, fitted, segments)
         chain, recursive = observer_chain(set_leaves(fitted, arrays(gain_values)), segments, len(record.time))
         done()
-        trace = pd.DataFrame(columns_of(record, segments, fitted, found) | chain)
+        trace = pd.DataFrame(columns_of(record, segments, fitted, search_fit) | chain)
         factor = decimation(config, record)
         parts = long_enough(segments, factor)
-        method: JsonObject = {"recursive": recursive, "trajectory": by_trajectories(found, record)}
+        method: JsonObject = {"recursive": recursive, "trajectory": by_trajectories(search_fit, record)}
         if parts:
-            method["regression"] = by_regression(nominal, found.free, parts, factor, record)
+            method["regression"] = by_regression(nominal, search_fit.free, parts, factor, record)
         done()
-        summary = summary_of(task, fitted, found, profiles) | {"method": method}
+        summary = summary_of(task, fitted, search_fit, profiles) | {"method": method}
         summary["torque"] = torque_errors(record, fitted, parts, factor)
         if summary["rejected"]:
             mark_lacking(summary, find_motion_share(fitted, parts, factor))
         if gains:
-            summary["gains"] = {side: one._asdict() for side, one in gains.items()}
+            summary["gains"] = {side: chosen._asdict() for side, chosen in gains.items()}
         if task.holdout is not None:
-            summary["holdout"] = on_holdout(config, task.holdout.open(), nominal, fitted, found.samples)
+            summary["holdout"] = on_holdout(config, task.holdout.open(), nominal, fitted, search_fit.samples)
         done()
     model = with_values(config, values | gain_values)
     return Identification(config, model, record, to_jsonable(summary), trace, "excitation" in task.missing)
@@ -170,8 +169,8 @@ def _from_motor(
     alone = search_alone(nominal, free, segments, config.identify, record, config.log.initial_state == "rest")
     done()
     trace = pd.DataFrame(columns_alone(record, alone))
-    summary = summary_of(task, alone.experiment, alone.found, {})
-    summary["method"] = {"recursive": {}, "trajectory": by_trajectories(alone.found, record)}
+    summary = summary_of(task, alone.experiment, alone.search_fit, {})
+    summary["method"] = {"recursive": {}, "trajectory": by_trajectories(alone.search_fit, record)}
     gap = gap_summary(alone)
     summary["torque"], summary["backlash"] = {}, gap
     if gap is not None and gap["why"]:

@@ -78,7 +78,10 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: in
     with np.errstate(all="ignore"):
         variance = np.sum(residual**2) / freedom
         middle = long_run(scores, least) * residual.size / freedom
-        inverse = _pseudo_inverse(normal / scale)
+        unit = normal / scale
+        inverse = np.full_like(unit, np.nan)
+        if np.isfinite(unit).all():
+            inverse = np.linalg.pinv(unit, 10.0 * len(unit) * np.finfo(float).eps, hermitian=True)
         plain = variance * inverse / scale
         sandwich = inverse @ middle @ inverse / scale
         covariance, inflation = without_gain(sandwich, plain)
@@ -93,13 +96,6 @@ def without_gain(sandwich: np.ndarray, plain: np.ndarray) -> tuple[np.ndarray, n
     inflation = np.sqrt(np.maximum(np.diag(sandwich), np.finfo(float).tiny) / np.diag(plain))
     more = np.maximum(1.0 / inflation, 1.0)
     return sandwich * np.outer(more, more), inflation * more
-
-
-def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix."""
-    if not np.isfinite(matrix).all():
-        return np.full_like(matrix, np.nan)
-    return np.linalg.pinv(matrix, 10.0 * len(matrix) * np.finfo(float).eps, hermitian=True)
 
 
 def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
@@ -121,10 +117,10 @@ def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
     return sums.T @ sums / length
 
 
-def interval(one: FreeParameter, theta: float, deviation: float) -> tuple[float, float]:
+def interval(parameter: FreeParameter, theta: float, deviation: float) -> tuple[float, float]:
     """95 % interval of a value, from its theta; never below zero where the value must be positive."""
     reach = NORMAL * deviation
-    low, high = (float(one.value(theta + side * reach)) for side in (-1.0, 1.0))
+    low, high = (float(parameter.value(theta + side * reach)) for side in (-1.0, 1.0))
     return min(low, high), max(low, high)
 
 
@@ -135,21 +131,21 @@ class Refusal(NamedTuple):
     deviation: float
 
 
-def refusals(free: Sequence[FreeParameter], found: Spread) -> tuple[list[Refusal], float]:
+def refusals(free: Sequence[FreeParameter], width: Spread) -> tuple[list[Refusal], float]:
     """Directions of theta with a standard deviation above :data:`UNSEEN`, and the condition number of the information.
 
     Directions are eigenvectors of the covariance, components below a tenth of the largest left out.
     """
-    values, vectors = np.linalg.eigh(found.information)
+    values, vectors = np.linalg.eigh(width.information)
     condition = float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
-    inflation = float(np.max(np.nan_to_num(found.inflation, nan=1.0)))
+    inflation = float(np.max(np.nan_to_num(width.inflation, nan=1.0)))
     refused = []
     for value, vector in zip(values, vectors.T, strict=True):
         deviation = max(inflation, 1.0) / np.sqrt(value) if value > 0.0 else float("inf")
         if deviation > UNSEEN:
             vector = vector / vector[np.argmax(np.abs(vector))]
-            shown = {one.path: float(x) for one, x in zip(free, vector, strict=True) if abs(x) >= 0.1}
-            refused.append(Refusal(shown, float(deviation)))
+            direction = {parameter.path: float(x) for parameter, x in zip(free, vector, strict=True) if abs(x) >= 0.1}
+            refused.append(Refusal(direction, float(deviation)))
     return refused, condition
 
 
@@ -182,33 +178,38 @@ def profile(
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
     worth = float(width.variance) * width.inflation**2
 
-    which = np.repeat(np.arange(count), 2)
+    places = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)
-    steps = np.sqrt(LIMIT) * deviation[which]
-    others = covariance[:, which].T / np.diag(covariance)[which, None]
-    tried = [[(0.0, 0.0)] for _ in which]
+    steps = np.sqrt(LIMIT) * deviation[places]
+    directions = covariance[:, places].T / np.diag(covariance)[places, None]
+    points = [[(0.0, 0.0)] for _ in places]
     for _ in range(_PASSES):
         steps = np.minimum(steps, _FURTHEST)
-        thetas = centre[None, :] + (sign * steps)[:, None] * others
-        tries = fits(experiment, free, windows, thetas, _MOST_STEPS, np.eye(count, dtype=bool)[which])
-        cost, found = np.array([one.cost for one in tries]), np.array([one.theta for one in tries])
-        deviance = 2.0 * (cost - float(best.cost)) / worth[which]
-        for i, one in enumerate(deviance):
-            tried[i].append((float(steps[i]), float(one)))
+        thetas = centre[None, :] + (sign * steps)[:, None] * directions
+        tries = fits(experiment, free, windows, thetas, _MOST_STEPS, np.eye(count, dtype=bool)[places])
+        cost, ends = np.array([end.cost for end in tries]), np.array([end.theta for end in tries])
+        deviance = 2.0 * (cost - float(best.cost)) / worth[places]
+        for i, value in enumerate(deviance):
+            points[i].append((float(steps[i]), float(value)))
         # start the next fits where these ended
-        others = (found - centre[None, :]) / (sign * steps)[:, None]
+        directions = (ends - centre[None, :]) / (sign * steps)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
         steps = steps * np.clip(np.where(np.isfinite(factor), factor, 0.3), 0.3, 3.0)
-    return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1]) for i, one in enumerate(free)}
+    return {
+        parameter.path: _gather_profile(parameter, centre[i], points[2 * i], points[2 * i + 1])
+        for i, parameter in enumerate(free)
+    }
 
 
-def _gathered(one: FreeParameter, centre: float, below: _Points, above: _Points) -> Profile:
+def _gather_profile(parameter: FreeParameter, centre: float, below: _Points, above: _Points) -> Profile:
     lower, upper = map(step_at_limit, (below, above))
     points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
-    low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
-    values = np.array([float(one.value(centre + step)) for step, _ in points])
-    return Profile((low if one.minimum is None else max(low, one.minimum), high), values, np.array([d for _, d in points]))
+    low, high = (float(parameter.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
+    values = np.array([float(parameter.value(centre + step)) for step, _ in points])
+    return Profile(
+        (low if parameter.minimum is None else max(low, parameter.minimum), high), values, np.array([d for _, d in points])
+    )
 
 
 def step_at_limit(points: _Points) -> float:
@@ -218,6 +219,6 @@ def step_at_limit(points: _Points) -> float:
     beyond = np.flatnonzero(roots >= goal)
     if len(beyond) == 0:
         return np.inf if steps[-1] >= _FURTHEST else float(steps[-1] * goal / max(roots[-1], 1e-9))
-    at = int(beyond[0])
-    share = (goal - roots[at - 1]) / (roots[at] - roots[at - 1])
-    return float(steps[at - 1] + share * (steps[at] - steps[at - 1]))
+    first = int(beyond[0])
+    share = (goal - roots[first - 1]) / (roots[first] - roots[first - 1])
+    return float(steps[first - 1] + share * (steps[first] - steps[first - 1]))

@@ -13,7 +13,7 @@ from jaxbl.simulate import Experiment, NamedArrays, Signals, State, TracedArrays
 
 from .compilation import jit
 from .regression import model_torques
-from .search import Found
+from .search import SearchFit
 from .segments import Segment
 
 
@@ -35,7 +35,7 @@ def motion_columns(segment: Segment, side: str) -> NamedArrays:
     return columns
 
 
-def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> NamedArrays:
+def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, search_fit: SearchFit) -> NamedArrays:
     """Columns of a log and its fit, each of shape (samples,); NaN where the log gives none.
 
     `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration` with
@@ -49,24 +49,23 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     count = len(record.time)
     for side in fitted.sides:
         columns |= join_columns(count, segments, [motion_columns(segment, side) for segment in segments])
-    rows = (found.firsts[:, None] + np.arange(found.samples)[None, :]).ravel()
+    rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)[None, :]).ravel()
     for i, side in enumerate(fitted.sides):
         column = np.full(count, np.nan)
-        column[rows] = float(found.windows.noise[side]) * np.asarray(found.fit.residual[:, :, i]).ravel()
+        column[rows] = float(search_fit.windows.noise[side]) * np.asarray(search_fit.fit.residual[:, :, i]).ravel()
         columns[f"{side}.residual"] = column
-    torques = [
-        model_torques(fitted, one.kinematics, {side: smoothed.deviation(1) for side, smoothed in one.smoothed.items()})
-        for one in segments
-    ]
-    pieces = [
-        {"torque" if name == "transmission" else f"{name}.effects": values for name, values in piece.items()}
-        for piece in torques
-    ]
+    pieces = []
+    for segment in segments:
+        deviation = {side: smoothed.deviation(1) for side, smoothed in segment.smoothed.items()}
+        torques = model_torques(fitted, segment.kinematics, deviation)
+        pieces.append(
+            {"torque" if name == "transmission" else f"{name}.effects": values for name, values in torques.items()}
+        )
     return columns | join_columns(count, segments, pieces)
 
 
 @jit
-def _replayed(experiment: Experiment, torque: jax.Array, measured: TracedArrays) -> TracedArrays:
+def _replay_observers(experiment: Experiment, torque: jax.Array, measured: TracedArrays) -> TracedArrays:
     def keep(state: State, signals: Signals) -> JsonObject:
         row: JsonObject = {}
         if signals.twist is not None:
@@ -90,13 +89,13 @@ def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples:
     """
     longest = max(segments, key=len)
     readings = {side: jnp.asarray(longest.readings[side]) for side in experiment.sides}
-    kept = _replayed(experiment, jnp.asarray(longest.torque), readings)
+    signals = _replay_observers(experiment, jnp.asarray(longest.torque), readings)
     # compiled programs sort their results by name
     estimates = [f"{side}.{name}" for side in experiment.sides for name in ("velocity_estimate", "torque_estimate")]
-    names = [*(["twist"] if "twist" in kept else []), *estimates]
-    columns = join_columns(samples, [longest], [{name: kept[name] for name in dict.fromkeys([*names, *kept])}])
-    found: JsonObject = {}
+    names = [*(["twist"] if "twist" in signals else []), *estimates]
+    columns = join_columns(samples, [longest], [{name: signals[name] for name in dict.fromkeys([*names, *signals])}])
+    numbers: JsonObject = {}
     if experiment.transmission is not None:
         for name in experiment.transmission.truth():
-            found[name] = {side: float(kept[f"{side}.{name}"][-1]) for side in experiment.sides}
-    return columns, found
+            numbers[name] = {side: float(signals[f"{side}.{name}"][-1]) for side in experiment.sides}
+    return columns, numbers

@@ -80,7 +80,7 @@ class LogTask:
 
     @property
     def heading(self) -> dict[str, Any]:
-        """What every summary says of its logs, as in `identification.json` and `diagnosis.json`."""
+        """Facts on the logs that every summary has, as in `identification.json` and `diagnosis.json`."""
         other = None if self.holdout is None or self.holdout.path == self.record.path else self.holdout
         return {
             "title": self.config.title,
@@ -88,7 +88,10 @@ class LogTask:
             "file": str(self.record.path.resolve()),
             "samples": len(self.record.time),
             "sample_period": self.record.sample_period,
-            "warnings": [*self.record.warnings, *(f"Held-out log: {one}" for one in (other.warnings if other else ()))],
+            "warnings": [
+                *self.record.warnings,
+                *(f"Held-out log: {warning}" for warning in (other.warnings if other else ())),
+            ],
         }
 
     @property
@@ -131,26 +134,26 @@ def read_logs(
         record if _alike(record.sample_period, config.log.resample or record.sample_period) else read(config, log)
         for log, record in zip(several, records, strict=True)
     ]
-    known: dict[str, float] = {}
+    shared: dict[str, float] = {}
     for record in [*reversed(records)] if like is None else [like]:
-        known |= record.corrections
+        shared |= record.corrections
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
         corrections = record.corrections
-        keys = {*known, *corrections}
+        keys = {*shared, *corrections}
         # an offset changes when a counter is switched off and on, the skew of a clock that drifts with each log
-        own = {"offset"} & {*corrections} | ({"skew", "drift"} if "drift" in keys else set())
-        corrections = {key: (corrections if key in own else known).get(key, 0.0) for key in keys}
+        separate = {"offset"} & {*corrections} | ({"skew", "drift"} if "drift" in keys else set())
+        corrections = {key: (corrections if key in separate else shared).get(key, 0.0) for key in keys}
         if not isinstance(log, Record) and corrections != record.corrections:
             # the reader counts what [log] gives as no correction of its own
-            records[i] = replace(read(_corrected(config, corrections), log), corrections=corrections)
-    first, *others = records if like is None else (like, *records)
-    others = [_from_zero_of(first, one, config, share) for one in others]
-    return join_records([first, *others] if like is None else others)
+            records[i] = replace(read(_set_corrections(config, corrections), log), corrections=corrections)
+    first, *following = records if like is None else (like, *records)
+    following = [_from_zero_of(first, record, config, share) for record in following]
+    return join_records([first, *following] if like is None else following)
 
 
-def _alike(one: float, other: float) -> bool:
-    """Whether two sampling periods (s) are the same but for rounding."""
-    return bool(np.isclose(one, other, rtol=1e-6, atol=0.0))
+def _alike(period: float, other: float) -> bool:
+    """Return True if two sampling periods (s) are the same but for rounding."""
+    return bool(np.isclose(period, other, rtol=1e-6, atol=0.0))
 
 
 def _at_one_period(config: Config, records: Sequence[Record], like: Record | None) -> Config:
@@ -159,7 +162,7 @@ def _at_one_period(config: Config, records: Sequence[Record], like: Record | Non
     longest = max(periods)
     if like is not None and longest < like.sample_period and not np.isclose(longest, like.sample_period, rtol=_NEAR):
         longest = like.sample_period
-    if all(_alike(one, longest) for one in periods):
+    if all(_alike(period, longest) for period in periods):
         return config
     return config.with_keys("log", resample=longest)
 
@@ -193,68 +196,68 @@ def _read_held_out(config: Config, holdout: Logs, record: Record, seeks_delay: b
     for _, rows in other.logs:
         first = rows.start + round(FIRST_FIFTH * (rows.stop - rows.start))
         parts += [slice(max(part.start, first), part.stop) for part in other.segments if first < part.stop <= rows.stop]
-    found = any(value and value != record.corrections.get(key) for key, value in other.corrections.items())
-    return replace(other, segments=tuple(parts)) if found else other
+    corrected = any(value and value != record.corrections.get(key) for key, value in other.corrections.items())
+    return replace(other, segments=tuple(parts)) if corrected else other
 
 
 def _from_zero_of(first: Record, record: Record, config: Config, share: float) -> Record:
     """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it in a
     share of it."""
     table, geared = config.log, config.drive.kind == "two_inertia"
-    two = geared and all("load" in one.positions for one in (first, record))
-    given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
-    if given or "motor" not in record.positions or record.statistics.channels["theta_e"].unit != "rad":
+    two = geared and all("load" in log.positions for log in (first, record))
+    has_offset = any(channel is not None and channel.offset is not None for channel in (table.theta_e, table.theta_s))
+    if has_offset or "motor" not in record.positions or record.statistics.channels["theta_e"].unit != "rad":
         return record
     ratio = config.drive.gear_ratio if geared else 1.0
     motions = []
-    for one in (first, record):
-        assert one.torque is not None
-        load = ratio * one.positions["load"] if two else None
-        end = round(share * len(one.time)) if one is record else len(one.time)
-        segments = segments_before(one.segments, end)
-        motions.append(TurningLog(one.torque, one.positions["motor"], load, segments, one.sample_period))
-    found = find_zero_shift(*motions)
-    if found is None:
+    for log in (first, record):
+        assert log.torque is not None
+        load = ratio * log.positions["load"] if two else None
+        end = round(share * len(log.time)) if log is record else len(log.time)
+        segments = segments_before(log.segments, end)
+        motions.append(TurningLog(log.torque, log.positions["motor"], load, segments, log.sample_period))
+    shift = find_zero_shift(*motions)
+    if shift is None:
         return record
-    waves = ", ".join(map(str, found.waves))
+    waves = ", ".join(map(str, shift.waves))
     other = f" (to theta_s 1/{ratio:g} of it)" if geared and "load" in record.positions else ""
     warning = (
         f"theta_e counts from another zero than in {first.path.name}, by the torque that repeats {waves} times a turn: "
-        f"{found.value:.4g} ± {found.error:.1g} rad were added{other}."
+        f"{shift.value:.4g} ± {shift.error:.1g} rad were added{other}."
         + (" [log] theta_e.offset = 0 corrects nothing." if table.omega_e is None else "")
     )
     positions = {
-        side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
+        side: values + shift.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
     }
-    corrections = record.corrections | {"zero": found.value}
+    corrections = record.corrections | {"zero": shift.value}
     return replace(record, positions=positions, warnings=(*record.warnings, warning), corrections=corrections)
 
 
-def _corrected(config: Config, given: Mapping[str, float]) -> Config:
+def _set_corrections(config: Config, corrections: Mapping[str, float]) -> Config:
     """The study with skews of theta_s and u and an offset of theta_e in `[log]`, as they are given."""
     table = config.log
-    if "u.skew" in given:
-        u = (table.u or TorqueTable()).model_copy(update={"skew": given["u.skew"]})
-        table = table.model_copy(update={"u": u, "hold": "sampled" if given["u.sampled"] else "zoh"})
+    if "u.skew" in corrections:
+        u = (table.u or TorqueTable()).model_copy(update={"skew": corrections["u.skew"]})
+        table = table.model_copy(update={"u": u, "hold": "sampled" if corrections["u.sampled"] else "zoh"})
     for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
         # a speed in place of a position has no key for some of them, and then no need
         name, channel = table.position_source(position)
-        if key in given and (key != "offset" or name == position) and key in type(channel).model_fields:
-            table = table.model_copy(update={name: channel.model_copy(update={key: given[key]})})
+        if key in corrections and (key != "offset" or name == position) and key in type(channel).model_fields:
+            table = table.model_copy(update={name: channel.model_copy(update={key: corrections[key]})})
     return config.model_copy(update={"log": table})
 
 
 def _read_one(config: Config, log: str | Path | Record, seeks_delay: bool, share: float) -> Record:
     if isinstance(log, Record):
-        return _checked(config, log)
+        return _check_record(config, log)
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
     if seeks_delay and nominal.dead_time == "no":
         nominal = replace(nominal, dead_time="sought")
-    return _checked(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal, share=share))
+    return _check_record(config, read_record(log, config.log, gear_ratio=ratio, nominal=nominal, share=share))
 
 
-def _checked(config: Config, record: Record) -> Record:
+def _check_record(config: Config, record: Record) -> Record:
     """A log that the study's drive can be fitted to, with what is said first; InputError where it cannot."""
     if record.contradiction:
         raise InputError(f"{record.path}: {record.contradiction}")
@@ -324,12 +327,13 @@ def default_paths(config: Config, experiment: Experiment) -> list[str]:
     """All numbers of the plant that are not known exactly, but for frequencies of 0 and what a fit leaves as it is."""
     return [
         path
-        for path, about in leaf_paths(experiment).items()
+        for path, parameter in leaf_paths(experiment).items()
         if path.split(".")[0] in PLANT_TABLES
         and path not in config.uncertainty.exact
         and not (
-            about.role
-            and float(get_leaf(experiment, path)) == {"held": about.role.neutral, "frequency": 0.0}.get(about.role.kind)
+            parameter.role
+            and float(get_leaf(experiment, path))
+            == {"held": parameter.role.neutral, "frequency": 0.0}.get(parameter.role.kind)
         )
     ]
 

@@ -23,28 +23,28 @@ from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .log_columns import join_columns, motion_columns
 from .logs import arrays
-from .search import Found
+from .search import SearchFit
 from .segments import Segment, at_period, segments_of
 from .trajectory import Fit, cut
 from .unseen_load import SHOWN, Gap, GapSearch, Point, UnseenLoad, half_gap_of, inverse, is_known, widths
 
 
 class Alone(NamedTuple):
-    """What the motor says.
+    """A fit to the motor's readings alone.
 
     Attributes:
-        found: the fit of the numbers that the log shows, all of the log as one window.
+        search_fit: the fit of the numbers that the log shows, all of the log as one window.
         values: all numbers of the fit by path, those that the log does not show among them: they belong together.
         gap: what it says of a gap; None where the model has none to be found.
-        why: why no gap is shown, in a clause; "" where one is.
+        reason: why no gap is shown, in a clause; "" where one is.
         model: what was fitted.
         point: its best numbers.
     """
 
-    found: Found
+    search_fit: SearchFit
     values: dict[str, float]
     gap: Gap | None
-    why: str
+    reason: str
     model: UnseenLoad
     point: Point
 
@@ -55,8 +55,8 @@ class Alone(NamedTuple):
 
     @property
     def doubtful(self) -> bool:
-        """Whether a gap is not shown that the readings call for, or leave to be so wide that the load is never met."""
-        return bool(self.why) and self.gap is not None and (self.gap.needed or self.gap.unmet)
+        """True if the readings call for a gap that is not shown, or allow one so wide that the load is never met."""
+        return bool(self.reason) and self.gap is not None and (self.gap.is_needed or self.gap.unmet)
 
 
 def search_alone(
@@ -65,42 +65,42 @@ def search_alone(
     segments: Sequence[Segment],
     settings: IdentifyTable,
     record: Record,
-    rest: bool,
+    at_rest: bool,
 ) -> Alone:
     """Fit a model to the motor's readings in a record; other arguments as of :class:`.search.ParameterSearch`.
 
     Raises:
         InputError: the model diverges.
     """
-    model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, rest)
+    model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, at_rest)
     absent: list[int] = []
-    gap, why = None, ""
+    gap, reason = None, ""
     if model.gap is None:
         point, width = model.settle(model.fit())
     else:
         gap = GapSearch(model).run()
         point, width = gap.best, gap.spread
-        why = why_not(gap, model, settings.spread, record)
-        absent = [model.gap] if why else []
-        if not gap.needed:
+        reason = why_not(gap, model, settings.spread, record)
+        absent = [model.gap] if reason else []
+        if not gap.is_needed:
             point, width = dataclasses.replace(model, held=absent).settle(gap.without)
     if not np.isfinite(point.deviance):
         raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
-    alone = alone_of(model, point, width, absent, gap, why)
+    alone = alone_of(model, point, width, absent, gap, reason)
     if not_met(model, point, record) or alone.doubtful:
         # numbers of a model that the log contradicts, with a gap of any size, or without a load have no interval
-        nothing = np.full_like(alone.found.spread.covariance, np.inf)
-        found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
-        alone = alone._replace(found=found)
+        nothing = np.full_like(alone.search_fit.spread.covariance, np.inf)
+        search_fit = dataclasses.replace(alone.search_fit, spread=alone.search_fit.spread._replace(covariance=nothing))
+        alone = alone._replace(search_fit=search_fit)
     return alone
 
 
-def alone_of(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int], gap: Gap | None, why: str) -> Alone:
+def alone_of(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int], gap: Gap | None, reason: str) -> Alone:
     """A fit in which the numbers at some places (`absent`) are none that was found; `width`: its covariance."""
     values = model.numbers(point.theta)
-    if gap is not None and not gap.needed and model.gap is not None:
+    if gap is not None and not gap.is_needed and model.gap is not None:
         values[model.free[model.gap].path] = 0.0
-    return Alone(_found(model, point, width, absent), values, gap, why, model, point)
+    return Alone(_describe_fit(model, point, width, absent), values, gap, reason, model, point)
 
 
 _FACTOR, _LEFT = 6.0, 0.05
@@ -115,7 +115,7 @@ went wrong."""
 
 def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     """Why a fit cannot be right, in a clause: a torque moves the motor that is in neither; "" if there is none."""
-    left, size = model.unexplained(point), model.torque
+    left, size = model.measure_unexplained(point), model.torque
     if left <= max(_FACTOR * model.torque_noise, _LEFT * size):
         return ""
     return (
@@ -128,13 +128,13 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     """Why a log does not show a gap, and what would, in one clause; "" where it does."""
     unit = record.unit_of("motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
-    if wrong := not_met(model, gap.best if gap.needed else gap.without, record):
+    if wrong := not_met(model, gap.best if gap.is_needed else gap.without, record):
         return wrong
     if gap.unmet:
         return (
             f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
         )
-    if not gap.needed:
+    if not gap.is_needed:
         if gap.at_most >= gap.travel:
             return f"any half gap fits; {both_ways}"
         if gap.crossings < _REVERSALS:
@@ -146,9 +146,9 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     if gap.crossings < 1:
         return f"the motor moves as if in a gap, but meets one flank at most: it is wider than this motion; {both_ways}"
     far = {
-        one.path: float(np.exp(x))
-        for one, x in zip(model.free, gap.best.theta, strict=True)
-        if is_known(one) and abs(x) > _FAR * np.log(spread)
+        number.path: float(np.exp(x))
+        for number, x in zip(model.free, gap.best.theta, strict=True)
+        if is_known(number) and abs(x) > _FAR * np.log(spread)
     }
     if far:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
@@ -158,12 +158,12 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     return ""
 
 
-def _found(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int]) -> Found:
+def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int]) -> SearchFit:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
     sought = np.setdiff1d(np.arange(len(model.free)), absent)
-    every = _only(width, sought)
-    refused, condition = refusals([model.free[i] for i in sought], every)
-    seen = sought[np.sqrt(np.diag(every.covariance)) < UNSEEN]
+    width_sought = _only(width, sought)
+    refused, condition = refusals([model.free[i] for i in sought], width_sought)
+    visible = sought[np.sqrt(np.diag(width_sought.covariance)) < UNSEEN]
     torque, readings = (
         np.concatenate(pieces)
         for pieces in zip(*((segment.torque, segment.readings["motor"]) for segment in model.segments), strict=True)
@@ -171,24 +171,24 @@ def _found(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int]
     # all of the log as one window, without a state of its own
     windows = cut(
         torque, {"motor": readings}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque),
-        rest=model.rest,
+        at_rest=model.at_rest,
     )  # fmt: skip
     residual = (point.errors / model.noise)[None, :, None]
     cost = 0.5 * np.sum(residual**2)
-    fit = Fit(jnp.asarray(point.theta[seen]), windows.start, residual, np.zeros((*residual.shape, 0)), cost, np.True_)
-    return Found(
-        free=tuple(model.free[i] for i in seen), fit=fit,
-        spread=_only(width, seen)._replace(variance=point.variance / model.noise**2),
+    fit = Fit(jnp.asarray(point.theta[visible]), windows.start, residual, np.zeros((*residual.shape, 0)), cost, np.True_)
+    return SearchFit(
+        free=tuple(model.free[i] for i in visible), fit=fit,
+        spread=_only(width, visible)._replace(variance=point.variance / model.noise**2),
         windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
         refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
         held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
     )  # fmt: skip
 
 
-def _only(width: Spread, which: np.ndarray) -> Spread:
-    """Of some of the numbers; what is left open of the others is no information."""
-    covariance = width.covariance[np.ix_(which, which)]
-    return Spread(covariance, inverse(covariance), width.variance, width.inflation[which])
+def _only(width: Spread, places: np.ndarray) -> Spread:
+    """Return the spread of some numbers; what is left open of the others is no information."""
+    covariance = width.covariance[np.ix_(places, places)]
+    return Spread(covariance, inverse(covariance), width.variance, width.inflation[places])
 
 
 def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
@@ -221,37 +221,37 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
 
 
 def gap_summary(alone: Alone) -> JsonObject | None:
-    """What the motor says of the gap, as `backlash` of `identification.json`; None where the model has none."""
+    """Describe the gap by the motor alone, as `backlash` of `identification.json`; None where the model has none."""
     gap, model = alone.gap, alone.model
     if gap is None or model.gap is None:
         return None
     number = model.free[model.gap]
     return {
-        "shown": not alone.why,
+        "shown": not alone.reason,
         "path": number.path,
         "nominal": number.nominal * half_gap_of(number),
-        "half_gap": None if alone.why else model.half_gap(gap.best.theta),
+        "half_gap": None if alone.reason else model.half_gap(gap.best.theta),
         "at_most": gap.at_most,
         "unmet": gap.unmet,
         "gain": gap.gain,
         "needed": SHOWN,
         "crossings": gap.crossings,
         "starts": gap.starts,
-        "why": alone.why or None,
+        "why": alone.reason or None,
     }
 
 
 def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
-    """How well the numbers found predict another log of the motor, beside the nominal ones.
+    """Predict another log of the motor by the fitted numbers, and by the nominal ones.
 
     `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
     """
     fitted, smoothness = alone.model, alone.point.smoothness
-    segments = segments_of(record, ["motor"], fitted.rest)
+    segments = segments_of(record, ["motor"], fitted.at_rest)
     model = dataclasses.replace(fitted, experiment=at_period(fitted.experiment, record.sample_period), segments=segments)
     if nominal is None:
         nominal = np.zeros(len(model.free))
-    after, before = (float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
+    after, before = (float(np.sqrt(model.predict(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
     position = describe_position(record, "motor", model.noise, rms=after, nominal_rms=before)
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

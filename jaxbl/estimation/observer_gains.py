@@ -49,21 +49,21 @@ class ChosenGains(NamedTuple):
 
 
 @jit
-def _misses(experiment: Experiment, kinematics: Kinematics, tried: TracedArrays, readings: TracedArrays) -> TracedArrays:
+def _misses(experiment: Experiment, kinematics: Kinematics, gains: TracedArrays, readings: TracedArrays) -> TracedArrays:
     """Rms difference of each observer's velocity to the smoothed one, for several gains."""
 
     def velocity(state: State, signals: Signals) -> dict[str, Any]:
         return {side: signals.side(side).velocity_estimate for side in experiment.sides}
 
-    def one(values: TracedArrays) -> TracedArrays:
-        _, found = replay(set_leaves(experiment, values), kinematics.torque, readings, record=velocity)
+    def miss(values: TracedArrays) -> TracedArrays:
+        _, velocities = replay(set_leaves(experiment, values), kinematics.torque, readings, record=velocity)
         settled = slice(len(kinematics.time) // 4, None)
         return {
-            side: jnp.sqrt(jnp.mean((found[side][settled] - smooth[settled]) ** 2))
+            side: jnp.sqrt(jnp.mean((velocities[side][settled] - smooth[settled]) ** 2))
             for side, smooth in kinematics.velocity.items()
         }
 
-    return jax.vmap(one)(tried)
+    return jax.vmap(miss)(gains)
 
 
 def choose_gains(
@@ -76,23 +76,23 @@ def choose_gains(
     (alpha, factor), least = (x.ravel() for x in np.meshgrid(_ALPHA, _LAMBDA)), np.tile(_LEAST_LAMBDA, len(_LAMBDA))
     # of NumPy: arithmetic alone is no program then
     drive = jax.tree.map(np.asarray, experiment.drive)
-    f_plus, tried = {}, {}
+    f_plus, candidates = {}, {}
     for side in experiment.sides:
         # acceleration that the observer's nominal model does not explain
         disturbance = k.acceleration[side] - drive.acceleration(side, k.velocity[side], k.torque)
         f_plus[side] = float(np.max(np.abs(disturbance[ends])))
         bound = max(f_plus[side], np.finfo(float).tiny)
-        tried[f"observer.{side}.alpha"] = alpha * bound
-        tried[f"observer.{side}.lambda"] = factor * least * np.sqrt(bound)
+        candidates[f"observer.{side}.alpha"] = alpha * bound
+        candidates[f"observer.{side}.lambda"] = factor * least * np.sqrt(bound)
 
     readings = {side: np.asarray(measured[side])[:count] for side in experiment.sides}
-    missed = _misses(experiment, k, tried, readings)
+    missed = _misses(experiment, k, candidates, readings)
     chosen = {}
     for side in experiment.sides:
         size = np.asarray(missed[side])
         size = np.where(np.isfinite(size), size, np.inf)
         # several do exactly the same where noise is fine: the first of them, whatever rounding says
         best = int(np.argmax(size <= (1.0 + 1e-9) * np.min(size)))
-        lambda_, alpha_ = (float(tried[f"observer.{side}.{name}"][best]) for name in ("lambda", "alpha"))
+        lambda_, alpha_ = (float(candidates[f"observer.{side}.{name}"][best]) for name in ("lambda", "alpha"))
         chosen[side] = ChosenGains(lambda_, alpha_, f_plus[side], float(size[best]))
     return chosen

@@ -55,16 +55,18 @@ def refine_steps(
         Windows and fit with finer steps, or as they were if these make the log less likely; errors of theta that remain,
         each of shape (parameters,); and plant steps in a sample.
     """
-    given, first, change, left, excess = windows, fit, np.zeros(len(free)), np.zeros(len(free)), 0.0
+    study_windows, first, change, left, excess = windows, fit, np.zeros(len(free)), np.zeros(len(free)), 0.0
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
         theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(spread(fit).covariance))
-        model = set_leaves(experiment, {one.path: np.asarray(one.value(theta[i])) for i, one in enumerate(free)})
+        model = set_leaves(
+            experiment, {parameter.path: np.asarray(parameter.value(theta[i])) for i, parameter in enumerate(free)}
+        )
         jacobian = np.asarray(fit.jacobian).reshape(-1, len(free))
         normal = jacobian.T @ jacobian + np.eye(len(free)) / PRIOR_DEVIATION**2
         # of what diverges nothing is finite, and finer steps are of no help
         with np.errstate(all="ignore"):
-            own = fine = _simulate(model, windows, fit, study_steps)
+            coarse = fine = _simulate(model, windows, fit, study_steps)
             while True:
                 half = _simulate(model, windows, fit, 2 * steps)
                 left = np.linalg.solve(normal, jacobian.T @ (half - fine).ravel())
@@ -76,7 +78,7 @@ def refine_steps(
                 fine = _simulate(model, windows, fit, steps)
         if steps == study_steps:
             return windows, fit, [], steps
-        finer = half - own
+        finer = half - coarse
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
         if np.all(np.abs(change) < _LINEAR * deviation):
@@ -85,7 +87,7 @@ def refine_steps(
         if fits_left:
             fit = fit_again(windows, fit)
             if not float(fit.cost - first.cost) < _LESS_LIKELY * spread(first).variance:
-                return given, first, [change], study_steps
+                return study_windows, first, [change], study_steps
     # by the order of the steps, a third of the last change is left
     return windows, fit, [change, left / 3.0] if excess > 1.0 else [change], 2 * steps
 

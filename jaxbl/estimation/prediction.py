@@ -58,7 +58,7 @@ def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, Number
         return {side: kalman_gain(value, period) for side, value in smoothness.items()}
 
     def best(candidates: list[Numbers]) -> Numbers:
-        sizes = np.array([_sizes(experiment, few, gains_of(one)) for one in candidates])
+        sizes = np.array([_sizes(experiment, few, gains_of(smoothness)) for smoothness in candidates])
         with np.errstate(divide="ignore"):
             total = np.sum(np.log(sizes), axis=1)
         return candidates[int(np.argmin(np.where(np.isfinite(total), total, np.inf)))]

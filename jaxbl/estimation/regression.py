@@ -35,7 +35,7 @@ SideSamples = dict[str, Samples]
 
 
 class Path(eqx.Module):
-    """What effects see along a log.
+    """Signals along a log that effects depend on.
 
     Attributes:
         time: s, shape (samples,).
@@ -82,8 +82,8 @@ def kinematics_from(
         {side: np.ascontiguousarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
     )
     measured = None if transmitted is None else np.asarray(transmitted)
-    given: list[Any] = [np.asarray(time), mean[earlier:], position, velocity, acceleration, measured]
-    return Kinematics(*given, before=mean[:earlier] if earlier else None)  # pyright: ignore[reportArgumentType]
+    arrays: list[Any] = [np.asarray(time), mean[earlier:], position, velocity, acceleration, measured]
+    return Kinematics(*arrays, before=mean[:earlier] if earlier else None)  # pyright: ignore[reportArgumentType]
 
 
 class Balance(NamedTuple):
@@ -105,18 +105,18 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
     states, torque = effect_path(experiment, k)
-    found = {}
+    balances = {}
     if k.transmitted is not None and plant.transmission is not None:
-        found["transmission"] = Balance(k.transmitted - _transmitted(plant, k, states), k.transmitted)
+        balances["transmission"] = Balance(k.transmitted - _transmit(plant, k, states), k.transmitted)
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, k.transmitted)
     through = k.transmitted
     if through is None and plant.transmission is not None:
-        through = _transmitted(plant, k, states)
+        through = _transmit(plant, k, states)
     for side, (total, level) in acting.items():
         resisting = drive.viscous(side) * k.velocity[side] + level * jnp.sign(k.velocity[side])
         driving = torque if side == "motor" or through is None else drive.torque_gain(side) * through
-        found[side] = Balance(total - resisting - plant.inertia(side) * k.acceleration[side], driving)
-    return found
+        balances[side] = Balance(total - resisting - plant.inertia(side) * k.acceleration[side], driving)
+    return balances
 
 
 @jit
@@ -125,12 +125,12 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
 
     Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
     """
-    plant, k, found = experiment.plant, kinematics, {}
+    plant, k, torques = experiment.plant, kinematics, {}
     states, torque = effect_path(experiment, k)
     loaded: Any = 0.0
     if plant.transmission is not None:
-        found["transmission"] = _transmitted(plant, k, states)
-        loaded = plant.gear_friction(states, found["transmission"])
+        torques["transmission"] = _transmit(plant, k, states)
+        loaded = plant.gear_friction(states, torques["transmission"])
     none = jnp.zeros_like(k.torque)
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.resolve_place(effect.place) for effect in plant.effects}
@@ -142,34 +142,34 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
             added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
             commanded = k.torque if side == "motor" else 0.0
             level = level + (loaded if side == "motor" else 0.0)
-            found[side] = level * direction + commanded - total + added
-    return found
+            torques[side] = level * direction + commanded - total + added
+    return torques
 
 
 @jit
-def transmitted(experiment: Experiment, k: Kinematics) -> Samples:
+def find_transmitted(experiment: Experiment, k: Kinematics) -> Samples:
     """Transmitted torque by a model at known kinematics, N m."""
-    gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))
-    return _transmitted(gear.plant, k, effect_path(gear, k)[0])
+    gear = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.place == "transmission"))
+    return _transmit(gear.plant, k, effect_path(gear, k)[0])
 
 
-def _transmitted(plant: Plant, k: Kinematics, states: EffectStates) -> Samples:
+def _transmit(plant: Plant, k: Kinematics, states: EffectStates) -> Samples:
     return jax.vmap(plant.transmitted_torque)(k.position, k.velocity, states)[0]
 
 
-def settled(experiment: Experiment, torque: Float[Array, ""]) -> EffectStates:
+def settle_states(experiment: Experiment, torque: Float[Array, ""]) -> EffectStates:
     """The effects' own states after an input (N m) that has lasted."""
     # as of their classes: of a method of a module equinox makes a module
     return tuple(type(effect).settled(effect, torque) for effect in experiment.effects)
 
 
 def remembers_input(effect: AbstractEffect) -> bool:
-    """Whether an effect depends on inputs before a log's first sample."""
+    """Return True if an effect depends on inputs before a log's first sample."""
     return effect.place == "actuator" and bool(jax.tree.leaves(type(effect).init(effect)))
 
 
 @jit
-def begun(
+def begin_states(
     experiment: Experiment,
     torque: Samples,
     before: Float[Array, " earlier"] | None = None,
@@ -185,7 +185,7 @@ def begun(
     """
     plant, period = experiment.plant, experiment.run.sample_period
     first = torque[0] if before is None else before[0]
-    start = tuple(type(one).init(one) for one in plant.effects) if from_rest else settled(experiment, first)
+    start = tuple(type(effect).init(effect) for effect in plant.effects) if from_rest else settle_states(experiment, first)
     start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), start)
     if before is None or not any(map(remembers_input, plant.effects)):
         return start
@@ -200,14 +200,14 @@ def begun(
 @jit
 def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[EffectStates, Samples]:
     """The effects' own states at each sample of a known motion, and the torque (N m) that acts; they begin as
-    :func:`begun` says."""
+    :func:`begin_states` says."""
     plant, period = experiment.plant, experiment.run.sample_period
     speeds = {side: speed[0] for side, speed in path.velocity.items()}
     start = tuple(
-        type(effect).set_in_motion(effect, own, speeds[place])
+        type(effect).set_in_motion(effect, state, speeds[place])
         if (place := plant.drive.resolve_place(effect.place)) in speeds
-        else own
-        for effect, own in zip(plant.effects, begun(experiment, path.torque, path.before, from_rest), strict=True)
+        else state
+        for effect, state in zip(plant.effects, begin_states(experiment, path.torque, path.before, from_rest), strict=True)
     )
     moving = any(effect.place == "actuator" for effect in plant.effects) or plant.has_memory
     if not moving:
@@ -216,8 +216,8 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
     steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()} if plant.has_memory else {}
     motion = (path.time, path.position, steps) if plant.has_memory else None
 
-    def sample(states: EffectStates, given: tuple[Any, Any]) -> tuple[EffectStates, tuple[EffectStates, Array]]:
-        torque, motion = given
+    def sample(states: EffectStates, row: tuple[Any, Any]) -> tuple[EffectStates, tuple[EffectStates, Array]]:
+        torque, motion = row
         new, arriving = plant.receive(states, torque, period)
         new, acting = plant.actuate(new, arriving(0.0, period), period)
         if motion is not None:
@@ -230,7 +230,7 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
 
 def effect_states(experiment: Experiment, path: Path) -> EffectStates:
     """The effects' own states at each sample of a known motion, by :func:`effect_path` unless there are none."""
-    none = settled(experiment, path.torque[0])
+    none = settle_states(experiment, path.torque[0])
     return effect_path(experiment, path)[0] if jax.tree.leaves(none) else none
 
 
@@ -242,13 +242,13 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
 
 
 def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
-    """How far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
-    found: dict[str, list[Balance]] = {}
+    """Measure how far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
+    balances: dict[str, list[Balance]] = {}
     for part in parts:
-        for name, one in jit(balance)(experiment, part).items():
-            found.setdefault(name, []).append(Balance(decimate(one.residual, factor), decimate(one.drive, factor)))
+        for name, sample in jit(balance)(experiment, part).items():
+            balances.setdefault(name, []).append(Balance(decimate(sample.residual, factor), decimate(sample.drive, factor)))
     figures = {}
-    for name, pieces in found.items():
+    for name, pieces in balances.items():
         left, drive = (float(jnp.sqrt(jnp.mean(jnp.concatenate(x) ** 2))) for x in zip(*pieces, strict=True))
         figures[name] = {"rms": left, "relative": left / drive if drive > 0.0 else float("nan")}
     return figures
@@ -289,7 +289,7 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
             torques.setdefault(side, []).append(np.asarray(decimate(left.residual, factor)))
             for name, values in (("velocity", part.velocity[side]), ("position", part.position[side])):
                 channels.setdefault((side, name), []).append(np.asarray(decimate(jnp.asarray(values), factor)))
-    found = []
+    shares = []
     # in each range and block some samples
     if sum(map(len, torques.get("motor", []))) < 2 * _BLOCKS * _BINS:
         return None
@@ -297,8 +297,8 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
         torque, values = np.concatenate(torques[side]), np.concatenate(pieces)
         gains = _gains_by_ranges(torque - np.mean(torque), values)
         if np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
-            found.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
-    return max(found, key=lambda one: one.share, default=None)
+            shares.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
+    return max(shares, key=lambda share: share.share, default=None)
 
 
 def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " blocks"]:
@@ -324,24 +324,24 @@ def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequen
 
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
-    def left(theta: Array) -> Array:
-        at = set_free_parameters(experiment, free, theta)
-        each = [balance(at, part) for part in parts]
-        columns = [jnp.concatenate([decimate(one[name].residual, factor) for one in each]) for name in names]
+    def miss_torques(theta: Array) -> Array:
+        model = set_free_parameters(experiment, free, theta)
+        balances = [balance(model, part) for part in parts]
+        columns = [jnp.concatenate([decimate(equations[name].residual, factor) for equations in balances]) for name in names]
         return jnp.stack(columns, axis=-1)
 
-    def weighted(theta: Array, weights: Array) -> tuple[Array, Array]:
-        return left(theta) * weights[None, :], theta / PRIOR_DEVIATION
+    def weigh(theta: Array, weights: Array) -> tuple[Array, Array]:
+        return miss_torques(theta) * weights[None, :], theta / PRIOR_DEVIATION
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 
     def again(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
         theta = carry[0]
-        weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
-        solution = optx.least_squares(weighted, solver, theta, weights, max_steps=200, throw=False)
+        weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(miss_torques(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
+        solution = optx.least_squares(weigh, solver, theta, weights, max_steps=200, throw=False)
         return solution.value, weights, solution.result == optx.RESULTS.successful
 
     first = jnp.zeros(len(free)), jnp.ones(len(names)), jnp.asarray(True)
     theta, weights, ended = jax.lax.fori_loop(0, _PASSES, again, first)
-    residual, jacobian = left(theta) * weights[None, :], jax.jacfwd(left)(theta) * weights[None, :, None]
+    residual, jacobian = miss_torques(theta) * weights[None, :], jax.jacfwd(miss_torques)(theta) * weights[None, :, None]
     return Fit(theta, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), ended)

@@ -36,7 +36,7 @@ NOISE_ALONE = 1.1
 
 
 def is_noise(residual: Mapping[str, float]) -> bool:
-    """Whether what a model leaves of a record's positions (`rms` and `noise` of a residual) counts as noise alone."""
+    """Return True if a residual of the positions (its `rms` and `noise`) counts as noise alone."""
     return residual["rms"] < NOISE_ALONE * residual["noise"]
 
 
@@ -73,7 +73,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found(Fitted):
+class SearchFit(Fitted):
     """The fit that was kept, of the numbers that the log shows.
 
     Attributes:
@@ -91,7 +91,7 @@ class Found(Fitted):
 
 def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
     """Theta with phases within half a turn of their nominal values."""
-    turns = np.array([2.0 * np.pi / one.scale if one.role == "angle" else 0.0 for one in free])
+    turns = np.array([2.0 * np.pi / parameter.scale if parameter.role == "angle" else 0.0 for parameter in free])
     return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
 
 
@@ -102,7 +102,7 @@ class ParameterSearch:
         experiment: the nominal model, with array leaves; its sample period is that of the log.
         segments: of the log.
         settings: `[identify]` of the study.
-        rest: whether the log begins at rest.
+        at_rest: whether the log begins at rest.
         name: of the log, for messages.
 
     Raises:
@@ -110,9 +110,15 @@ class ParameterSearch:
     """
 
     def __init__(
-        self, experiment: Experiment, segments: Sequence[Segment], settings: IdentifyTable, *, rest: bool, name: str
+        self, experiment: Experiment, segments: Sequence[Segment], settings: IdentifyTable, *, at_rest: bool, name: str
     ):
-        self.experiment, self.segments, self.settings, self.rest, self.name = experiment, segments, settings, rest, name
+        self.experiment, self.segments, self.settings, self.at_rest, self.name = (
+            experiment,
+            segments,
+            settings,
+            at_rest,
+            name,
+        )
         shortest, longest = min(map(len, segments)), max(map(len, segments))
         period = segments[0].period
         if settings.window is None:
@@ -129,29 +135,29 @@ class ParameterSearch:
                 )
             self.lengths = [asked]
 
-    def run(self, free: tuple[FreeParameter, ...]) -> Found:
+    def run(self, free: tuple[FreeParameter, ...]) -> SearchFit:
         """Fit; of directions that the record does not show, one number at a time is taken out.
 
         Raises:
             InputError: the model diverges.
         """
         theta, starts = self._coarse(free)
-        kept = np.ones(len(free), bool)
-        found = self._whole(free, theta, kept)
-        refused, condition = refusals(found.free, found.spread)
+        fitted = np.ones(len(free), bool)
+        best = self._whole(free, theta, fitted)
+        refused, condition = refusals(best.free, best.spread)
         held, left = [], refused
-        while left and len(found.free) > 1:
-            worst = max(left, key=lambda one: one.deviation)
+        while left and len(best.free) > 1:
+            worst = max(left, key=lambda refusal: refusal.deviation)
             out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
             held.append(out)
-            kept &= np.array([one.path != out for one in free])
-            theta = np.where(kept, theta, 0.0)
-            found = self._whole(free, theta, kept)
-            left, _ = refusals(found.free, found.spread)
-        return Found(**vars(found), refused=refused, held=held, condition=condition, starts=starts)
+            fitted &= np.array([parameter.path != out for parameter in free])
+            theta = np.where(fitted, theta, 0.0)
+            best = self._whole(free, theta, fitted)
+            left, _ = refusals(best.free, best.spread)
+        return SearchFit(**vars(best), refused=refused, held=held, condition=condition, starts=starts)
 
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
-        return windows_of(self.segments, self.experiment, samples, self.rest)
+        return windows_of(self.segments, self.experiment, samples, self.at_rest)
 
     def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[JsonObject]]:
         """Best of several starts, on short windows from all over the record.
@@ -167,32 +173,33 @@ class ParameterSearch:
         thetas = np.zeros((self.settings.starts, len(free)))
         thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
         tries = fits(self.experiment, free, windows, thetas, _FEW_STEPS, rounds=1)
-        cost = np.array([one.cost for one in tries])
+        cost = np.array([end.cost for end in tries])
         cost = np.where(np.isfinite(cost), cost, np.inf)
-        found = np.array([one.theta for one in tries])
+        thetas_found = np.array([end.theta for end in tries])
         if not np.isfinite(cost).any():
             raise InputError(f"{self.name}: the model diverges from every start; its nominal numbers should be nearer")
         best = int(np.argmin(cost))
         # fits end where they change residuals by little beside the noise: without noise, costs may be any times one another
         same = cost[best] + 0.01 * max(cost[best], tries[best].residual.size / 2)
         starts = [
-            {"cost": float(c), "agrees": bool(c <= same), "theta": t.tolist()} for c, t in zip(cost, found, strict=True)
+            {"cost": float(c), "agrees": bool(c <= same), "theta": t.tolist()}
+            for c, t in zip(cost, thetas_found, strict=True)
         ]
-        return _nearest_turn(free, found[best]), starts
+        return _nearest_turn(free, thetas_found[best]), starts
 
-    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, kept: np.ndarray) -> Fitted:
+    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, fitted: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
 
         def fit_again(windows: Windows, fit: Fit) -> Fit:
             start = theta.copy()
-            start[kept] = fit.theta
-            return fit_from(windows, start).only(np.flatnonzero(kept))
+            start[fitted] = fit.theta
+            return fit_from(windows, start).only(np.flatnonzero(fitted))
 
         def fit_from(windows: Windows, start: np.ndarray) -> Fit:
-            return fits(self.experiment, free, windows, start[None], held=~kept[None])[0]
+            return fits(self.experiment, free, windows, start[None], held=~fitted[None])[0]
 
-        left = tuple(itertools.compress(free, kept))
-        tried: list[tuple[float, Fitted]] = []
+        left = tuple(itertools.compress(free, fitted))
+        sized: list[tuple[float, Fitted]] = []
         for samples in self.lengths:
             windows, firsts = self._cut(samples)
             smoothness: dict[str, float] = {}
@@ -200,18 +207,18 @@ class ParameterSearch:
                 for _ in range(_PASSES):
                     windows, smoothness = predictor(set_free_parameters(self.experiment, free, jnp.asarray(theta)), windows)
                     theta = np.asarray(fit_from(windows, theta).theta)
-            found = fit_from(windows, theta).only(np.flatnonzero(kept))
-            windows, found, errors, steps = refine_steps(self.experiment, left, windows, found, fit_again)
-            width = spread(found).with_error(*errors)
+            end = fit_from(windows, theta).only(np.flatnonzero(fitted))
+            windows, end, errors, steps = refine_steps(self.experiment, left, windows, end, fit_again)
+            width = spread(end).with_error(*errors)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size):
-                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness, steps, errors)))
-        if not tried:
+                sized.append((size, Fitted(left, end, width, windows, firsts, smoothness, steps, errors)))
+        if not sized:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
-        growth = tried[-1][1].spread.variance / tried[0][1].spread.variance - 1.0
-        best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
+        growth = sized[-1][1].spread.variance / sized[0][1].spread.variance - 1.0
+        best, *runners_up = [candidate for _, candidate in sorted(sized, key=lambda pair: pair[0])]
         grows = growth > _SURE * np.sqrt(2.0 / best.fit.residual.size)
-        return _between(best, others[0], grows) if others else best
+        return _between(best, runners_up[0], grows) if runners_up else best
 
 
 def _between(best: Fitted, other: Fitted, grows: bool) -> Fitted:

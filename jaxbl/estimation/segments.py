@@ -62,10 +62,12 @@ class Segment:
         """Some of its samples, in a row."""
         first = part.start or 0
         smoothed = {
-            side: one._replace(state=one.state[part], covariance=one.covariance[part], innovations=one.innovations[part])
-            for side, one in self.smoothed.items()
+            side: motion._replace(
+                state=motion.state[part], covariance=motion.covariance[part], innovations=motion.innovations[part]
+            )
+            for side, motion in self.smoothed.items()
         }
-        readings = {side: one[part] for side, one in self.readings.items()}
+        readings = {side: values[part] for side, values in self.readings.items()}
         transmitted = None if self.transmitted is None else self.transmitted[part]
         time, begin = self.time[part], self.rows.start + first
         rows, before = slice(begin, begin + len(time)), self.torque[:first][-DELAY_SAMPLES:] if first else self.before
@@ -80,27 +82,27 @@ class Segment:
     @cached_property
     def kinematics(self) -> Kinematics:
         """The smoothed motion as the equations of motion take it."""
-        states = {side: one.state for side, one in self.smoothed.items()}
+        states = {side: motion.state for side, motion in self.smoothed.items()}
         return kinematics_from(self.time, self.torque, states, self.transmitted, self.before)
 
 
-def led_in(record: Record, rest: bool) -> Record:
+def skip_unknown_input(record: Record, at_rest: bool) -> Record:
     """A log whose segments begin later by as many samples as a dead time may last, where what was commanded before them is
-    not known; but for short ones. `rest`: whether the log begins at rest, with no input before."""
+    not known; but for short ones. `at_rest`: whether the log begins at rest, with no input before."""
     parts = tuple(
         slice(part.start + DELAY_SAMPLES, part.stop)
-        if _before(record, part, rest) is None and part.stop - part.start >= _LONG * DELAY_SAMPLES
+        if _before(record, part, at_rest) is None and part.stop - part.start >= _LONG * DELAY_SAMPLES
         else part
         for part in record.segments
     )
     return dataclasses.replace(record, segments=parts)
 
 
-def _before(record: Record, part: slice, rest: bool) -> np.ndarray | None:
+def _before(record: Record, part: slice, at_rest: bool) -> np.ndarray | None:
     """Input before a part of a log, N m, shape (DELAY_SAMPLES,), where it is known."""
     assert record.torque is not None
     # nothing is commanded of a drive that moves freely
-    if not record.torque.any() or (rest and any(part.start == rows.start for _, rows in record.logs)):
+    if not record.torque.any() or (at_rest and any(part.start == rows.start for _, rows in record.logs)):
         return np.zeros(DELAY_SAMPLES)
     first = part.start - DELAY_SAMPLES
     apart = DELAY_SAMPLES * record.sample_period
@@ -109,38 +111,39 @@ def _before(record: Record, part: slice, rest: bool) -> np.ndarray | None:
     return record.torque[first : part.start]
 
 
-def segments_of(record: Record, sides: Sequence[str], rest: bool = False) -> list[Segment]:
-    """Segments of a log, the positions of each side smoothed; `rest`: whether the log begins at rest."""
+def segments_of(record: Record, sides: Sequence[str], at_rest: bool = False) -> list[Segment]:
+    """Segments of a log, the positions of each side smoothed; `at_rest`: whether the log begins at rest."""
     assert record.torque is not None
-    found = []
+    segments = []
     for rows in record.segments:
         readings = {side: record.positions[side][rows] for side in sides}
-        smoothed = {side: smooth(one, record.sample_period) for side, one in readings.items()}
+        smoothed = {side: smooth(values, record.sample_period) for side, values in readings.items()}
         time, torque = record.time[rows] - record.time[0], record.torque[rows]
         transmitted = None if record.transmitted is None else record.transmitted[rows]
-        before = _before(record, rows, rest)
-        found.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted, before))
-    return found
+        before = _before(record, rows, at_rest)
+        segments.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted, before))
+    return segments
 
 
 def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
     """Standard deviation of the readings' noise of each side, rad: the mean over the segments."""
-    return {side: float(np.mean([float(one.smoothed[side].noise) for one in segments])) for side in segments[0].smoothed}
+    sides = segments[0].smoothed
+    return {side: float(np.mean([float(segment.smoothed[side].noise) for segment in segments])) for side in sides}
 
 
 def signal_sizes(experiment: Experiment, segments: Sequence[Segment]) -> SignalSizes:
     """Standard deviation of the input, rms speed of the motor, and standard deviation of the twist."""
-    motion = [one.kinematics for one in segments]
+    motion = [segment.kinematics for segment in segments]
     speed = rms(np.concatenate([part.velocity["motor"] for part in motion]))
     twist = [part.position["motor"] - experiment.drive.ratio("load") * part.position.get("load", 0.0) for part in motion]
     geared = "load" in motion[0].position
-    torque = float(np.std(np.concatenate([one.torque for one in segments])))
+    torque = float(np.std(np.concatenate([segment.torque for segment in segments])))
     return SignalSizes(torque, speed, float(np.std(np.concatenate(twist))) if geared else 0.0)
 
 
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
     """Kinematics of the segments that are long enough to be decimated by a factor."""
-    return [one.kinematics for one in segments if len(one) >= max(2 * shortest(factor), _FEWEST)]
+    return [segment.kinematics for segment in segments if len(segment) >= max(2 * shortest(factor), _FEWEST)]
 
 
 @jit
@@ -149,13 +152,13 @@ def _torques(experiment: Experiment, k: Kinematics, states: EffectStates) -> dic
     return jax.vmap(experiment.plant.side_torques)(k.position, k.velocity, states, k.torque, k.time)
 
 
-def _held(experiment: Experiment, segment: Segment, states: EffectStates) -> EffectStates:
+def _hold_frictions(experiment: Experiment, segment: Segment, states: EffectStates) -> EffectStates:
     """States of effects along a segment; where a side is not seen to move, those of frictions with a memory that hold it.
 
     Their state follows from the way covered, and there that is less than readings show.
     """
-    plant, k, found = experiment.plant, segment.kinematics, list(states)
-    holding = [i for i, one in enumerate(plant.effects) if type(one).holds is not AbstractEffect.holds]
+    plant, k, new_states = experiment.plant, segment.kinematics, list(states)
+    holding = [i for i, effect in enumerate(plant.effects) if type(effect).holds is not AbstractEffect.holds]
     if not holding:
         return states
     acting = _torques(experiment, k, states)
@@ -164,10 +167,12 @@ def _held(experiment: Experiment, segment: Segment, states: EffectStates) -> Eff
         motion = Motion(
             k.time, k.position[side], k.velocity[side], k.torque if side == "motor" else jnp.zeros_like(k.torque)
         )
-        rest = acting[side][0] + plant.holding_torque(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
-        still = segment.smoothed[side].held(segment.period)
-        found[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(rest), states[i])
-    return tuple(found)
+        balance = (
+            acting[side][0] + plant.holding_torque(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
+        )
+        still = segment.smoothed[side].find_standstill(segment.period)
+        new_states[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(balance), states[i])
+    return tuple(new_states)
 
 
 def at_period(experiment: Experiment, period: float) -> Experiment:
@@ -176,20 +181,22 @@ def at_period(experiment: Experiment, period: float) -> Experiment:
 
 
 def windows_of(
-    segments: Sequence[Segment], experiment: Experiment, samples: int, rest: bool = False
+    segments: Sequence[Segment], experiment: Experiment, samples: int, at_rest: bool = False
 ) -> tuple[Windows, np.ndarray]:
     """A log in windows of so many samples, segment by segment, and the row that each begins with.
 
-    Shorter segments are left out; the experiment says how effects begin, `rest` whether each segment begins at rest.
+    Shorter segments are left out; the experiment says how effects begin, `at_rest` whether each segment begins at rest.
     """
     pieces, firsts = [], []
     noise = reading_noise(segments)
-    for one in segments:
-        if len(one) < samples:
+    for segment in segments:
+        if len(segment) < samples:
             continue
-        k = one.kinematics
-        along = Path(k.time, one.torque, k.position, k.velocity, before=one.before)
-        start = PlantState(k.position, k.velocity, _held(experiment, one, effect_states(experiment, along)))
-        pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
-        firsts.append(one.rows.start + samples * np.arange(len(one) // samples))
+        k = segment.kinematics
+        along = Path(k.time, segment.torque, k.position, k.velocity, before=segment.before)
+        start = PlantState(k.position, k.velocity, _hold_frictions(experiment, segment, effect_states(experiment, along)))
+        pieces.append(
+            cut(segment.torque, segment.readings, segment.period, start, noise, samples, float(segment.time[0]), at_rest)
+        )
+        firsts.append(segment.rows.start + samples * np.arange(len(segment) // samples))
     return Windows.join(pieces), np.concatenate(firsts)

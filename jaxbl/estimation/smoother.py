@@ -67,8 +67,8 @@ class Smoothed(NamedTuple):
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return self.covariance[:, order, order] ** 0.5
 
-    def held(self, period: float) -> Bool[np.ndarray, " samples"]:
-        """Where the position is not shown to move for a while: dry friction may hold it there.
+    def find_standstill(self, period: float) -> Bool[np.ndarray, " samples"]:
+        """Find samples at which the position is not shown to move for a while: dry friction may hold it there.
 
         Neither velocity nor acceleration stands out of the velocity's noise, the latter over the smoother's time constant.
         """
@@ -87,7 +87,7 @@ _FULL = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Where they stand in it."""
 
 
-def _predicted(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
+def _predict(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the Kalman filter, in units of noise and period; kept: state and covariance of the prediction, its error
     and that one's variance."""
     (smoothness,), x, (y,) = values, carry[:3], inputs
@@ -104,7 +104,7 @@ def _predicted(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
 
 
 def _advance(a: Any, b: Any, c: Any) -> Leaves:
-    """What a period makes of a state."""
+    """Advance a state by one period."""
     return [a + b + 0.5 * c, b + c, c]
 
 
@@ -119,20 +119,20 @@ def _transform(function: Callable[[Any, Any, Any], Leaves], matrix: Any) -> list
 
 
 def _innovation(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
-    """As :func:`_predicted`; kept: error and variance alone."""
-    new, found = _predicted(values, carry, inputs)
-    return new, found[-2:]
+    """Predict as :func:`_predict` does; kept: error and variance alone."""
+    new, columns = _predict(values, carry, inputs)
+    return new, columns[-2:]
 
 
-def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
+def _correct(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the backward pass, from what the filter kept there; kept: smoothed state and covariance."""
     x, (e, s) = inputs[:3], inputs[9:]
     p = [[inputs[3 + i] for i in row] for row in _FULL]
     large = [[carry[3 + i] for i in row] for row in _FULL]
     gain = [p[i][0] / s for i in range(3)]
 
-    def dot(some: Leaves, others: Leaves) -> Any:
-        return some[0] * others[0] + some[1] * others[1] + some[2] * others[2]
+    def dot(a: Leaves, b: Leaves) -> Any:
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     # with C = 1 - K C: C' small, less the error; C' large C, and the precision of the reading
     small = [carry[0] - dot(gain, carry[:3]) - e / s, carry[1], carry[2]]
@@ -147,9 +147,9 @@ def _corrected(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, L
 
 
 def _along(sample: Any, values: Leaves, carry: Leaves, inputs: Leaves) -> Arrays:
-    """What a function of a sample keeps along a signal, or along several side by side; numbers are one lane."""
-    found = scan_signal(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
-    return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
+    """Run a function of a sample along a signal, or along several side by side; numbers are one lane."""
+    columns = scan_signal(sample, [np.ravel(value) for value in values], [np.ravel(number) for number in carry], inputs)
+    return [column if np.ndim(carry[0]) else column[:, 0] for column in columns]
 
 
 def _start(position: Any) -> Leaves:
@@ -166,28 +166,28 @@ def _first(position: Any, smoothness: Any) -> Leaves:
     From an altogether unknown one the backward pass would lose all digits in the covariance of the first samples.
     """
     start = _start(position)
-    *last, e, s = (one[-1] for one in _along(_predicted, [smoothness + 0.0 * start[0]], start, [position[::-1]]))
+    *last, e, s = (column[-1] for column in _along(_predict, [smoothness + 0.0 * start[0]], start, [position[::-1]]))
     x, p = last[:3], last[3:]
     gain = [p[i] / s for i in _FULL[0]]
     turned = 1.0, -1.0, 1.0
     covariance = [p[_FULL[i][j]] - gain[i] * gain[j] * s for i, j in _UPPER]
     return [
-        *(sign * (one + by * e) for sign, one, by in zip(turned, x, gain, strict=True)),
-        *(_SPREAD**2 * turned[i] * turned[j] * one for (i, j), one in zip(_UPPER, covariance, strict=True)),
+        *(sign * (value + factor * e) for sign, value, factor in zip(turned, x, gain, strict=True)),
+        *(_SPREAD**2 * turned[i] * turned[j] * value for (i, j), value in zip(_UPPER, covariance, strict=True)),
     ]
 
 
 def _likelihood(scaled: Any, logs: Any) -> tuple[Any, Any]:
     """Log-likelihood of several smoothnesses at their best noise, and that noise; positions in any unit, as the filter's
     gains do not depend on it."""
-    values, start = [np.exp(logs)], [one + 0.0 * logs for one in _start(scaled)]
+    values, start = [np.exp(logs)], [number + 0.0 * logs for number in _start(scaled)]
     # the first samples find the state
-    e, s = (one[3:] for one in _along(_innovation, values, start, [scaled]))
+    e, s = (column[3:] for column in _along(_innovation, values, start, [scaled]))
     variance = np.sum(e**2 / s, axis=0) / len(e)
     return -0.5 * (len(e) * np.log(variance) + np.sum(np.log(s), axis=0)), np.sqrt(variance)
 
 
-def _zoomed(scaled: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
+def _zoom(scaled: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
     """Ends of a ninth of a range about the logarithm of the smoothness of largest likelihood, and the noise there."""
     points = low + (high - low) * np.linspace(0.0, 1.0, _GRID)
     likelihood, noise = _likelihood(scaled, points)
@@ -207,19 +207,19 @@ def _unit(position: Any) -> Any:
 
 
 def _passes(scaled: Any, smoothness: Any) -> tuple[Arrays, Arrays]:
-    """What the filter and the backward pass keep along a position, or along several side by side, from the first one on."""
+    """Run filter and backward pass along a position, or along several side by side, from the first sample on."""
     zero = 0.0 * scaled[0]
-    forward = _along(_predicted, [smoothness + zero], _first(scaled, smoothness), [scaled])
-    return forward, [one[::-1] for one in _along(_corrected, [], [zero] * 9, [one[::-1] for one in forward])]
+    forward = _along(_predict, [smoothness + zero], _first(scaled, smoothness), [scaled])
+    return forward, [column[::-1] for column in _along(_correct, [], [zero] * 9, [column[::-1] for column in forward])]
 
 
-def _smoothed(position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
-    forward, found = _passes((position - position[0]) / noise, smoothness)
+def _run_smoother(position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
+    forward, columns = _passes((position - position[0]) / noise, smoothness)
     unit = np.stack([noise, noise / period, noise / period**2])
-    state = np.stack(found[:3], axis=1) * unit[None, :]
+    state = np.stack(columns[:3], axis=1) * unit[None, :]
     # the position counts from the first one
     state = np.concatenate([state[:, :1] + position[0], state[:, 1:]], axis=1)
-    covariance = np.stack([np.stack([found[3 + i] for i in row], axis=1) for row in _FULL], axis=1)
+    covariance = np.stack([np.stack([columns[3 + i] for i in row], axis=1) for row in _FULL], axis=1)
     innovations = forward[9] / np.sqrt(forward[10])
     jerk = smoothness * noise**2 / period**5
     return Smoothed(state, covariance * np.outer(unit, unit)[None], noise, jerk, innovations)
@@ -232,37 +232,37 @@ def _fit(position: np.ndarray) -> tuple[Any, Any]:
     low, high = np.log(_SMOOTHNESS)
     noise = np.float64(1.0)
     for _ in range(_ZOOMS):
-        low, high, noise = _zoomed(scaled, low, high)
+        low, high, noise = _zoom(scaled, low, high)
     return np.exp(0.5 * (low + high)), noise * unit
 
 
-def smooth(position: Signal, period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
+def smooth(position: Signal, period: float, *, noise_and_jerk: tuple[Any, Any] | None = None) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:
         position: readings in rad (or m), at least 8 of them.
         period: sampling period in s.
-        known: standard deviation of the readings' noise, quantisation included, in rad, and spectral density of the jerk in
-            rad^2/s^5; left out, both are found by maximum likelihood.
+        noise_and_jerk: standard deviation of the readings' noise, quantisation included, in rad, and spectral density of
+            the jerk in rad^2/s^5; left out, both are found by maximum likelihood.
     """
     values, h = np.asarray(position, float), np.float64(period)
     # of what is not finite nothing is
     with np.errstate(all="ignore"):
-        if known is None:
+        if noise_and_jerk is None:
             smoothness, sigma = _fit(values)
         else:
-            sigma, jerk = (np.float64(one) for one in known)
+            sigma, jerk = (np.float64(number) for number in noise_and_jerk)
             smoothness = jerk * h**5 / sigma**2
-        return _smoothed(values, smoothness, sigma, h)
+        return _run_smoother(values, smoothness, sigma, h)
 
 
-def smoothed_accelerations(positions: Signals, period: float, known: tuple[Any, Any]) -> Signals:
-    """Accelerations of several channels, each smoothed as :func:`smooth` does with the same `known` numbers."""
-    sigma, jerk = known
-    smoothness, found = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)
+def smoothed_accelerations(positions: Signals, period: float, noise_and_jerk: tuple[Any, Any]) -> Signals:
+    """Accelerations of several channels, each smoothed as :func:`smooth` does with the same noise and jerk."""
+    sigma, jerk = noise_and_jerk
+    smoothness, accelerations = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)
     with np.errstate(all="ignore"):
         for first in range(0, positions.shape[1], _TOGETHER):
-            some = positions[:, first : first + _TOGETHER]
-            _, kept = _passes((some - some[0]) / sigma, smoothness)
-            found[:, first : first + _TOGETHER] = kept[2] * sigma / period**2
-    return found
+            channels = positions[:, first : first + _TOGETHER]
+            _, columns = _passes((channels - channels[0]) / sigma, smoothness)
+            accelerations[:, first : first + _TOGETHER] = columns[2] * sigma / period**2
+    return accelerations

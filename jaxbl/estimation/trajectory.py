@@ -31,8 +31,8 @@ Theta = Float[Array, " parameters"]
 """Coordinates of the free parameters."""
 _Slopes = tuple[Array, PlantState, Array]
 """Residuals, initial states, derivatives of the residuals by theta."""
-_INNER = 2
-"""Initial states tried at each step of the fit."""
+_INNER, _OUTER = 2, 12
+"""Initial states tried for a window at each step of the fit; and where they are sought anew."""
 RIDGE = 1e-10
 """Least damping of a search for initial states, over the columns' squares: above rounding, below what it changes."""
 INFLUENCE = 1e-20
@@ -58,7 +58,7 @@ class Windows(eqx.Module):
         time: of each window's first sample, s, shape (windows,).
         start: a guess of the state at each window's first sample, leaves of shape (windows,).
         noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
-        rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
+        at_rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
         finer: what finer plant steps than the experiment's add to the simulated positions, over the noise
             (:mod:`.plant_steps`).
         gain: of the predictor (:func:`jaxbl.simulate.plant_trajectory`) of each side, shape (2,);
@@ -70,15 +70,15 @@ class Windows(eqx.Module):
     time: Float[Array, " windows"]
     start: PlantState
     noise: dict[str, Float[Array, ""]]
-    rest: Bool[Array, " windows"]
+    at_rest: Bool[Array, " windows"]
     finer: Residuals
     gain: dict[str, Float[Array, " 2"]] | None = None
 
-    def only(self, which: np.ndarray) -> "Windows":
+    def only(self, places: np.ndarray) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
         columns, common = eqx.partition(self, _IN_COLUMNS)
-        return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[which], columns), common)
+        return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[places], columns), common)
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
@@ -112,9 +112,9 @@ class Fit(eqx.Module):
     cost: Float[Array, ""]
     converged: Array
 
-    def only(self, which: np.ndarray) -> "Fit":
+    def only(self, places: np.ndarray) -> "Fit":
         """Some of the numbers; the others were held."""
-        theta, jacobian = (jnp.asarray(np.asarray(x)[..., which]) for x in (self.theta, self.jacobian))
+        theta, jacobian = (jnp.asarray(np.asarray(x)[..., places]) for x in (self.theta, self.jacobian))
         return replace(self, theta=theta, jacobian=jacobian)
 
 
@@ -151,37 +151,37 @@ class _Inner(NamedTuple):
     slope: Array
     cost: Array
     damping: Array
-    tried: Array
+    following: Array
 
 
-def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool) -> _Eliminated:
+def _eliminate(experiment: Experiment, window: Windows, passes: int, at_rest: bool) -> _Eliminated:
     """Initial state of one window by damped Gauss-Newton, and an orthonormal basis of what it can explain.
 
     The best of all states tried counts: at a hard gap, or where dry friction holds, a full step often makes things worse.
-    With `rest`, standstill is tried as well.
+    With `at_rest`, standstill is tried as well.
     """
     guess, unravel = ravel_pytree(window.start)
     standing = jax.tree.map(jnp.zeros_like, window.start.velocity)
     still, _ = ravel_pytree(PlantState(window.start.position, standing, window.start.effects))
     free = jax.tree.map(jnp.ones_like, window.start)
-    moving = jax.tree.map(lambda one: jnp.where(window.rest, 0.0, one), free.velocity)
+    moving = jax.tree.map(lambda leaf: jnp.where(window.at_rest, 0.0, leaf), free.velocity)
     # others follow from numbers that are still to be found
     effects = tuple(
-        jax.tree.map(jnp.zeros_like, one) if effect.state_from_input else one
-        for effect, one in zip(experiment.effects, free.effects, strict=True)
+        jax.tree.map(jnp.zeros_like, state) if effect.state_from_input else state
+        for effect, state in zip(experiment.effects, free.effects, strict=True)
     )
-    known, _ = ravel_pytree(PlantState(free.position, moving, effects))
+    fitted, _ = ravel_pytree(PlantState(free.position, moving, effects))
 
     def residual(start: Array) -> Array:
         return _residual(experiment, unravel(start), window).ravel()
 
     def attempt(i: Array, best: _Inner) -> _Inner:
-        slope, value = _differentiate(residual, best.tried)
-        slope = slope * known[None, :]
+        slope, value = _differentiate(residual, best.following)
+        slope = slope * fitted[None, :]
         cost = jnp.sum(value**2)
         better = (cost < best.cost) | ~jnp.isfinite(best.cost)
         start, value, slope, cost = jax.tree.map(
-            partial(jnp.where, better), (best.tried, value, slope, cost), (best.start, best.value, best.slope, best.cost)
+            partial(jnp.where, better), (best.following, value, slope, cost), (best.start, best.value, best.slope, best.cost)
         )
         damping = jnp.where(better, jnp.maximum(0.01 * best.damping, RIDGE), jnp.maximum(30.0 * best.damping, 1e-2))
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
@@ -189,58 +189,56 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
         size = jnp.where(size > INFLUENCE * jnp.max(size), size, jnp.inf)
         unit = slope / size[None, :]
         change = jnp.linalg.solve(unit.T @ unit + damping * jnp.eye(len(start)), unit.T @ value)
-        tried = start - change / size
-        if rest:
+        following = start - change / size
+        if at_rest:
             # from there nothing leads back: a side that friction holds does not feel a little velocity
             middle = passes // 2
-            tried, damping = jnp.where(i == middle, still, tried), jnp.where(i == middle, RIDGE, damping)
-        return _Inner(start, value, slope, cost, damping, tried)
+            following, damping = jnp.where(i == middle, still, following), jnp.where(i == middle, RIDGE, damping)
+        return _Inner(start, value, slope, cost, damping, following)
 
     none = jnp.zeros(window.torque.shape[0] * len(experiment.sides))
     first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(RIDGE), guess)
-    found = jax.lax.fori_loop(0, passes, attempt, first)
-    size = jnp.sqrt(jnp.sum(found.slope**2, axis=0))
-    seen = size > INFLUENCE * jnp.max(size)
-    basis, _ = jnp.linalg.qr(found.slope / jnp.where(seen, size, jnp.inf)[None, :])
+    best = jax.lax.fori_loop(0, passes, attempt, first)
+    size = jnp.sqrt(jnp.sum(best.slope**2, axis=0))
+    influential = size > INFLUENCE * jnp.max(size)
+    basis, _ = jnp.linalg.qr(best.slope / jnp.where(influential, size, jnp.inf)[None, :])
     # of a column of zeros the decomposition makes any direction
-    basis = jnp.where(seen[None, :], basis, 0.0)
-    return _Eliminated(unravel(found.start), found.value.reshape(-1, len(experiment.sides)), basis)
+    basis = jnp.where(influential[None, :], basis, 0.0)
+    return _Eliminated(unravel(best.start), best.value.reshape(-1, len(experiment.sides)), basis)
 
 
 def _without(basis: Array, values: Array) -> Array:
-    """What of values, shape (samples, sides, ...), lies outside of a basis of shape (samples times sides, states)."""
+    """Return the part of values, shape (samples, sides, ...), outside a basis of shape (samples times sides, states)."""
     flat = values.reshape(basis.shape[0], -1)
     return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
 
 
-def projected_residual(
-    experiment: Experiment, windows: Windows, passes: int = 12, rest: bool = True
-) -> tuple[Residuals, PlantState]:
+def projected_residual(experiment: Experiment, windows: Windows) -> tuple[Residuals, PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
-    Of each window's initial state `passes` values are tried, with `rest` standstill among them.
+    Standstill is among the initial states that are tried.
     """
 
-    def one(window: Windows) -> tuple[Array, PlantState]:
-        found = _eliminate(experiment, window, passes, rest)
-        return _without(found.basis, found.residual), found.start
+    def project(window: Windows) -> tuple[Array, PlantState]:
+        start = _eliminate(experiment, window, _OUTER, True)
+        return _without(start.basis, start.residual), start.start
 
-    return jax.vmap(one, in_axes=(_MAPPED,))(windows)
+    return jax.vmap(project, in_axes=(_MAPPED,))(windows)
 
 
-def _sloped(experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Theta) -> _Slopes:
+def _differentiate_windows(experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, theta: Theta) -> _Slopes:
     """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
 
-    def one(window: Windows) -> _Slopes:
-        found = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
+    def differentiate_window(window: Windows) -> _Slopes:
+        window_start = _eliminate(set_free_parameters(experiment, free, theta), window, _INNER, False)
 
         def residual(theta: Array) -> Array:
-            return _residual(set_free_parameters(experiment, free, theta), found.start, window)
+            return _residual(set_free_parameters(experiment, free, theta), window_start.start, window)
 
         slope, value = _differentiate(residual, theta)
-        return _without(found.basis, value), found.start, _without(found.basis, slope)
+        return _without(window_start.basis, value), window_start.start, _without(window_start.basis, slope)
 
-    return jax.vmap(one, in_axes=(_MAPPED,))(windows)
+    return jax.vmap(differentiate_window, in_axes=(_MAPPED,))(windows)
 
 
 class _Point(NamedTuple):
@@ -251,14 +249,14 @@ class _Point(NamedTuple):
         jacobian: its derivative by theta, shape (residuals, parameters).
         start: the windows' initial states there.
         squares: sum of squared residuals of each window, shape (windows,).
-        whole: of :func:`_sloped`.
+        whole: of :func:`_differentiate_windows`.
     """
 
     residual: Array
     jacobian: Array
     start: PlantState
     squares: Array
-    whole: _Slopes
+    slopes: _Slopes
 
     @property
     def cost(self) -> Array:
@@ -267,36 +265,36 @@ class _Point(NamedTuple):
 
     @property
     def info(self) -> Any:
-        """As the solver's parts take it."""
+        """Residuals and derivative as the solver's parts take them."""
         import lineax
         import optimistix
 
         return optimistix.FunctionInfo.ResidualJac(self.residual, lineax.MatrixLinearOperator(self.jacobian))
 
 
-def _reduced(
+def _reduce(
     experiment: Experiment,
     free: Sequence[FreeParameter],
     windows: Windows,
     theta: Theta,
     moving: Array,
 ) -> _Point:
-    """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
+    """Reduce all residuals to one more than there are numbers, with the same cost, gradient and normal matrix.
 
     All columns of the derivative in one run, nothing kept along the trajectories, no decomposition of tall matrices.
     `moving` is 1 for numbers that are fitted, 0 for those that are held; shape (parameters,).
     """
-    value, start, slope = _sloped(experiment, free, windows, theta)
-    each = jnp.sum(value**2, axis=(1, 2))
-    total = jnp.sum(each) + jnp.sum((theta / PRIOR_DEVIATION) ** 2)
+    value, start, slope = _differentiate_windows(experiment, free, windows, theta)
+    squares = jnp.sum(value**2, axis=(1, 2))
+    total = jnp.sum(squares) + jnp.sum((theta / PRIOR_DEVIATION) ** 2)
     normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / PRIOR_DEVIATION**2)
     towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / PRIOR_DEVIATION**2)
     size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
     root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
-    seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
-    rest = jnp.sqrt(jnp.maximum(total - jnp.sum(seen**2), 0.0))
+    projected = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
+    remainder = jnp.sqrt(jnp.maximum(total - jnp.sum(projected**2), 0.0))
     derivative = jnp.concatenate([root.T * (size * moving)[None, :], jnp.zeros((1, len(theta)))])
-    return _Point(jnp.concatenate([seen, rest[None]]), derivative, start, each, (value, start, slope))
+    return _Point(jnp.concatenate([projected, remainder[None]]), derivative, start, squares, (value, start, slope))
 
 
 class _Solved(NamedTuple):
@@ -311,8 +309,8 @@ def _zeros_of(function: Callable[..., _Point], *arguments: Any) -> _Point:
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
 
 
-def _converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
-    """Whether neither theta nor the residuals changed by more than the tolerances, absolute and relative."""
+def _has_converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
+    """Return True if neither theta nor the residuals changed by more than the tolerances, absolute and relative."""
     within = [jnp.abs(a - b) < _ATOL + _RTOL * jnp.abs(a) for a, b in zip(new, old, strict=True)]
     return jnp.all(within[0]) & jnp.all(within[1])
 
@@ -338,15 +336,15 @@ def _solve(
         return (steps < most_steps) & ~ended
 
     def step(carry: Any) -> Any:
-        theta, best, tried, search, steps, rejected, _ = carry
+        theta, best, following, search, steps, rejected, _ = carry
         first = steps == 0
-        new = point(tried, jax.tree.map(partial(jnp.where, first), guess, best.start))
-        size, accepted, searched, search = region.step(first, theta, tried, best.info, new.info, search)
-        met = accepted & _converged((tried, new.residual), (theta, best.residual))
+        new = point(following, jax.tree.map(partial(jnp.where, first), guess, best.start))
+        size, accepted, searched, search = region.step(first, theta, following, best.info, new.info, search)
+        met = accepted & _has_converged((following, new.residual), (theta, best.residual))
         # a change of this size is small beside what residuals of this size leave open, on any record
         small = accepted & ~first & (best.cost - new.cost < _ENOUGH * new.cost / count)
         rejected = jnp.where(accepted, 0, rejected + 1)
-        theta, best = jax.tree.map(partial(jnp.where, accepted), (tried, new), (theta, best))
+        theta, best = jax.tree.map(partial(jnp.where, accepted), (following, new), (theta, best))
         change, solved = descent.step(size, descent.query(theta, best.info, descent.init(theta, best.info)))
         failed = (searched != optx.RESULTS.successful) | (solved != optx.RESULTS.successful)
         ended = met | small | (rejected >= _MOST_REJECTED) | failed
@@ -365,9 +363,9 @@ def fit(
     free: Sequence[FreeParameter],
     windows: Windows,
     theta: Theta,
-    most_steps: int | Int[Array, ""] = 100,
-    held: Bool[Array, " parameters"] | None = None,
-    rounds: int | Int[Array, ""] = 3,
+    most_steps: Int[Array, ""],
+    held: Bool[Array, " parameters"],
+    rounds: Int[Array, ""],
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -379,16 +377,16 @@ def fit(
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
         most_steps: of the solver, each time.
-        held: which numbers stay at the start; none if left out.
+        held: which numbers stay at the start.
         rounds: how often at most the solver is started, again where initial states sought anew are better ones.
     """
 
-    given = theta
-    moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
+    nominal = theta
+    moving = jnp.where(held, 0.0, 1.0)
 
-    def reduced(theta: Array, guess: PlantState) -> _Point:
-        at = jnp.where(moving > 0.0, theta, given)
-        return _reduced(experiment, free, replace(windows, start=guess), at, moving)
+    def reduce_at(theta: Array, guess: PlantState) -> _Point:
+        numbers = jnp.where(moving > 0.0, theta, nominal)
+        return _reduce(experiment, free, replace(windows, start=guess), numbers, moving)
 
     count = windows.torque.size * len(windows.measured)
 
@@ -406,17 +404,17 @@ def fit(
         guess = jax.tree.map(lambda new, old: jnp.where(better, new, old), start, guess)
         # the last time looks for initial states alone, and for what is left over with them: one step, which is not taken
         on = ~last & gained & (round < rounds)
-        found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 1), count)
-        theta = jnp.where((moving > 0.0) & on, found.theta, theta)
-        left, converged = jnp.where(on, found.point.squares, left), jnp.where(on, found.converged, converged)
-        return theta, found.point.start, left, round + 1, converged, found.point.whole, on & (rounds <= 1), on
+        solution = _solve(reduce_at, theta, guess, jnp.where(on, most_steps, 1), count)
+        theta = jnp.where((moving > 0.0) & on, solution.theta, theta)
+        left, converged = jnp.where(on, solution.point.squares, left), jnp.where(on, solution.converged, converged)
+        return theta, solution.point.start, left, round + 1, converged, solution.point.slopes, on & (rounds <= 1), on
 
-    none = _zeros_of(reduced, theta, windows.start).whole
+    none = _zeros_of(reduce_at, theta, windows.start).slopes
     no, yes = jnp.asarray(False), jnp.asarray(True)
     first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), no, none, no, yes
     # all that simulates stands in the program once: it takes long to compile
-    best, *_, converged, whole, _, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
-    value, start, jacobian = whole
+    best, *_, converged, slopes, _, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
+    value, start, jacobian = slopes
     return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), converged)
 
 
@@ -440,21 +438,21 @@ def fits(
     """
     held = np.zeros(thetas.shape, bool) if held is None else held
     # numbers as arguments: other nominal ones need no other program
-    numbers: Any = jax.tree.map(lambda one: np.asarray(one) if isinstance(one, float) else one, tuple(free))
+    numbers: Any = jax.tree.map(lambda number: np.asarray(number) if isinstance(number, float) else number, tuple(free))
 
-    def fitted(which: Any, program: Callable[..., Fit]) -> Fit:
-        start, still = jnp.asarray(thetas[which]), jnp.asarray(held[which])
+    def run_fits(places: Any, program: Callable[..., Fit]) -> Fit:
+        start, still = jnp.asarray(thetas[places]), jnp.asarray(held[places])
         return program(experiment, numbers, windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
 
     count = len(thetas)
     if jax.default_backend() == "cpu":
-        return [fitted(i, _fit) for i in range(count)]
-    found: list[Fit] = []
+        return [run_fits(i, _fit) for i in range(count)]
+    ends: list[Fit] = []
     for first in range(0, count, _AT_ONCE):
         # which bounds memory; the last ones are filled up
-        some = fitted(np.minimum(first + np.arange(_AT_ONCE), count - 1), _batch)
-        found += [jax.tree.map(lambda x, i=i: x[i], some) for i in range(min(_AT_ONCE, count - first))]
-    return found
+        batch = run_fits(np.minimum(first + np.arange(_AT_ONCE), count - 1), _batch)
+        ends += [jax.tree.map(lambda x, i=i: x[i], batch) for i in range(min(_AT_ONCE, count - first))]
+    return ends
 
 
 def cut(
@@ -465,15 +463,15 @@ def cut(
     noise: dict[str, float],
     samples: int,
     first: float = 0.0,
-    rest: bool = False,
+    at_rest: bool = False,
 ) -> Windows:
     """Cut part of a record into as many windows of so many samples as fit into it, shapes and units as of :class:`Windows`.
 
     `start` are the states at all samples, :class:`jaxbl.simulate.PlantState` with leaves of shape (samples,); `first` is the
-    time of the first sample, s; `rest` says whether the part begins at rest.
+    time of the first sample, s; `at_rest` says whether the part begins at rest.
     """
     count = len(torque) // samples
-    standing = np.arange(count) == (0 if rest else -1)
+    standing = np.arange(count) == (0 if at_rest else -1)
     start = jax.tree.map(lambda x: np.asarray(x)[: count * samples : samples], start)
     still = jax.tree.map(lambda x: np.where(standing, 0.0, x), start.velocity)
 
@@ -486,6 +484,6 @@ def cut(
         time=first + period * samples * np.arange(count),  # pyright: ignore[reportArgumentType]
         start=PlantState(start.position, still, start.effects),
         noise={side: np.asarray(value, float) for side, value in noise.items()},  # pyright: ignore[reportArgumentType]
-        rest=standing,
+        at_rest=standing,
         finer=np.zeros((count, samples, len(measured))),  # pyright: ignore[reportArgumentType]
     )

@@ -34,7 +34,7 @@ from jaxbl.workers import announce
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
 from .intervals import LIMIT, Spread, long_run, step_at_limit, without_gain
 from .prediction import kalman_gain
-from .regression import begun
+from .regression import begin_states
 from .segments import Segment, reading_noise
 
 _STEP, _SHORTEST = 1e-2, 1e-6
@@ -118,7 +118,7 @@ class UnseenLoad:
         free: numbers to be fitted.
         width: prior standard deviation of each one's theta, shape (free,).
         segments: of the log, with the motor's motion.
-        rest: whether each begins at rest.
+        at_rest: whether each begins at rest.
         held: places of free numbers that stay where a fit begins.
     """
 
@@ -126,7 +126,7 @@ class UnseenLoad:
     free: tuple[FreeParameter, ...]
     width: np.ndarray
     segments: Sequence[Segment]
-    rest: bool
+    at_rest: bool
     held: list[int] = field(default_factory=list)
 
     def __post_init__(self):
@@ -150,20 +150,22 @@ class UnseenLoad:
     @property
     def gap(self) -> int | None:
         """Place of the number that makes the gap, if it is one of the free ones."""
-        return next((i for i, one in enumerate(self.free) if is_gap(one)), None)
+        return next((i for i, number in enumerate(self.free) if is_gap(number)), None)
 
     def frictions(self) -> list[list[tuple[int, float]]]:
         """Places of viscous and of dry frictions among the free numbers, motor and load, and the factor that makes each one
         at the motor."""
-        plant, places = self.experiment.plant, {one.path: i for i, one in enumerate(self.free)}
+        plant, places = self.experiment.plant, {number.path: i for i, number in enumerate(self.free)}
         ratio = float(plant.drive.ratio("load"))
         viscous = {"drive.motor_viscous": 1.0, "drive.load_viscous": ratio**-2.0}
         dry = {
-            f"effects.{one.name}.torque": 1.0 if one.place == "motor" else 1.0 / ratio
-            for one in plant.effects
-            if type(one).dry_friction is not AbstractEffect.dry_friction
+            f"effects.{effect.name}.torque": 1.0 if effect.place == "motor" else 1.0 / ratio
+            for effect in plant.effects
+            if type(effect).dry_friction is not AbstractEffect.dry_friction
         }
-        return [[(places[path], factor) for path, factor in each.items() if path in places] for each in (viscous, dry)]
+        return [
+            [(places[path], factor) for path, factor in places_of.items() if path in places] for places_of in (viscous, dry)
+        ]
 
     def beginnings(self) -> list[np.ndarray]:
         """Theta to begin at, shape (free,): frictions that together are what the log shows of a drive without gap, mostly
@@ -176,17 +178,17 @@ class UnseenLoad:
         acceleration, speed, torque = map(np.concatenate, zip(*columns, strict=True))
         matrix = np.stack([acceleration, speed, np.sign(speed), np.ones(len(speed))], axis=1)
         moving = np.abs(speed) > 0.1 * self._speed
-        found = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
+        coefficients = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
-        total, begun = np.maximum(found[1:3], least), []
+        total, thetas = np.maximum(coefficients[1:3], least), []
         for share in _SHARES:
             theta = np.zeros(len(self.free))
             for size, places in zip(total, self.frictions(), strict=True):
                 parts = [1.0] if len(places) == 1 else [1.0 - share, share]
                 for (i, factor), part in zip(places, parts, strict=False):
                     theta[i] = self.free[i].theta(part * size / factor)
-            begun.append(theta)
-        return begun
+            thetas.append(theta)
+        return thetas
 
     def coarse(self) -> "UnseenLoad":
         """The same with plant steps just short enough for the drive's fastest oscillation."""
@@ -205,12 +207,12 @@ class UnseenLoad:
     def numbers(self, theta: np.ndarray) -> dict[str, float]:
         """Values by path."""
         with np.errstate(over="ignore"):
-            return {one.path: float(one.value(float(x))) for one, x in zip(self.free, theta, strict=True)}
+            return {number.path: float(number.value(float(x))) for number, x in zip(self.free, theta, strict=True)}
 
     def half_gap(self, theta: np.ndarray) -> float:
         """Half gap, rad."""
         if self.gap is None:
-            return self._own["half"]
+            return self._constants["half"]
         number = self.free[self.gap]
         return half_gap_of(number) * self.numbers(theta)[number.path]
 
@@ -224,7 +226,7 @@ class UnseenLoad:
         return self._with_errors(point, errors)
 
     def _errors(self, point: Point, place: int, starts: np.ndarray) -> np.ndarray:
-        """What the readings of a segment differ from predictions from several starts, shape (runs, counted samples)."""
+        """Subtract predictions from several starts from the readings of a segment; shape (runs, counted samples)."""
         states = self._runs(point, place, starts)
         with _ignore_divergence():
             errors = self.segments[place].readings["motor"] - np.asarray(states.position["motor"])
@@ -232,51 +234,53 @@ class UnseenLoad:
 
     def _with_errors(self, point: Point, segment_errors: Sequence[np.ndarray]) -> Point:
         errors = np.concatenate(segment_errors)
-        prior = np.sum((point.theta / self.width) ** 2) + np.sum((point.start - self._expected(point.start)) ** 2)
+        prior = np.sum((point.theta / self.width) ** 2) + np.sum((point.start - self._expect_start(point.start)) ** 2)
         # a model that diverges
         with _ignore_divergence():
             deviance = self.count * np.log(np.mean(errors**2)) + prior
         return point._replace(errors=errors, deviance=float(deviance) if np.isfinite(deviance) else np.inf)
 
     @staticmethod
-    def _expected(start: np.ndarray) -> np.ndarray:
+    def _expect_start(start: np.ndarray) -> np.ndarray:
         """Mean of the prior of a start: in contact on the flank that it is at."""
         return np.stack([np.sign(column) if i == 2 else np.zeros(len(column)) for i, column in enumerate(start.T)], axis=1)
 
     @cached_property
-    def _settled(self) -> list[EffectStates]:
+    def _first_states(self) -> list[EffectStates]:
         """States of effects that each segment begins with."""
-        return jax.tree.map(float, [begun(self.experiment, one.torque[:1], one.before) for one in self.segments])
+        return jax.tree.map(
+            float, [begin_states(self.experiment, segment.torque[:1], segment.before) for segment in self.segments]
+        )
 
     @cached_property
     def _model(self) -> PlantSimulator:
         zero: Any = dict.fromkeys(("motor", "load"), 0.0)
         return PlantSimulator(
-            self.experiment, PlantState(zero, zero, self._settled[0]), [one.path for one in self.free], ["motor"]
+            self.experiment, PlantState(zero, zero, self._first_states[0]), [number.path for number in self.free], ["motor"]
         )
 
     @cached_property
-    def _own(self) -> dict[str, float]:
+    def _constants(self) -> dict[str, float]:
         """Half gap, stiffness and gear ratio without the free numbers."""
         plant = self.experiment.plant
         assert plant.transmission is not None
         return {
             "transmission.stiffness": float(plant.transmission.stiffness),
-            "ratio": float(plant.drive.ratio("load")),
+            "drive.gear_ratio": float(plant.drive.ratio("load")),
             "half": plant.half_gap,
         }
 
     def _runs(self, point: Point, place: int, starts: np.ndarray) -> PlantState:
         """Simulate a segment from several starts, shape (runs, 4)."""
         segment, numbers = self.segments[place], self.numbers(point.theta)
-        known = self._own | numbers
-        ratio = known.get("drive.gear_ratio", known["ratio"])
+        constants = self._constants | numbers
+        ratio = constants["drive.gear_ratio"]
         position, velocity = (self._first[place] + self._open[place] * starts[:, :2]).T
-        twist = starts[:, 2] * (self.half_gap(point.theta) + self.torque / known["transmission.stiffness"])
+        twist = starts[:, 2] * (self.half_gap(point.theta) + self.torque / constants["transmission.stiffness"])
         load = velocity + _APART * self._speed * starts[:, 3]
-        if self.rest:
+        if self.at_rest:
             velocity, load = np.zeros_like(velocity), np.zeros_like(load)
-        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._settled[place])
+        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._first_states[place])
         state = PlantState(
             {"motor": position, "load": (position - twist) / ratio}, {"motor": velocity, "load": load / ratio}, effects
         )
@@ -286,7 +290,7 @@ class UnseenLoad:
         gain = kalman_gain(float(point.smoothness), self.period)
         return self._model(numbers, state, torque, time, {"motor": readings}, {"motor": gain})
 
-    def begun(self, theta: np.ndarray, smoothness: float) -> Point:
+    def begin(self, theta: np.ndarray, smoothness: float) -> Point:
         """With each segment beginning where in the gap, and with which speed of the load, suits it best."""
         tries = np.array([[0.0, 0.0, twist, speed] for twist in (1.0, -1.0, 1e-3) for speed in (0.0, 2.0, -2.0)])
         point, errors = Point(theta, np.zeros((len(self.segments), _STATES)), smoothness), []
@@ -299,10 +303,10 @@ class UnseenLoad:
             errors.append(runs[best])
         return self._with_errors(point, errors)
 
-    def predicted(self, theta: np.ndarray, smoothness: float) -> Point:
+    def predict(self, theta: np.ndarray, smoothness: float) -> Point:
         """Prediction errors of given numbers; initial states alone are fitted, first with predictors that follow closely."""
         model = replace(self, held=list(range(len(self.free))))
-        point = model.begun(theta, _FOLLOWING[0])
+        point = model.begin(theta, _FOLLOWING[0])
         for following in (*_FOLLOWING, smoothness):
             point = model.resume(point, _FEW, following)
         return point
@@ -314,22 +318,22 @@ class UnseenLoad:
         """
         count, states = len(self.free), point.start.size
         step = np.full(count + states, 1e-2 * _STEP) if size is None else np.clip(_SHARE * size, _SHORTEST, _STEP)
-        found = np.zeros((self.count, count + states))
+        columns = np.zeros((self.count, count + states))
         for i in {*range(count)} - {*self.held}:
             theta = point.theta.copy()
             theta[i] += step[i]
-            found[:, i] = (self.evaluate(point._replace(theta=theta)).errors - point.errors) / step[i]
+            columns[:, i] = (self.evaluate(point._replace(theta=theta)).errors - point.errors) / step[i]
         row, column = 0, count
         for i, start in enumerate(point.start):
-            own = step[column : column + _STATES]
-            each = self._errors(point, i, start + np.diag(own))
-            rows = slice(row, row + each.shape[1])
-            found[rows, column : column + _STATES] = ((each - point.errors[rows]) / own[:, None]).T
+            steps = step[column : column + _STATES]
+            runs = self._errors(point, i, start + np.diag(steps))
+            rows = slice(row, row + runs.shape[1])
+            columns[rows, column : column + _STATES] = ((runs - point.errors[rows]) / steps[:, None]).T
             row, column = rows.stop, column + _STATES
-        return np.where(np.isfinite(found), found, 0.0)
+        return np.where(np.isfinite(columns), columns, 0.0)
 
     def _precision(self) -> np.ndarray:
-        """What is known of theta and of the starts before, shape (free + 4 segments,)."""
+        """Precision of the priors of theta and of the starts, shape (free + 4 segments,)."""
         return np.concatenate([self.width**-2.0, np.ones(_STATES * len(self.segments))])
 
     def solve(self, point: Point, steps: int) -> Point:
@@ -340,7 +344,7 @@ class UnseenLoad:
             if not np.isfinite(best.deviance):
                 break
             slope = self.slopes(best, size)
-            away = np.concatenate([best.theta, (best.start - self._expected(best.start)).ravel()])
+            away = np.concatenate([best.theta, (best.start - self._expect_start(best.start)).ravel()])
             matrix = slope.T @ slope / best.variance + np.diag(precision)
             size = np.diag(matrix) ** -0.5
             towards = slope.T @ best.errors / best.variance + precision * away
@@ -352,10 +356,10 @@ class UnseenLoad:
                 change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), towards)
                 change = np.clip(change, -1.0, 1.0)
                 theta, start = best.theta + change[:count], best.start + change[count:].reshape(-1, _STATES)
-                tried = self.evaluate(best._replace(theta=theta, start=start))
-                gained = best.deviance - tried.deviance
+                following = self.evaluate(best._replace(theta=theta, start=start))
+                gained = best.deviance - following.deviance
                 if gained > 0.0:
-                    best, damping = tried, max(0.1 * damping, 1e-9)
+                    best, damping = following, max(0.1 * damping, 1e-9)
                     break
                 damping *= 8.0
             if gained < _SETTLED:
@@ -370,7 +374,7 @@ class UnseenLoad:
         """Fit with the predictor that suits it best: the one whose errors are least is chosen, fitted, and so on."""
         for _ in range(_CHOICES):
             before = point.smoothness
-            predictors = [self.evaluate(point._replace(smoothness=float(tried))) for tried in _SMOOTHNESS]
+            predictors = [self.evaluate(point._replace(smoothness=float(smoothness))) for smoothness in _SMOOTHNESS]
             point = self.solve(_likeliest([point, *predictors]), _MORE)
             if point.smoothness == before:
                 break
@@ -383,10 +387,10 @@ class UnseenLoad:
     def fit(self) -> Point:
         """Fit without a gap to be found, from the nominal numbers."""
         coarse = self.coarse()
-        ends = [coarse.follow(coarse.begun(theta, _FOLLOWING[0])) for theta in self.beginnings()]
+        ends = [coarse.follow(coarse.begin(theta, _FOLLOWING[0])) for theta in self.beginnings()]
         return self.finish(_likeliest(ends))
 
-    def unexplained(self, point: Point) -> float:
+    def measure_unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
         inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
         return inertia * float(np.sqrt(point.smoothness)) * self.noise / self.period**2
@@ -399,24 +403,26 @@ class UnseenLoad:
         what noise in the recorded torque, once more as much, changes.
         """
         announce("standard errors")
-        others = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW)]
-        others += [self.resume(point, _FEW, factor * point.smoothness) for factor in _OTHERS]
-        best = _likeliest([point, *(self.resume(other, _BACK, point.smoothness) for other in others)])
-        others += self._noisier(best)
+        neighbours = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW)]
+        neighbours += [self.resume(point, _FEW, factor * point.smoothness) for factor in _OTHERS]
+        best = _likeliest([point, *(self.resume(other, _BACK, point.smoothness) for other in neighbours)])
+        neighbours += self._noisier(best)
         # not their mean: some end in the valley that they came from, and say nothing
-        changes = [other.theta - best.theta for other in others if np.isfinite(other.deviance)]
+        changes = [other.theta - best.theta for other in neighbours if np.isfinite(other.deviance)]
         return best, self.spread(best).with_error(*changes)
 
     def _noisier(self, point: Point) -> list[Point]:
         """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
         if self.torque_noise < _QUIET * self.torque:
             return []
-        found = []
+        points = []
         for seed in range(_DRAWS):
             draw = np.random.default_rng(seed).standard_normal
-            segments = [replace(one, torque=one.torque + self.torque_noise * draw(len(one))) for one in self.segments]
-            found.append(replace(self, segments=segments).resume(point, _FEW))
-        return found
+            segments = [
+                replace(segment, torque=segment.torque + self.torque_noise * draw(len(segment))) for segment in self.segments
+            ]
+            points.append(replace(self, segments=segments).resume(point, _FEW))
+        return points
 
     def spread(self, point: Point) -> Spread:
         """Covariance of theta, of data and priors together."""
@@ -449,7 +455,7 @@ _OTHERS = 10.0, 0.1
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of a symmetric positive matrix some of whose directions may be lost in rounding: these keep what rounding leaves."""
+    """Invert a symmetric positive matrix; directions that are lost in rounding keep what rounding leaves."""
     if not len(matrix) or not np.isfinite(matrix).all():
         return matrix
     size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
@@ -459,7 +465,7 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
 
 
 class Gap(NamedTuple):
-    """What the motor says of the gap.
+    """The gap as the motor shows it.
 
     Attributes:
         best: the fit with all numbers.
@@ -484,13 +490,13 @@ class Gap(NamedTuple):
     unmet: bool = False
 
     @property
-    def needed(self) -> bool:
-        """Whether the readings cannot be met without a gap."""
+    def is_needed(self) -> bool:
+        """True if the readings cannot be met without a gap."""
         return self.gain >= SHOWN
 
     def of(self, point: Point, spread: Spread) -> "Gap":
         """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settle`."""
-        return self._replace(best=point, spread=spread) if self.needed else self._replace(without=point)
+        return self._replace(best=point, spread=spread) if self.is_needed else self._replace(without=point)
 
 
 def _likeliest(points: Sequence[Point]) -> Point:
@@ -498,24 +504,24 @@ def _likeliest(points: Sequence[Point]) -> Point:
     return min(points, key=lambda point: point.deviance)
 
 
-def is_gap(one: FreeParameter) -> bool:
-    """Whether a number makes a gap."""
-    return one.path.endswith(GAPS)
+def is_gap(number: FreeParameter) -> bool:
+    """Return True if a number makes a gap."""
+    return number.path.endswith(GAPS)
 
 
-def half_gap_of(one: FreeParameter) -> float:
+def half_gap_of(number: FreeParameter) -> float:
     """Half gap for 1 of the number that makes it."""
-    return 4.0 if one.path.endswith("dead_zone") else 1.0
+    return 4.0 if number.path.endswith("dead_zone") else 1.0
 
 
-def is_known(one: FreeParameter) -> bool:
-    """Whether data sheets and CAD know a number within a small factor."""
-    return one.path.endswith(("inertia", ".stiffness"))
+def is_known(number: FreeParameter) -> bool:
+    """Return True if data sheets and CAD know a number within a small factor."""
+    return number.path.endswith(("inertia", ".stiffness"))
 
 
 def widths(free: Sequence[FreeParameter], factor: float) -> np.ndarray:
     """Prior standard deviations of theta: inertias and stiffness are known within a factor, a gap not at all."""
-    return np.array([_ANY if is_gap(one) else np.log(factor) if is_known(one) else PRIOR_DEVIATION for one in free])
+    return np.array([_ANY if is_gap(number) else np.log(factor) if is_known(number) else PRIOR_DEVIATION for number in free])
 
 
 _ANY = 100.0
@@ -537,14 +543,14 @@ class GapSearch:
 
     def __init__(self, model: UnseenLoad):
         self.model, self.coarse = model, model.coarse()
-        width = np.where([is_known(one) for one in model.free], np.minimum(_NEAR, model.width), model.width)
-        width = np.where([is_gap(one) for one in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
+        width = np.where([is_known(number) for number in model.free], np.minimum(_NEAR, model.width), model.width)
+        width = np.where([is_gap(number) for number in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
         self.near = replace(self.coarse, width=width)
         assert model.gap is not None
         self.place: int = model.gap
         # the same with the gap as it is
         self.model_held, self.coarse_held, self.near_held = (
-            replace(each, held=[self.place]) for each in (model, self.coarse, self.near)
+            replace(fits, held=[self.place]) for fits in (model, self.coarse, self.near)
         )
         self.part = replace(self.near_held, segments=[max(model.segments, key=len)[:_PART]])
         self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
@@ -564,50 +570,50 @@ class GapSearch:
         without = self._without(best)
         worth = float(spread.inflation[self.place]) ** 2
         gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)
-        least = min(one.variance for _, one in starts)
-        tried = [(half, self.model.count * float(np.log(one.variance / least))) for half, one in starts]
-        found = Gap(best, without, spread, gain, 0, self.travel, tried, self.travel)
-        if found.needed:
-            return found._replace(crossings=self._turns(best, self.model.experiment, self.model.half_gap(best.theta)))
+        least = min(point.variance for _, point in starts)
+        deviances = [(half, self.model.count * float(np.log(point.variance / least))) for half, point in starts]
+        gap = Gap(best, without, spread, gain, 0, self.travel, deviances, self.travel)
+        if gap.is_needed:
+            return gap._replace(crossings=self._turns(best, self.model.experiment, self.model.half_gap(best.theta)))
         if self._unmet(without, starts[-1][1], worth):
-            return found._replace(unmet=True)
-        return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
+            return gap._replace(unmet=True)
+        return gap._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
 
     def _starts(self) -> list[tuple[float, Point]]:
         """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
         low = max(2.0 * self.model.noise, 1e-4 * self.travel)
         grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
-        return [(float(half), self._begun(half)) for half in grid]
+        return [(float(half), self._begin(half)) for half in grid]
 
-    def _begun(self, half: float) -> Point:
+    def _begin(self, half: float) -> Point:
         """A short fit at a half gap, the other numbers held near to what is known of them."""
-        starts = [self.part.begun(self._with_gap(half, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
+        starts = [self.part.begin(self._with_gap(half, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
         return min((self.part.solve(start, _FEW) for start in starts), key=lambda point: point.variance)
 
     def _best(self, starts: Sequence[tuple[float, Point]]) -> Point:
         """The best fit from the half gaps that are better than their neighbours."""
-        size = np.array([np.inf, *(one.variance for _, one in starts), np.inf])
+        size = np.array([np.inf, *(point.variance for _, point in starts), np.inf])
         valleys = [i - 1 for i in range(1, len(size) - 1) if size[i] <= min(size[i - 1], size[i + 1])]
         chosen = sorted(valleys, key=lambda i: size[i + 1])[:_FINALISTS]
-        found = [starts[i][1].theta for i in chosen]
-        for smoothness, kept in zip(_FOLLOWING, (_FINALISTS, 2), strict=True):
-            points = [self.near.solve(self.near.begun(theta, smoothness), _MORE) for theta in found]
+        thetas = [starts[i][1].theta for i in chosen]
+        for smoothness, count in zip(_FOLLOWING, (_FINALISTS, 2), strict=True):
+            points = [self.near.solve(self.near.begin(theta, smoothness), _MORE) for theta in thetas]
             points.sort(key=lambda point: point.variance)
-            found = [point.theta for point in points[:kept] if point.variance < _HOPELESS * points[0].variance]
-        ends = [self.coarse.follow(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
+            thetas = [point.theta for point in points[:count] if point.variance < _HOPELESS * points[0].variance]
+        ends = [self.coarse.follow(self.coarse.begin(theta, _FOLLOWING[-1])) for theta in thetas]
         return self.model.finish(_likeliest(ends))
 
     def _without(self, best: Point) -> Point:
         """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
         none = _NONE * self.travel
-        found = []
-        for theta in (self._begun(none).theta, self._with_gap(none, best.theta)):
-            point = self.near_held.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW)
-            found.append(self.coarse_held.resume(point, _MORE, _FOLLOWING[1]))
-        return self.model_held.finish(self.coarse_held.follow(_likeliest(found)))
+        points = []
+        for theta in (self._begin(none).theta, self._with_gap(none, best.theta)):
+            point = self.near_held.solve(self.near.begin(theta, _FOLLOWING[0]), _FEW)
+            points.append(self.coarse_held.resume(point, _MORE, _FOLLOWING[1]))
+        return self.model_held.finish(self.coarse_held.follow(_likeliest(points)))
 
     def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
-        """Whether the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
+        """Tell if the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
         point = self.near_held.resume(middle, _FEW, _FOLLOWING[0])
@@ -617,21 +623,21 @@ class GapSearch:
         plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
         # on one flank, where a weight may hold the load, the load is met
         met = []
-        for one, skip in zip(self.model.states(point), self.model.skipped, strict=True):
-            motion = jax.tree.map(jnp.asarray, (one.position, one.velocity, one.effects))
+        for state, skip in zip(self.model.states(point), self.model.skipped, strict=True):
+            motion = jax.tree.map(jnp.asarray, (state.position, state.velocity, state.effects))
             met.append(np.asarray(jax.vmap(plant.transmitted_torque)(*motion)[0])[skip:])
         return rms(np.concatenate(met)) < _TOUCH * self.model.torque
 
     def _at_most(self, without: Point, worth: float) -> float:
         """The largest half gap that fits about as well as none; the motor's travel where all do."""
         half = max(0.5 * self.model.noise, 1e-5 * self.travel)
-        point, tried = without, [(half, 0.0)]
+        point, deviances = without, [(half, 0.0)]
         while half < self.travel:
             point = point._replace(theta=self._with_gap(half, point.theta))
             point = self.model_held.resume(point, _FEW, without.smoothness)
-            tried.append((half, (point.deviance - without.deviance) / worth))
-            if tried[-1][1] > LIMIT:
-                return step_at_limit(tried)
+            deviances.append((half, (point.deviance - without.deviance) / worth))
+            if deviances[-1][1] > LIMIT:
+                return step_at_limit(deviances)
             half *= 1.6
         return self.travel
 

@@ -67,7 +67,7 @@ def draw_element(result: ElementIdentification) -> list[Drawn]:
     figure, (ax,) = subplots(7.0, 4.2)
     ax.plot(x[points], u[points], ".", ms=2.0, color=FAINT, alpha=0.6, label="measured")
     ax.plot(x[points], fitted[points], ".", ms=1.2, color=BLUE, label="found")
-    numbers = result.found.numbers
+    numbers = result.element.numbers
     if "half_gap" in numbers:
         middle, half = numbers["centre"].value, numbers["half_gap"].value
         ax.axvspan(middle - half, middle + half, color=ORANGE, alpha=0.2, lw=0.0, label="gap")

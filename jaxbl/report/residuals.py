@@ -9,7 +9,7 @@ import numpy as np
 from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import Coordinate, Localised, residual_spectrum
 from jaxbl.diagnosis.observer_residual import Observed
-from jaxbl.diagnosis.residuals import Residual, SideResiduals, narrowed
+from jaxbl.diagnosis.residuals import Residual, SideResiduals, narrow
 from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.records.least_squares import rms
 
@@ -59,7 +59,7 @@ def draw_residuals(
 
 def plot_torque(ax: Axes, residual: Residual, bandwidth: float, *, noise: bool = True, **how: Any) -> None:
     """Plot a residual over time behind the low-pass that the analysis used, and its noise as a band."""
-    low, _ = narrowed(residual, bandwidth)
+    low, _ = narrow(residual, bandwidth)
     samples = outline(low.torque)
     time = low.time[samples]
     ax.plot(time, low.torque[samples], **how)
@@ -80,8 +80,8 @@ def _over_time(
         for part in parts:
             plot_torque(ax, part, bandwidth, color=SIDE_COLOURS[name], lw=0.9, label="missing")
         estimates = observed.get(name, ())
-        if estimates and all(part.converged for part in estimates):
-            first, _ = narrowed(estimates[0].residual, bandwidth)
+        if estimates and all(part.has_converged for part in estimates):
+            first, _ = narrow(estimates[0].residual, bandwidth)
             label = f"by its observer (noise {first.deviation[0]:.2g} {unit})"
             for part in estimates:
                 plot_torque(ax, part.residual, bandwidth, noise=False, color=_MEAN, lw=0.5, label=label, zorder=4)
@@ -110,7 +110,7 @@ def _over_coordinates(
     drawn = sorted(names, key=lambda name: (name != "speed", -by_name[name].explained))[:_PANELS]
     panels = [by_name[name] for name in names if name in drawn]
     figure, axes = subplots(3.2 * len(panels) + 0.6, 3.5, columns=len(panels), sharey=True)
-    lows, rows = zip(*(narrowed(part, located.bandwidth) for part in parts), strict=True)
+    lows, rows = zip(*(narrow(part, located.bandwidth) for part in parts), strict=True)
     torque = np.concatenate([low.torque for low in lows])
     noise = rms(np.concatenate([low.deviation for low in lows]))
     points = slice(None, None, max(len(torque) // _CLOUD, 1))

@@ -13,7 +13,7 @@ import jaxbl.diagnosis.diagnosis_summary as summary_module
 from jaxbl.config import read_config
 from jaxbl.diagnosis.choice import Choice
 from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
-from jaxbl.diagnosis.diagnosis_summary import tied
+from jaxbl.diagnosis.diagnosis_summary import find_tie
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
 from jaxbl.diagnosis.next_experiment import next_experiment, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
@@ -158,7 +158,7 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
     with jax.enable_x64(True):
         setup = set_up(task)
         observed = observed_torques(setup.bare, setup.fitted.segments)
-        description, (note,) = summary_module.observers_say(setup.bare, observed, setup)
+        description, (note,) = summary_module.describe_observers(setup.bare, observed, setup)
     assert description["motor"]["converged"] is False and description["motor"]["rms"] is None
     assert note.startswith("The motor's observer does not converge on this log (lambda = 2, alpha = 1)")
 
@@ -318,7 +318,7 @@ def test_the_history_leads_from_log_to_name(diagnosis):
 
 def test_a_tie_has_an_experiment(logs, diagnosis, tmp_path):
     record = read_record(logs / "axis.csv")
-    assert tied({"findings": []}) is None
+    assert find_tie({"findings": []}) is None
     line = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
     assert line.startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
@@ -348,7 +348,7 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     select_samples(simulate_direct_drive(0.8 * fast, [friction], 1e-3, 2), LAST_PART).write(holdout)
     task = read_diagnosis_task(log, nominal_study(), holdout=holdout)
     diagnosis = run_diagnosis(task)
-    pair = tied(diagnosis.summary)
+    pair = find_tie(diagnosis.summary)
     assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
     best = next_experiment(diagnosis.summary, diagnosis.model, task.record, travel=6.0)
     assert best is not None and best.apart > 100.0

@@ -57,7 +57,7 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
     case = cases(SEED, 4, "single", 2.0)[i]
     explanation = run_search(case, tmp_path)
     (name,) = case.hidden
-    assert explanation.left < LIMITS.unknown and explanation.fitted.names == (name,)
+    assert explanation.largest_gain < LIMITS.unknown and explanation.fitted.names == (name,)
     for key, value in case.truth["effects"][name].items():
         if key in _SIZES:
             # errors of nominal numbers are known no better than these are
@@ -69,12 +69,12 @@ def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
 
 def test_nothing_is_named_on_a_clean_machine(tmp_path):
     explanation = run_search(cases(SEED, 1, "none", 2.0)[0], tmp_path)
-    assert explanation.left < LIMITS.unknown and explanation.fitted.names == ()
+    assert explanation.largest_gain < LIMITS.unknown and explanation.fitted.names == ()
 
 
 def test_what_no_effect_explains_is_said_to_be_unknown(tmp_path):
     explanation = run_search(cases(SEED, 1, "unknown", 1.0)[0], tmp_path)
-    assert explanation.left > LIMITS.unknown
+    assert explanation.largest_gain > LIMITS.unknown
 
 
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
@@ -88,7 +88,7 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     explanation = effect_search.run()
     # friction that contains it explains as much, and is no alternative
     (finding,) = weigh(explanation)
-    assert explanation.left < LIMITS.unknown and finding.effect == "motor.coulomb_friction"
+    assert explanation.largest_gain < LIMITS.unknown and finding.effect == "motor.coulomb_friction"
     assert finding.confidence > 0.99 and finding.alternatives == ()
 
 
@@ -105,7 +105,7 @@ def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
         tmp_path / "log.csv"
     )
     explanation = prepare_search(tmp_path / "log.csv", nominal_study()).run()
-    assert explanation.left < LIMITS.unknown and explanation.fitted.names == (name,)
+    assert explanation.largest_gain < LIMITS.unknown and explanation.fitted.names == (name,)
     for key, value in HIDDEN[name].items():
         assert explanation.fitted.numbers[name][key] == pytest.approx(value, rel=0.02)
 
@@ -131,7 +131,7 @@ def test_zeros_of_encoders_that_do_not_agree_are_found_first(tmp_path):
     dataclasses.replace(case.log, theta_e=case.log.theta_e + 0.3).write(tmp_path / "log.csv")
     search = prepare_search(tmp_path / "log.csv", case.model | {"log": {"theta_e": {"offset": 0.0}}})
     numbers = search.run().fitted.numbers
-    assert search.history[0].tried == "add transmission.offset" and search.history[0].kept
+    assert search.history[0].change == "add transmission.offset" and search.history[0].accepted
     assert numbers == {"transmission.offset": {"offset": pytest.approx(0.3, abs=1e-3)}}
 
 
@@ -141,4 +141,4 @@ def test_numbers_that_are_all_off_are_no_effect(tmp_path):
     search = prepare_search(tmp_path / "log.csv", case.model)
     explanation = search.run()
     assert explanation.fitted.names == () and search.fits is search.rough
-    assert explanation.left < LIMITS.unknown
+    assert explanation.largest_gain < LIMITS.unknown

@@ -56,13 +56,15 @@ def test_twins_are_parted_by_their_priors(size):
     assert evidence.log_evidence == pytest.approx(joint_evidence.log_evidence, rel=1e-9)
     assert evidence.misfit == pytest.approx(joint_evidence.misfit, rel=1e-6)
     value = evidence.numbers["value"]
-    assert evidence.own[0] + factor * value == pytest.approx(joint_evidence.own[0], rel=1e-9)
+    assert evidence.own_change[0] + factor * value == pytest.approx(joint_evidence.own_change[0], rel=1e-9)
     # each is as far from its mean as its variance allows
-    assert (evidence.own[0] - centre[0]) / scale[0] ** 2 == pytest.approx((value - centre[2]) / (factor * scale[2] ** 2))
+    assert (evidence.own_change[0] - centre[0]) / scale[0] ** 2 == pytest.approx(
+        (value - centre[2]) / (factor * scale[2] ** 2)
+    )
     if size == 1.0:
         direct_evidence = evidence_of(make_products(design, errors, scale, centre), [Candidate()], 0)
         assert evidence.log_evidence == pytest.approx(direct_evidence.log_evidence, rel=1e-6)
-        np.testing.assert_allclose(evidence.own, direct_evidence.own, atol=1e-6)
+        np.testing.assert_allclose(evidence.own_change, direct_evidence.own_change, atol=1e-6)
         assert value == pytest.approx(direct_evidence.numbers["value"], abs=1e-6)
 
 
@@ -74,6 +76,6 @@ def test_the_predictor_solves_the_same_problem():
     evidence = evidence_of(products, [Candidate()], 0)
     stacked, targets = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
     expected = np.linalg.lstsq(stacked, targets, rcond=None)[0]
-    np.testing.assert_allclose([*evidence.own, evidence.numbers["value"]], expected, atol=1e-6)
+    np.testing.assert_allclose([*evidence.own_change, evidence.numbers["value"]], expected, atol=1e-6)
     assert evidence.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
     np.testing.assert_allclose(_least_squares(np.asarray(products.products), scale**-2.0, centre), expected, atol=1e-9)

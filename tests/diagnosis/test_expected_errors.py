@@ -23,7 +23,7 @@ def compare_with_expected(folder, log, effects, noise=None):
     task = read_diagnosis_task(folder / "axis.csv", nominal_study())
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = Choice(setup).search.fits.fit(effects, np.zeros(len(setup.own)))
+        fitted = Choice(setup).search.fits.fit(effects, np.zeros(len(setup.free)))
         _, holdout = open_held_out(setup)
         if noise is not None:
             segments = []

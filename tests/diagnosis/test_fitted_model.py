@@ -16,14 +16,3 @@ def test_an_effect_may_be_its_special_case_where_the_number_that_parts_them_is_o
         errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
     )
     assert special_case(fitted, name) == (None if apart else "motor.coulomb_friction")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("noise", "apart"), [(0.05, True), (0.2, False)])
-def test_a_way_shorter_than_the_noise_of_its_position_is_not_known(noise, apart):
-    name = "load.presliding_friction"
-    fitted = SimpleNamespace(
-        experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
-        errors=lambda: {f"effects.{name}.length": 1e-3},
-    )
-    result = special_case(fitted, name, {"motor": 1.0, "load": noise})  # type: ignore[arg-type]
-    assert result == (None if apart else "load.coulomb_friction")

@@ -7,7 +7,6 @@ import pytest
 from passed import PASSED
 
 from jaxbl.diagnosis.judgement import judge
-from jaxbl.diagnosis.proof import Untested
 
 NAME, OTHER = "motor.coulomb_friction", "motor.cogging"
 
@@ -46,7 +45,7 @@ def test_one_reason_is_enough_against_it(changes, reason):
 
 
 def test_what_the_proof_cannot_test_is_not_said_to_be_explained():
-    untested = {NAME: Untested(1e-3, 0.3)}
+    untested = {NAME: {"torque": 1e-3, "on_log": 0.3}}
     # the share says nothing of what is not there
     judgement = judge_model(untested=untested, share=0.0)
     assert judgement.verdict == "not_tested" and not judgement.test["little"]

@@ -187,7 +187,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
 def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
     """A second model along the log, whose numbers are others, with what the first one has left and from scratch."""
     if held:
-        monkeypatch.setattr(Smoothed, "held", lambda self, period: np.arange(len(self.state)) % 500 < 100)
+        monkeypatch.setattr(Smoothed, "find_standstill", lambda self, period: np.arange(len(self.state)) % 500 < 100)
     first = linearise(2)
     names = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
     variants = variants_of(first.experiment, names, lambda name: LOG)

@@ -12,7 +12,7 @@ from hidden_log import FRICTIONS, GAP, GEARED, select_samples, simulate_geared_d
 from jaxbl.config import read_model
 from jaxbl.diagnosis import motor_alone
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosis
-from jaxbl.diagnosis.motor_alone import sought
+from jaxbl.diagnosis.motor_alone import list_sought
 from jaxbl.diagnosis.next_experiment import with_gap
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.report.diagnose import describe_diagnosis
@@ -113,11 +113,14 @@ def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
 
 def test_what_a_model_has_is_not_sought():
     bare = read_model(STUDY)[0].build()
-    assert sought(bare, ["load.coulomb_friction", "drive.gear_ratio"]) == ["motor.coulomb_friction", "transmission.backlash"]
-    assert set(sought(bare)) == {"motor.coulomb_friction", "load.coulomb_friction", "transmission.backlash"}
+    assert list_sought(bare, ["load.coulomb_friction", "drive.gear_ratio"]) == [
+        "motor.coulomb_friction",
+        "transmission.backlash",
+    ]
+    assert set(list_sought(bare)) == {"motor.coulomb_friction", "load.coulomb_friction", "transmission.backlash"}
     gap = {"law": "dead_zone", "stiffness": 61.0, "half_gap": 0.05}
     nominal = read_model(STUDY | {"transmission": gap, "effects": [FRICTIONS[1]]})[0].build()
-    assert sought(nominal) == ["motor.coulomb_friction"]
+    assert list_sought(nominal) == ["motor.coulomb_friction"]
 
 
 def test_a_gap_of_a_given_size_in_a_study():

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from jaxbl.config import read_model
-from jaxbl.diagnosis.next_experiment import Input, _written, check_gap_sought, write_gap_experiment
+from jaxbl.diagnosis.next_experiment import Input, _write_input, check_gap_sought, write_gap_experiment
 from jaxbl.errors import InputError
 from jaxbl.records.reader import Record
 
@@ -45,6 +45,6 @@ def test_the_amplitude_said_is_about_the_mean_of_the_file_and_in_its_unit(tmp_pa
     record.unit_of = partial(Record.unit_of, record)
     torque = 1.5 + 2.0 * np.sin(2.0 * np.pi * 1e-2 * np.arange(100))
     path = tmp_path / "next.csv"
-    line = _written(Input("sine", 2.0, 1.0, torque, 20.0, 1.5), record, path)  # type: ignore[arg-type]
+    line = _write_input(Input("sine", 2.0, 1.0, torque, 20.0, 1.5), record, path)  # type: ignore[arg-type]
     assert line.startswith(f"sine of 2 {torque_unit} about a mean of 1.5 {torque_unit}, 1 Hz, 1 s;")
     assert np.ptp(pd.read_csv(path)["u"]) == pytest.approx(4.0, rel=1e-6)

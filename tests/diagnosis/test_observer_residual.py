@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 import jaxbl.diagnosis.observer_residual as under_test
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.observer_residual import compared, observed_torques
-from jaxbl.diagnosis.residuals import narrowed, residual_torques
+from jaxbl.diagnosis.observer_residual import compare_observers, observed_torques
+from jaxbl.diagnosis.residuals import narrow, residual_torques
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.estimation.logs import on_record
@@ -71,9 +71,9 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
     experiment, residuals, observed = read_residuals(logs, "geared", nominal_study(drive=GEARED, transmission=GAP))
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
         (witness,) = observed[side]
-        assert witness.converged and witness.stuck < 0.02
+        assert witness.has_converged and witness.stuck < 0.02
         assert len(witness.residual.time) + witness.skipped == 1500 - DELAY_SAMPLES and 50 <= witness.skipped < 60
-        description = compared(experiment, observed[side], residuals[side], 30.0)
+        description = compare_observers(experiment, observed[side], residuals[side], 30.0)
         assert description["correlation"] > 0.99
         assert (
             description["rms"] == pytest.approx(description["smoother_rms"], rel=0.03)
@@ -82,8 +82,8 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
         assert description["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * TIME_CONSTANT))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
         missing = low_pass(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + witness.skipped : 1500]
-        low, _ = narrowed(witness.residual, 10.0)
-        true, _ = narrowed(replace(witness.residual, torque=missing), 10.0)
+        low, _ = narrow(witness.residual, 10.0)
+        true, _ = narrow(replace(witness.residual, torque=missing), 10.0)
         assert np.corrcoef(low.torque, true.torque)[0, 1] > 0.99
         assert rms(low.torque) == pytest.approx(rms(true.torque), rel=0.05)
 
@@ -97,7 +97,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretis
     for side, (witness,) in observed.items():
         scores = [rms(witness.residual.torque / witness.residual.deviation)]
         for cutoff in (40.0, 20.0, 10.0):
-            low, _ = narrowed(witness.residual, cutoff)
+            low, _ = narrow(witness.residual, cutoff)
             scores.append(rms(low.torque / low.deviation))
         # the explicit one has a lag of its own, which shows behind narrow low-passes
         if discretisation == "implicit":
@@ -109,7 +109,7 @@ def test_a_complete_model_leaves_noise_of_the_stated_size(logs, drive, discretis
 def test_a_rigid_drive_has_one_witness(logs):
     experiment, residuals, observed = read_residuals(logs, "direct", nominal_study())
     assert list(observed) == ["motor"]
-    description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
+    description = compare_observers(experiment, observed["motor"], residuals["motor"], 30.0)
     assert description["correlation"] > 0.98 and description["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
 
 
@@ -118,8 +118,8 @@ def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
     """The torque that is missing makes 3 rad/s^2."""
     experiment, residuals, observed = read_residuals(logs, "direct", nominal_study(), {"motor": (2.0, alpha)})
     (witness,) = observed["motor"]
-    assert witness.stuck > 0.5 and not witness.converged
-    description = compared(experiment, observed["motor"], residuals["motor"], 30.0)
+    assert witness.stuck > 0.5 and not witness.has_converged
+    description = compare_observers(experiment, observed["motor"], residuals["motor"], 30.0)
     assert description["converged"] is False and {description[name] for name in ("rms", "noise", "correlation")} == {None}
 
 
@@ -131,4 +131,4 @@ def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
 
     monkeypatch.setattr(under_test, "_controls", controls)
     _, _, observed = read_residuals(logs, "direct", nominal_study())
-    assert not observed["motor"][0].converged and np.isnan(observed["motor"][0].residual.deviation).all()
+    assert not observed["motor"][0].has_converged and np.isnan(observed["motor"][0].residual.deviation).all()

@@ -9,7 +9,7 @@ from jaxbl.diagnosis import effect_search
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
 from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.reference_log import ReferenceLog
-from jaxbl.diagnosis.residuals import narrowed
+from jaxbl.diagnosis.residuals import narrow
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.segments import segments_of
@@ -55,7 +55,7 @@ def test_emps_friction_of_each_direction_is_named_and_the_force_error_falls():
     # behind the 100 Hz of the published figures
     driving = summary["gap"]["driving"]["motor"]
     ((before, after, is_held_out),) = diagnosis.pairs["motor"]
-    error = [np.sqrt(np.mean(narrowed(finding, 100.0)[0].torque ** 2)) / driving for finding in (before, after)]
+    error = [np.sqrt(np.mean(narrow(finding, 100.0)[0].torque ** 2)) / driving for finding in (before, after)]
     assert is_held_out
     assert error[0] == pytest.approx(0.66, abs=0.03)
     assert error[1] < 0.058

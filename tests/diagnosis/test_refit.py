@@ -13,7 +13,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
-from jaxbl.estimation.regression import settled
+from jaxbl.estimation.regression import settle_states
 from jaxbl.estimation.segments import segments_of
 from jaxbl.simulate import plant_trajectory, with_effects
 
@@ -48,7 +48,7 @@ def test_prediction_errors_are_least(fits):
     @jit
     def predict(inputs):
         candidate = set_free_parameters(plain, fit.free, inputs[2:] * 0.01)
-        start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settled(candidate, torque[0]))
+        start = PlantState({"motor": inputs[0]}, {"motor": inputs[1]}, settle_states(candidate, torque[0]))
         return plant_trajectory(candidate, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(inputs):

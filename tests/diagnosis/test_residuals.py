@@ -7,7 +7,7 @@ from small_study import rigid_study, small_study
 from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrowed, noise_spectrum, residual_torques
+from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrow, noise_spectrum, residual_torques
 from jaxbl.estimation.regression import balance
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
@@ -37,7 +37,7 @@ def rms(values):
 
 def score_residual(residual, cutoff=None):
     if cutoff is not None:
-        residual, _ = narrowed(residual, cutoff)
+        residual, _ = narrow(residual, cutoff)
     return rms(residual.torque / residual.deviation)
 
 
@@ -87,12 +87,12 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     time = 1e-3 * np.arange(20000)
     slow = np.sin(2.0 * np.pi * 0.7 * time)
     white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(1), 500.0)
-    low, rows = narrowed(white, 5.0)
+    low, rows = narrow(white, 5.0)
     assert len(low.time) < 2000 and low.bandwidth == 5.0
     np.testing.assert_array_equal(low.time, time[rows])
     assert rms((low.torque - slow[rows]) / low.deviation) == pytest.approx(1.0, abs=0.1)
-    narrowed_twice, _ = narrowed(low, 2.5)
-    narrowed_once, _ = narrowed(white, 2.3)
+    narrowed_twice, _ = narrow(low, 2.5)
+    narrowed_once, _ = narrow(white, 2.3)
     assert narrowed_twice.deviation[50] == pytest.approx(narrowed_once.deviation[50], rel=0.1)
 
 

@@ -13,7 +13,7 @@ from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.residuals import residual_torques
 from jaxbl.diagnosis.setup import set_up
-from jaxbl.diagnosis.torque_tables import _fitted, tabulate
+from jaxbl.diagnosis.torque_tables import _fit_tables, tabulate
 
 SETTINGS = {"run.duration": 8.0, "run.substeps": 5}
 OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}}
@@ -32,7 +32,7 @@ def find_tables(*effects):
     experiment = prepare(read_config(study()))
     lacking = residual_torques(experiment, [segment])["motor"]
     log = ReferenceLog([segment], {"motor": 20.0})
-    return {table.over: table for table in _fitted(log, lacking, "motor", rotary=True)}
+    return {table.over: table for table in _fit_tables(log, lacking, "motor", rotary=True)}
 
 
 def test_a_torque_over_position_is_found_with_its_error():

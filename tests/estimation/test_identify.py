@@ -313,7 +313,7 @@ def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart():
     segment = make_segment(trace.assign(theta_e=positions))
     free = make_free_parameters(experiment, default_paths(read_config(study), experiment), 1.0)
     settings = read_config(study).identify
-    search = ParameterSearch(experiment, [segment], settings, rest=False, name="log").run(free)
+    search = ParameterSearch(experiment, [segment], settings, at_rest=False, name="log").run(free)
     assert float(search.spread.variance) < 0.5
     assert [start["agrees"] for start in search.starts] == [True] * 4
 

@@ -16,7 +16,7 @@ from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.estimation.logs import on_record
 from jaxbl.estimation.regression import Path, effect_path
-from jaxbl.estimation.segments import led_in, reading_noise, segments_of, windows_of
+from jaxbl.estimation.segments import reading_noise, segments_of, skip_unknown_input, windows_of
 from jaxbl.records import read_record
 
 LAG = {"kind": "actuator.lag", "time_constant": 0.05}
@@ -48,19 +48,25 @@ def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(lagged_log):
     full, _, _ = lagged_log
     record = replace(full, segments=(slice(0, 100), slice(100, 900), slice(1000, 2000)))
     # nothing is known before the first part, which is too short to give up any; the others follow on known inputs
-    assert led_in(record, False).segments == record.segments
+    assert skip_unknown_input(record, False).segments == record.segments
     record = replace(record, time=full.time + 0.5 * (np.arange(2000) >= 1000))
-    led = led_in(record, False)
-    assert led.segments == (slice(0, 100), slice(100, 900), slice(1000 + DELAY_SAMPLES, 2000)) == led_in(led, False).segments
+    led = skip_unknown_input(record, False)
+    assert (
+        led.segments
+        == (slice(0, 100), slice(100, 900), slice(1000 + DELAY_SAMPLES, 2000))
+        == skip_unknown_input(led, False).segments
+    )
     first, second, third = segments_of(led, ["motor"])
     assert first.before is None and record.torque is not None
     np.testing.assert_array_equal(second.before, record.torque[100 - DELAY_SAMPLES : 100])
     np.testing.assert_array_equal(third.before, record.torque[1000 : 1000 + DELAY_SAMPLES])
     # at rest nothing had been commanded
-    assert led_in(full, True).segments == full.segments and led_in(full, False).segments == (slice(DELAY_SAMPLES, 2000),)
+    assert skip_unknown_input(full, True).segments == full.segments and skip_unknown_input(full, False).segments == (
+        slice(DELAY_SAMPLES, 2000),
+    )
     np.testing.assert_array_equal(segments_of(full, ["motor"], True)[0].before, np.zeros(DELAY_SAMPLES))
     free = replace(full, torque=np.zeros(2000))
-    assert led_in(free, False).segments == full.segments
+    assert skip_unknown_input(free, False).segments == full.segments
 
 
 def test_effects_begin_with_what_the_inputs_before_left(lagged_log):

@@ -49,7 +49,7 @@ def smooth_by_least_squares(readings):
 
 def test_agrees_with_least_squares_over_all_states():
     _, readings = simulate_motion(1, 120)
-    result = smooth(readings, PERIOD, known=(NOISE, JERK))
+    result = smooth(readings, PERIOD, noise_and_jerk=(NOISE, JERK))
     state, covariance = smooth_by_least_squares(readings)
     deviation = np.sqrt(np.einsum("tii->ti", covariance))
     # a hundredth of the backward filter's information counts twice at the first sample
@@ -114,5 +114,5 @@ def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monke
     readings = np.stack([(1.0 + seed) * simulate_motion(seed, 300)[1] for seed in range(columns)], axis=1)
     result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
     for channel, position in zip(result.T, readings.T, strict=True):
-        alone = smooth(position, PERIOD, known=(NOISE, JERK)).acceleration
+        alone = smooth(position, PERIOD, noise_and_jerk=(NOISE, JERK)).acceleration
         np.testing.assert_allclose(channel, alone, rtol=1e-9, atol=1e-9 * np.max(np.abs(alone)))
