@@ -7,7 +7,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -27,6 +28,8 @@ _REQUESTS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a process to end."""
 _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 """Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
+STEPS = "steps"
+"""Unit of progress through parts of unlike length, of which nothing is kept before the last."""
 
 
 @contextmanager
@@ -43,11 +46,9 @@ def name_config_in_errors(config: Path, folder: Path | None = None) -> Iterator[
 
 
 @contextmanager
-def run_with_progress(
-    context: typer.Context, config: Path, folder: Path, *, unit: str = "runs", keeps_results: bool = True
-) -> "Iterator[Progress]":
+def run_with_progress(context: typer.Context, config: Path, folder: Path, *, unit: str = "runs") -> "Iterator[Progress]":
     """Around a long computation: messages name the config, progress in `unit` is shown, and an interrupt (exit 130) says how
-    to go on, and whether what is finished is `keeps_results` in the folder.
+    to go on: what is finished is in the folder, but for `STEPS`.
 
     Foreign code may swallow an interrupt, or turn it into another error: it is remembered, and raised at the next progress
     or error.
@@ -75,6 +76,7 @@ def run_with_progress(
     except BaseException as error:
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
+        keeps_results = unit != STEPS
         state = "what is finished is kept. Go on with" if keeps_results else "nothing was written. Start again with"
         again = command_line(*repeat_call(context, folder, keeps_results=keeps_results))
         typer.echo(escape_unprintable(f"interrupted; {state}: {again}"), err=True)
@@ -85,35 +87,29 @@ def run_with_progress(
 
 def run_until_interrupted(run: Callable[[], object]) -> None:
     """Run until Ctrl+C or a request to end; a second one ends the process as it is."""
-
-    def end(number: int, frame: FrameType | None) -> None:
-        for request in _REQUESTS:
-            signal.signal(request, signal.SIG_DFL)
-        raise KeyboardInterrupt
-
-    for request in _REQUESTS:
-        signal.signal(request, end)
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), watch_for_end_request(interrupts=True):
         run()
 
 
 @contextmanager
-def watch_for_end_request() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True once the user or the system has asked the process to end.
+def watch_for_end_request(*, interrupts: bool = False) -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns True once the user or the system has asked the process to end; with `interrupts`, this
+    raises `KeyboardInterrupt` as well.
 
     A second request ends the process at once.
     """
-    asked = False
+    asked = threading.Event()
 
     def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
+        asked.set()
         for request in _REQUESTS:
             signal.signal(request, signal.SIG_DFL)
+        if interrupts:
+            raise KeyboardInterrupt
 
     before = {request: signal.signal(request, ask) for request in _REQUESTS}
     try:
-        yield lambda: asked
+        yield asked.is_set
     finally:
         for request, handler in before.items():
             signal.signal(request, handler)
@@ -138,16 +134,31 @@ def repeat_call(context: typer.Context, folder: Path, *, keeps_results: bool = T
 
 @contextmanager
 def progress_bar(unit: str, *, quiet: bool = False, first: str = "compiling") -> "Iterator[Progress | None]":
-    """Show the present task, its progress in `unit`, and the remaining time: a bar on a terminal, lines now and then in a
-    pipe. Without a unit nothing is counted."""
+    """Show the present task, its progress in `unit`, and the remaining time: on a terminal one line that changes, in a pipe
+    lines now and then. Without a unit nothing is counted."""
     if quiet:
         yield None
-    elif sys.stderr.isatty():
-        with _bar(unit, first) as update:
-            yield update
-    else:
-        with _lines(unit, first) as update:
-            yield update
+        return
+    with ExitStack() as stack:
+        say, pause = partial(typer.echo, err=True), _EVERY
+        if sys.stderr.isatty():
+            from rich.console import Console
+
+            # what is printed meanwhile goes above this line
+            say, pause = stack.enter_context(Console(stderr=True).status(first)).update, 0.0
+        lines, ended = ProgressLines(unit, first, time.monotonic(), pause), threading.Event()
+
+        def speak() -> None:
+            while not ended.wait(_LOOK):
+                if line := lines.look(time.monotonic()):
+                    say(escape_unprintable(line))
+
+        speaker = threading.Thread(target=speak, name="jaxbl-progress", daemon=True)
+        speaker.start()
+        stack.callback(speaker.join)
+        stack.callback(ended.set)
+        stack.enter_context(subscribe(lines.hear))
+        yield lines.update
 
 
 @contextmanager
@@ -162,87 +173,57 @@ def is_quiet(context: typer.Context) -> bool:
     return bool(context.params.get("quiet"))
 
 
-@contextmanager
-def _bar(unit: str, first: str) -> "Iterator[Progress]":
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    counted = (MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn()) if unit else (TimeElapsedColumn(),)
-    columns = (TextColumn("{task.description}"), BarColumn(), *counted)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(first, total=None)
-        heard = False
-
-        def update(done: int, total: int) -> None:
-            bar.update(task, description=None if heard else "running", completed=done, total=total)
-
-        def hear(description: str) -> None:
-            nonlocal heard
-            heard = True
-            bar.update(task, description=description)
-
-        with subscribe(hear):
-            yield update
-
-
 class ProgressLines:
     """Lines of text about progress: the present task, the share that is done, the remaining time.
 
+    Once all that is counted is done, or while nothing is, a line says how long the task takes so far.
+
     Args:
-        unit: of what is counted.
+        unit: of what is counted; `STEPS` are of unlike length, so that no time is left to be told from their number.
         task: is being done at first.
         now: time of the beginning, s.
+        pause: seconds between lines.
     """
 
-    def __init__(self, unit: str, task: str, now: float):
-        self._unit, self._what, self._began, self._said = unit, task, now, now
-        self._heard, self._done, self._total = False, 0, 0
+    def __init__(self, unit: str, task: str, now: float, pause: float = _EVERY):
+        self._unit, self._task, self._pause, self._said = unit, task, pause, now
+        self._first, self._done, self._total = task, 0, 0
         self._seen = deque([(now, 0)], maxlen=round(_WINDOW / _LOOK))
+        self._began, self._state = now, (task, 0)
 
     def update(self, done: int, total: int) -> None:
         """Hear how much is done."""
+        if done < self._done:
+            # another count begins
+            self._seen.clear()
         self._done, self._total = done, total
-        if not self._heard:
-            self._what = "running"
+        if self._task == self._first:
+            self._task = "running"
 
     def hear(self, task: str) -> None:
         """Hear what is being done."""
-        self._heard, self._what = True, task
+        self._task = task
 
     def look(self, now: float) -> str | None:
         """Return a line if it is time for one."""
-        self._seen.append((now, self._done))
-        if now - self._said < _EVERY:
+        done, total = self._done, self._total
+        self._seen.append((now, done))
+        if self._state != (state := (self._task, done)):
+            self._began, self._state = now, state
+        if now - self._said < self._pause:
             return None
         self._said = now
-        if not self._total:
-            return f"jaxbl: {self._what}, for {format_duration(now - self._began)} so far"
-        share = f"{self._done} of {self._total} {self._unit} ({math.floor(100 * self._done / self._total)} %)"
+        lead, lasts = f"jaxbl: {self._task}, ", f"for {format_duration(now - self._began)} so far"
+        if done >= total:
+            return lead + lasts
+        if self._unit == STEPS:
+            return f"{lead}step {done + 1} of {total}, {lasts}"
         since, before = self._seen[0]
         left = ""
         # parts of an earlier call are counted within a moment: what happened lately says how fast it goes
-        if before < self._done < self._total:
-            left = f", about {format_duration((self._total - self._done) * (now - since) / (self._done - before))} left"
-        return f"jaxbl: {self._what}, {share}{left}"
-
-
-@contextmanager
-def _lines(unit: str, first: str) -> "Iterator[Progress]":
-    lines, ended = ProgressLines(unit, first, time.monotonic()), threading.Event()
-
-    def speak() -> None:
-        while not ended.wait(_LOOK):
-            if line := lines.look(time.monotonic()):
-                typer.echo(escape_unprintable(line), err=True)
-
-    speaker = threading.Thread(target=speak, name="jaxbl-progress", daemon=True)
-    speaker.start()
-    try:
-        with subscribe(lines.hear):
-            yield lines.update
-    finally:
-        ended.set()
-        speaker.join()
+        if before < done:
+            left = f", about {format_duration((total - done) * (now - since) / (done - before))} left"
+        return f"{lead}{done} of {total} {self._unit} ({math.floor(100 * done / total)} %){left}"
 
 
 def can_ask_user() -> bool:

@@ -2,7 +2,9 @@
 
 import re
 
-_LINE = re.compile(r"jaxbl: [^:]+, (for [\d.]+ \w+ so far|\d+ of \d+ \w+ \(\d+ %\)(, about [\d.]+ \w+ left)?)\n")
+_LINE = re.compile(
+    r"jaxbl: [^:]+, ((step \d+ of \d+, )?for [\d.]+ \w+ so far|\d+ of \d+ \w+ \(\d+ %\)(, about [\d.]+ \w+ left)?)\n"
+)
 
 
 def without_progress(stderr):

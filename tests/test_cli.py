@@ -503,11 +503,13 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["title"] == "second"
 
 
-def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
+def test_progress_on_a_terminal_is_a_line_that_is_taken_away(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    for unit in ("runs", ""):
+    monkeypatch.setattr(terminal, "_LOOK", 0.01)
+    for unit in ("runs", terminal.STEPS, ""):
         with terminal.progress_bar(unit) as progress:
             progress(2, 3)
+            time.sleep(0.1)
     assert capsys.readouterr().out == ""
 
 
@@ -537,6 +539,29 @@ def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
     assert lines.look(90.0) == "jaxbl: drawing, 654 of 1000 runs (65 %), about 3 min left"
     assert without_progress("jaxbl: drawing, 654 of 1000 runs (65 %), about 2 min left\nx\n") == "x\n"
     assert shown_line is None
+
+
+def test_work_that_follows_the_last_count_has_a_time_or_a_count_of_its_own():
+    """No line stands at 100 %, and none tells a remaining time from another stage's speed."""
+    lines = terminal.ProgressLines("runs", "compiling", 0.0, pause=1.0)
+    for t in range(1, 11):
+        lines.update(10 * t, 100)
+        shown_line = lines.look(float(t))
+    assert shown_line == "jaxbl: running, for 0.0 s so far"
+    lines.hear("repeating runs")
+    assert [lines.look(t) for t in (11.0, 31.0)] == [f"jaxbl: repeating runs, for {t} s so far" for t in ("0.0", "20.0")]
+    lines.update(0, 50)
+    assert lines.look(32.0) == "jaxbl: repeating runs, 0 of 50 runs (0 %)"
+    lines.update(5, 50)
+    assert lines.look(42.0) == "jaxbl: repeating runs, 5 of 50 runs (10 %), about 90.0 s left"
+
+
+def test_steps_of_unlike_length_tell_no_remaining_time():
+    lines = terminal.ProgressLines(terminal.STEPS, "compiling", 0.0, pause=1.0)
+    lines.update(1, 6)
+    assert lines.look(1.0) == "jaxbl: running, step 2 of 6, for 0.0 s so far"
+    shown_line = lines.look(300.0)
+    assert shown_line == "jaxbl: running, step 2 of 6, for 5 min so far" and without_progress(f"{shown_line}\n") == ""
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])

@@ -13,7 +13,7 @@ from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.files import claim_log_folder, lock_folder, remove_if_empty_on_error, run_or_read, to_jsonable, write_atomic
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure
-from jaxbl.terminal import is_quiet, repeat_call, run_with_progress, watch_for_end_request
+from jaxbl.terminal import STEPS, is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
 from .options import (
@@ -141,7 +141,7 @@ def identify(
     def describe(summary: JsonObject) -> "Result":
         return replace(describe_identification(summary), next_steps=after_identification(task, summary, log_call))
 
-    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
+    with run_with_progress(context, model, folder, unit=STEPS) as progress:
         summary = run_or_read(
             task,
             folder / "identification.json",
@@ -218,7 +218,7 @@ def diagnose(
     def describe(summary: JsonObject) -> "Result":
         return replace(describe_diagnosis(summary), next_steps=after_diagnosis(task, summary, log_call))
 
-    with run_with_progress(context, model, folder, unit="steps", keeps_results=False) as progress:
+    with run_with_progress(context, model, folder, unit=STEPS) as progress:
         summary = run_or_read(
             task,
             folder / "diagnosis.json",

@@ -24,7 +24,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import remove_if_empty_on_error, write_atomic
 from jaxbl.lines import format_descriptions
 from jaxbl.result import Result
-from jaxbl.terminal import can_ask_user, run_with_progress, show_task
+from jaxbl.terminal import STEPS, can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
 from .options import BackendOption, OutOption, argument, check_new, claim_out, flag, option
@@ -237,6 +237,6 @@ def bench(
     claim_out(out, "bench.json")
     # the time of compiling is measured, so that nothing may come from the cache
     jax.config.update("jax_enable_compilation_cache", False)
-    with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit="parts", keeps_results=False) as progress:
+    with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit=STEPS) as progress:
         result = jaxbl.bench(quick=quick, progress=progress)
     return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)

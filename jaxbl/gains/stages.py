@@ -24,7 +24,7 @@ from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, check_backend, share_programs
 from jaxbl.sweeps.store import claim_folder, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
-from jaxbl.workers import Progress
+from jaxbl.workers import Progress, announce
 
 
 @contextmanager
@@ -179,5 +179,10 @@ class Stages:
         return result
 
     def rerun(self, study: Config | JsonObject, *names: str) -> pd.DataFrame:
-        """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place."""
-        return sweep(study, self.path_of(*names), devices=self.devices, overwrite=True).frame
+        """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place.
+
+        Nobody knows beforehand how many of these there are: the progress counts the runs of each.
+        """
+        announce(f"repeating runs ({', '.join(names)})")
+        place = self.path_of(*names)
+        return sweep(study, place, progress=self._progress, devices=self.devices, overwrite=True).frame
