@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .gains.tune import Tuning as Tuning, tune as tune
     from .gains.verify import Verdict as Verdict, verify as verify
     from .monitoring.watch import Watch as Watch, watch as watch
+    from .quantity import Quantity as Quantity
     from .records import (
         Inspection as Inspection,
         LogTable as LogTable,
@@ -41,25 +42,26 @@ if TYPE_CHECKING:
 
 # the same for loading; a test compares the two
 _NAMES = {
-    "config": ("Config", "read_config"),
-    "diagnosis.diagnose": ("Diagnosis", "diagnose"),
-    "errors": ("InputError", "NoResult"),
-    "exports": ("Export", "export"),
-    "gains.accuracy_laws": ("Law", "accuracy_laws"),
-    "gains.tune": ("Tuning", "tune"),
-    "gains.verify": ("Verdict", "verify"),
-    "estimation.element": ("ElementIdentification", "identify_element"),
-    "estimation.identify": ("Identification", "identify"),
-    "monitoring.watch": ("Watch", "watch"),
-    "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
-    "report.results": ("describe", "draw", "write_report"),
-    "sweeps.compare": ("Comparison", "compare"),
-    "sweeps.status": ("Status", "status"),
-    "sweeps.sweep": ("StudyResult", "dry_run", "open_study", "repair", "share", "submit", "sweep"),
-    "sweeps.trial": ("Trial", "run"),
-    "throughput": ("bench",),
+    "config": "Config read_config",
+    "diagnosis.diagnose": "Diagnosis diagnose",
+    "errors": "InputError NoResult",
+    "exports": "Export export",
+    "gains.accuracy_laws": "Law accuracy_laws",
+    "gains.tune": "Tuning tune",
+    "gains.verify": "Verdict verify",
+    "estimation.element": "ElementIdentification identify_element",
+    "estimation.identify": "Identification identify",
+    "monitoring.watch": "Watch watch",
+    "quantity": "Quantity",
+    "records": "Inspection LogTable Record inspect read_record",
+    "report.results": "describe draw write_report",
+    "sweeps.compare": "Comparison compare",
+    "sweeps.status": "Status status",
+    "sweeps.sweep": "StudyResult dry_run open_study repair share submit sweep",
+    "sweeps.trial": "Trial run",
+    "throughput": "bench",
 }
-_WHERE = {name: module for module, names in _NAMES.items() for name in names}
+_WHERE = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:

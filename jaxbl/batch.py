@@ -25,8 +25,7 @@ class LogJob(NamedTuple):
 
     def absolute(self) -> "LogJob":
         """Return the job with absolute paths, for processes in other folders."""
-        holdout = self.holdout and self.holdout.absolute()
-        return LogJob(self.log.absolute(), self.model.absolute(), holdout, self.folder.absolute(), self.overwrite)
+        return self._make(field.absolute() if isinstance(field, Path) else field for field in self)
 
 
 def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> tuple[list[LogJob], list[str]]:

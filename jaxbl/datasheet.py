@@ -6,7 +6,9 @@ Numbers are read in the units of data sheets and written in SI, each beside what
 
 import math
 import re
+import tomllib
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import InputError
@@ -175,20 +177,17 @@ class DriveKind(NamedTuple):
         return on_a_line(unit) if side in self.linear else unit
 
 
+_item_from_zero = partial(Item, is_above=False)
 _END = (
     Item("sample_period", "sampling period of the drive", _PERIOD, "0.25 ms", "1 ms"),
     Item("frequency", "lowest frequency of the test input", {"Hz": 1.0}, "0.5 Hz", "0.5 Hz"),
 )
-_ENCODER = Item("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "17 bit", is_above=False)
-_LOAD_ENCODER = Item(
-    "load_encoder", "one count of the load's encoder", _STEP, "20 bit", "17 bit", is_above=False, absent=True
-)
-_SCALE = Item("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "1 um", is_above=False, absent=True)
-_DAMPING = Item("damping", "damping ratio of the gear's oscillation", _RATIO, "5 %", "3 %", is_above=False)
-_MOTOR_VISCOUS = Item(
-    "motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", is_above=False
-)
-_NOISE = Item("encoder_noise", "rms noise of the motor's encoder", _ANGLE, "5 arcsec", "0 rad", is_above=False)
+_ENCODER = _item_from_zero("motor_encoder", "one count of the motor's encoder", _STEP, "17 bit", "17 bit")
+_LOAD_ENCODER = _item_from_zero("load_encoder", "one count of the load's encoder", _STEP, "20 bit", "17 bit", absent=True)
+_SCALE = _item_from_zero("load_encoder", "one count of the linear scale", _LENGTH, "100 nm", "1 um", absent=True)
+_DAMPING = _item_from_zero("damping", "damping ratio of the gear's oscillation", _RATIO, "5 %", "3 %")
+_MOTOR_VISCOUS = _item_from_zero("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad")
+_NOISE = _item_from_zero("encoder_noise", "rms noise of the motor's encoder", _ANGLE, "5 arcsec", "0 rad")
 _RATED = (
     Item("torque", "rated torque of the motor", _TORQUE, "1.3 N m"),
     Item("speed", "rated speed of the motor", _SPEED, "3000 rpm"),
@@ -200,16 +199,14 @@ KINDS = {
         (
             Item("motor_inertia", "inertia of the rotor", _INERTIA, "0.48 kg cm²"),
             _MOTOR_VISCOUS,
-            Item(
-                "motor_friction", "dry friction at the motor, with the gear's", _TORQUE, "15 mN m", "0 N m", is_above=False
-            ),
+            _item_from_zero("motor_friction", "dry friction at the motor, with the gear's", _TORQUE, "15 mN m", "0 N m"),
             *_RATED,
             Item("gear_ratio", "gear ratio, motor turns for one turn of the load", {"": 1.0}, "50"),
             Item("stiffness", "torsional stiffness of the gear at its output", _STIFFNESS, "12 N m/arcmin"),
-            Item("backlash", "backlash of the gear at its output, end to end", _ANGLE, "3 arcmin", is_above=False),
+            _item_from_zero("backlash", "backlash of the gear at its output, end to end", _ANGLE, "3 arcmin"),
             _DAMPING,
             Item("load_inertia", "inertia of the load at its own shaft", _INERTIA, "0.4 kg m²"),
-            Item("load_viscous", "viscous friction at the load", _VISCOUS, "0.5 N m s/rad", "0 N m s/rad", is_above=False),
+            _item_from_zero("load_viscous", "viscous friction at the load", _VISCOUS, "0.5 N m s/rad", "0 N m s/rad"),
             _ENCODER,
             _LOAD_ENCODER,
             _NOISE,
@@ -221,14 +218,14 @@ KINDS = {
         (
             Item("motor_inertia", "inertia of rotor, coupling and screw", _INERTIA, "1.2 kg cm²"),
             _MOTOR_VISCOUS,
-            Item("motor_friction", "dry friction at the motor, with the nut's", _TORQUE, "0.1 N m", "0 N m", is_above=False),
+            _item_from_zero("motor_friction", "dry friction at the motor, with the nut's", _TORQUE, "0.1 N m", "0 N m"),
             *_RATED,
             Item("lead", "travel of the carriage for one turn of the motor", _LEAD, "10 mm", key="gear_ratio"),
             Item("stiffness", "axial stiffness of screw, nut and bearings", _AXIAL, "120 N/um"),
-            Item("backlash", "backlash of the nut, end to end", _LENGTH, "20 um", is_above=False),
+            _item_from_zero("backlash", "backlash of the nut, end to end", _LENGTH, "20 um"),
             _DAMPING,
             Item("mass", "mass of the carriage, with what it carries", _MASS, "60 kg", key="load_inertia"),
-            Item("load_viscous", "viscous friction of the guides", _DRAG, "200 N s/m", "0 N s/m", is_above=False),
+            _item_from_zero("load_viscous", "viscous friction of the guides", _DRAG, "200 N s/m", "0 N s/m"),
             _ENCODER,
             _SCALE,
             _NOISE,
@@ -253,12 +250,12 @@ KINDS = {
         "a linear motor that moves its load without a gear",
         (
             Item("mass", "mass that moves", _MASS, "8 kg", key="motor_inertia"),
-            Item("motor_viscous", "viscous friction of the guides", _DRAG, "20 N s/m", "0 N s/m", is_above=False),
+            _item_from_zero("motor_viscous", "viscous friction of the guides", _DRAG, "20 N s/m", "0 N s/m"),
             Item("motor_friction", "dry friction, with what else disturbs", _FORCE, "6 N"),
             Item("force", "rated force of the motor", _FORCE, "200 N", key="torque"),
             Item("speed", "rated speed of the motor", _VELOCITY, "2 m/s"),
             _SCALE._replace(name="motor_encoder", question="one count of the scale", absent=False),
-            Item("encoder_noise", "rms noise of the scale", _LENGTH, "20 nm", "0 m", is_above=False),
+            _item_from_zero("encoder_noise", "rms noise of the scale", _LENGTH, "20 nm", "0 m"),
             *_END,
         ),
         linear=("motor",),
@@ -310,7 +307,7 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
 
     answers, table = rename_to_geared(kind, answers), TuneTable(worst_over_uncertainty=True)
     try:
-        data = _parse_toml(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
+        data = tomllib.loads(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
         amplitude, pilot_metrics = _limit_input(data, answers, table)
         _check_motion(kind, pilot_metrics)
         text = _write_drive(kind, answers, title, amplitude)
@@ -318,14 +315,14 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers, table)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
-        config = read_config(_parse_toml(text) | {"observer": observers})
+        config = read_config(tomllib.loads(text) | {"observer": observers})
         expected = expect_errors(list_scenarios(config, table), list(gains))
         for side, metrics in pilot_metrics.items():
             metrics["expected"] = expected[side]._asdict()
         gain_map = propose_map(run_pilot(Scenarios(config, ["nominal"], {}), table)["motor"]["f_plus"])
         tolerances = propose_tolerances(config, expected)
         text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances, gain_map)
-        read_config(_parse_toml(text))
+        read_config(tomllib.loads(text))
     except InputError as error:
         raise InputError(
             f"these numbers make no study; look at their units: {str(error).removeprefix('config: ')}"
@@ -383,12 +380,6 @@ def rename_to_geared(kind: DriveKind, answers: Answers) -> dict[str, Answer]:
     return {item.key or item.name: answers[item.name] for item in kind.items}
 
 
-def _parse_toml(text: str) -> JsonObject:
-    import tomllib
-
-    return tomllib.loads(text)
-
-
 def _format_number(value: float, digits: int = 6) -> str:
     return repr(float(f"{value:.{digits}g}"))
 
@@ -428,7 +419,9 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
         lines += ["", "[[effects]]", f'kind = "motor.{CoulombFriction.kind}"', line("torque", "motor_friction", torque)]
     noise, load = "", []
     if kind.law:
-        stiffness, ratio = value["stiffness"] / value["gear_ratio"] ** 2, value["gear_ratio"]
+        ratio = value["gear_ratio"]
+        to_stiffness, to_half_gap = _to_motor(ratio)
+        stiffness, half_gap = to_stiffness * value["stiffness"], to_half_gap * value["backlash"]
         inertias = value["motor_inertia"], value["load_inertia"] / ratio**2
         shaft = 2.0 * math.sqrt(stiffness * math.prod(inertias) / sum(inertias))
         if value["damping"]:
@@ -438,34 +431,30 @@ def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
         load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
         load_numbers = value["load_inertia"], value["load_viscous"]
-        factors = zip(_to_motor(ratio), ("stiffness", "backlash"), strict=True)
-        at_motor, half_gap = (factor * value[name] for factor, name in factors)
-        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, at_motor, half_gap)
+        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, stiffness, half_gap)
     else:
         nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"])
-    lines += [
-        "",
-        "# The input: six waves at once. Replace it by a motion of your own: kind = 'recorded' plays a file back.",
-        "[excitation]",
-        'kind = "multisine"',
-        f"amplitude = {_format_number(amplitude, 3)} # {torque}: within the rated {rated} and speed; given: {limits}",
-        line("frequency", "frequency", "Hz"),
-        f"count = {_HARMONICS}",
-        "",
-        "[uncertainty]",
-        f"relative = {_UNCERTAINTY} # of the numbers above: machines differ from their data sheets",
-        "",
-        "[encoders]",
-        line("noise", "encoder_noise", f"{angle} rms", how=noise),
-        line("motor_resolution", "motor_encoder", f"{angle} a count, 0 is ideal"),
-        *load,
-        "",
-        "[run]",
-        f"duration = {_format_number(_PERIODS / value['frequency'])} # s: {_PERIODS} periods of the input",
-        line("sample_period", "sample_period", "s"),
-        f"substeps = {count_plant_steps(nominal, value['sample_period'])} # steps of the plant a sample, by the stiffness",
-    ]
-    return "\n".join(lines) + "\n"
+    inputs = f"""
+# The input: six waves at once. Replace it by a motion of your own: kind = 'recorded' plays a file back.
+[excitation]
+kind = "multisine"
+amplitude = {_format_number(amplitude, 3)} # {torque}: within the rated {rated} and speed; given: {limits}
+{line("frequency", "frequency", "Hz")}
+count = {_HARMONICS}
+
+[uncertainty]
+relative = {_UNCERTAINTY} # of the numbers above: machines differ from their data sheets
+
+[encoders]
+{line("noise", "encoder_noise", f"{angle} rms", how=noise)}
+{line("motor_resolution", "motor_encoder", f"{angle} a count, 0 is ideal")}"""
+    run = f"""
+[run]
+duration = {_format_number(_PERIODS / value["frequency"])} # s: {_PERIODS} periods of the input
+{line("sample_period", "sample_period", "s")}
+substeps = {count_plant_steps(nominal, value["sample_period"])} # steps of the plant a sample, by the stiffness
+"""
+    return "\n".join([*lines, inputs, *load, run])
 
 
 def _to_motor(ratio: float) -> tuple[float, float]:
@@ -498,13 +487,10 @@ def _write_transmission(
     stiff, half = _to_motor(ratio)
     turning = "load" not in kind.linear
     where_motor, where = "on the motor's shaft", "at the output" if turning else "at the carriage"
-    if turning:
-        gear = write_line("gear_ratio", "gear_ratio")
-    else:
-        gear = write_line("gear_ratio", "gear_ratio", "rad of the motor for 1 m of the carriage", how=" a turn")
+    explanation = () if turning else ("rad of the motor for 1 m of the carriage", 1.0, " a turn")
     lines = [
         *write_side_numbers("load", ", at the load's shaft" if turning else ""),
-        gear,
+        write_line("gear_ratio", "gear_ratio", *explanation),
         "",
         "[transmission]",
         'law = "dead_zone" # a hard gap' if gap else 'law = "linear_shaft" # no backlash was given',
@@ -555,7 +541,7 @@ def compare_observers(kind: DriveKind, text: str, pilot_metrics: JsonObject) -> 
     from .gains.tune import tune
     from .observer import AbstractSuperTwisting
 
-    study, name_of_study = _parse_toml(text), AbstractSuperTwisting.name
+    study, name_of_study = tomllib.loads(text), AbstractSuperTwisting.name
     # one search of each kind, on the study's own input: each further program takes seconds to compile
     study["tune"] = {"observers": _OTHER_OBSERVERS, "trials": 128, "refine": 0, "worst_over_uncertainty": True}
     sides = tune(study).summary["points"][0]["sides"]
@@ -617,34 +603,33 @@ def _write_observers(
     angle = kind.unit("motor", "rad")
     load = "; on the load both are divided by the gear ratio" if kind.law else ""
     bounds = ", ".join(f"{f_plus:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, f_plus in bound.items())
-    lines = [
-        f"# Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times the largest that is to be expected "
-        f"(rms)",
-        f"# of either side with the gains below, in drives within [uncertainty]{load}. Put in what you need.",
-        f"velocity_tolerance = {tolerances['velocity_tolerance']!r} # {angle}/s",
-        f"position_tolerance = {tolerances['position_tolerance']!r} # {angle}",
-        "",
-        f"# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest",
-        f"# acceleration that observers do not know, in runs of drives within [uncertainty]: {bounds}.",
-        "# 'jaxbl tune' looks for better ones.",
-        f"# The motor's largest speed in these runs: {pilot_metrics['motor']['largest_velocity']:.3g} {angle}/s; rated: "
-        f"{answers['speed'].value:.3g}.",
-        "[observer]",
-    ]
+    speed = pilot_metrics["motor"]["largest_velocity"]
+    head = f"""\
+# Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times the largest that is to be expected (rms)
+# of either side with the gains below, in drives within [uncertainty]{load}. Put in what you need.
+velocity_tolerance = {tolerances["velocity_tolerance"]!r} # {angle}/s
+position_tolerance = {tolerances["position_tolerance"]!r} # {angle}
+
+# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest
+# acceleration that observers do not know, in runs of drives within [uncertainty]: {bounds}.
+# 'jaxbl tune' looks for better ones.
+# The motor's largest speed in these runs: {speed:.3g} {angle}/s; rated: {answers["speed"].value:.3g}.
+[observer]"""
+    lines = [head]
     for side, (lambda_, alpha) in gains.items():
         units = ", ".join(kind.unit(side, unit) for unit in ("√rad/s", "rad/s²"))
         lines.append(f"{side} = {{ lambda = {_format_number(lambda_, 3)}, alpha = {_format_number(alpha, 3)} }} # {units}")
-    lines += [
-        "",
-        "# jaxbl tune: gains of the least error, compared on another input",
-        "[tune]",
-        'objective = "velocity" # or "torque"',
-        "worst_over_uncertainty = true",
-        "# within the rated torque and speed, too",
-        f"[tune.holdout]\n{tomli_w.dumps(chirp).strip()}",
-        "",
-        "# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.",
-    ]
+    tables = f"""
+# jaxbl tune: gains of the least error, compared on another input
+[tune]
+objective = "velocity" # or "torque"
+worst_over_uncertainty = true
+# within the rated torque and speed, too
+[tune.holdout]
+{tomli_w.dumps(chirp).strip()}
+
+# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key."""
+    lines.append(tables)
     lines += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in gain_map.items() for table in tables]
     lines.append(f"# {describe_expectation(kind, pilot_metrics)}")
     return "\n".join(lines) + "\n"

@@ -42,7 +42,10 @@ def examine() -> list[Finding]:
     for name, test in (("one run", _test_one_run), ("two backends", _test_two_backends)):
         announce(f"testing {name}")
         try:
-            findings.append(test(name))
+            error, measurement = test()
+            is_close = error < _CLOSE
+            text = measurement.format(error) + ("" if is_close else ": too far; report it with these lines")
+            findings.append(Finding(name, text, is_close))
         except (InputError, NoResult, Unsupported, RuntimeError) as error:
             findings.append(Finding(name, f"{type(error).__name__}: {error}", False))
     return [*findings, Finding("time", f"{time.perf_counter() - began:.1f} s")]
@@ -62,15 +65,11 @@ def _check_packages() -> list[Finding]:
         if extra == "dev":
             continue
         missing = [name for name, version_text in versions.items() if not version_text]
-        there = ", ".join(f"{name} {version_text}" for name, version_text in versions.items() if version_text)
-        if not extra:
-            how = f"missing: {', '.join(missing)}; pip install jaxbl" if missing else there
-            findings.append(Finding("packages", how, not missing))
-        elif missing:
-            lacking = f"lacks {', '.join(missing)}; for it: pip install 'jaxbl[{extra}]'"
-            findings.append(Finding(f"extra {extra}", lacking))
-        else:
-            findings.append(Finding(f"extra {extra}", there))
+        state = ", ".join(f"{name} {version_text}" for name, version_text in versions.items())
+        if missing:
+            package = f"'jaxbl[{extra}]'" if extra else "jaxbl"
+            state = f"lacks {', '.join(missing)}; for it: pip install {package}"
+        findings.append(Finding(f"extra {extra}" if extra else "packages", state, bool(extra) or not missing))
     return findings
 
 
@@ -120,7 +119,7 @@ def _make_study(**tables: Any) -> dict[str, Any]:
     } | tables
 
 
-def _test_one_run(name: str) -> Finding:
+def _test_one_run() -> tuple[float, str]:
     """Compare a motor under a held sine with the closed form."""
     trace = run(_make_study()).trace
     period = float(trace["t"].iloc[1] - trace["t"].iloc[0])
@@ -130,10 +129,10 @@ def _test_one_run(name: str) -> Finding:
         exact.append(velocity)
         velocity = decay * velocity + (1.0 - decay) * torque / _VISCOUS
     error = float(np.max(np.abs(trace["motor.velocity"] - exact)) / np.max(np.abs(exact)))
-    return _judge_test(name, f"velocity within {error:.1e} of the closed form", error < _CLOSE)
+    return error, "velocity within {:.1e} of the closed form"
 
 
-def _test_two_backends(name: str) -> Finding:
+def _test_two_backends() -> tuple[float, str]:
     """Compare the fused loop with XLA's scan on a motor with several observer gains and noise."""
     study = _make_study(
         encoders={"noise": 1e-5},
@@ -142,12 +141,8 @@ def _test_two_backends(name: str) -> Finding:
     )
     errors = [sweep(study, backend=backend).frame["motor.velocity_rmse"].to_numpy() for backend in ("fused", "scan")]
     error = float(np.max(np.abs(errors[0] / errors[1] - 1.0)))
-    return _judge_test(name, f"fused and scan within {error:.1e} of each other", error < _CLOSE)
+    return error, "fused and scan within {:.1e} of each other"
 
 
 _CLOSE = 1e-6
 """Relative: steps of the plant and roundings are far below, anything that is wrong far above."""
-
-
-def _judge_test(name: str, measurement: str, is_close: bool) -> Finding:
-    return Finding(name, measurement if is_close else f"{measurement}: too far; report it with these lines", is_close)

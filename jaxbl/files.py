@@ -414,18 +414,13 @@ def run_or_read(
         claim_log_folder(folder, task.record.path, overwrite=overwrite)
         with suppress(OSError, InputError):
             summary = read_json(file)
-            if summary.get("identity") == task.identity and _report_belongs_to(file):
+            # a report belongs to it that is older, as another command in the folder writes later
+            is_reported = (folder / "report.html").stat().st_mtime_ns <= file.stat().st_mtime_ns
+            if is_reported and summary.get("identity") == task.identity:
                 return summary
         result = run(task)
         write(result, folder)
     return result.summary
-
-
-def _report_belongs_to(summary: Path) -> bool:
-    """True if the report beside a summary belongs to it: it is then older, as another command in the folder writes later."""
-    with suppress(OSError):
-        return (summary.parent / "report.html").stat().st_mtime_ns <= summary.stat().st_mtime_ns
-    return False
 
 
 @contextmanager

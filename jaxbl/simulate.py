@@ -323,8 +323,7 @@ LONGEST_BLOCK = 512
 
 def block_length(steps: int) -> int:
     """Return the samples in a block: the largest divisor of `steps` up to the longest block, or 256 if there is none."""
-    divisors = [n for n in range(64, LONGEST_BLOCK + 1) if steps % n == 0]
-    return divisors[-1] if divisors else min(256, steps)
+    return max((n for n in range(64, LONGEST_BLOCK + 1) if steps % n == 0), default=min(256, steps))
 
 
 Carry = tuple[State, tuple[Any, ...]]
@@ -478,11 +477,9 @@ def _scan(
 def correct_by_readings(state: PlantState, readings: TracedArrays, gain: dict[str, Any]) -> PlantState:
     """Correct positions and velocities by `gain` (1, and 1/s) times the prediction error of each side's reading (rad)."""
     errors = {side: readings[side] - state.position[side] for side in gain}
-    return PlantState(
-        {side: value + gain[side][0] * errors[side] if side in gain else value for side, value in state.position.items()},
-        {side: value + gain[side][1] * errors[side] if side in gain else value for side, value in state.velocity.items()},
-        state.effects,
-    )
+    position = {side: state.position[side] + gain[side][0] * errors[side] for side in gain}
+    velocity = {side: state.velocity[side] + gain[side][1] * errors[side] for side in gain}
+    return PlantState(state.position | position, state.velocity | velocity, state.effects)
 
 
 def plant_trajectory(

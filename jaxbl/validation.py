@@ -1,6 +1,7 @@
 """Checks of what users write: files, sizes of data, strict tables. Each error is one line that says what is wrong."""
 
 import difflib
+import re
 import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ _NESTING_DEPTH = 16
 """Most levels of tables and arrays: a study needs five."""
 _VALUE_COUNT = 300_000
 """Most values of a study, which take some seconds to read. Longer axes have start, stop and num; inputs, a recorded file."""
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters but for those of white space, and half characters."""
 _LISTED_FILES = 5
 """Most files that a message names."""
 _SMALLEST, LARGEST = 1e-30, 1e30
@@ -99,11 +102,8 @@ def _find_fault(value: Any, text_length: int = _TEXT_LENGTH) -> str:
     if isinstance(value, str):
         if len(value) > text_length:
             return f"should have at most {text_length} characters, not {len(value)}"
-        if not value.isprintable():
-            bad = next(
-                (c for c in value if (c < " " and c not in "\t\n\r") or "\x7f" <= c < "\xa0" or "\ud800" <= c < "\ue000"), ""
-            )
-            return f"should have no control characters such as {bad!r}" if bad else ""
+        if control := _CONTROL.search(value):
+            return f"should have no control characters such as {control[0]!r}"
     elif isinstance(value, float):
         if LARGEST < abs(value) < float("inf"):
             return f"should be at most {LARGEST:g} in magnitude, not {value:g}"
@@ -180,24 +180,26 @@ def explain_first_error(error: ValidationError, location: list[str | int] | None
     prefix = f"{dotted}: " if dotted else ""
     kind, context, value = first["type"], first.get("ctx", {}), abbreviate(first["input"])
     key = tuple(location)
-    if kind == "missing":
-        return key, f"{prefix}this key is missing"
     if kind == "union_tag_invalid":
         tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
         name = context["discriminator"].strip("'")
         return (*key, name), f"{dotted}.{name}: unknown {name} '{context['tag']}'; {suggest_word(context['tag'], tags)}"
-    if kind == "union_tag_not_found":
-        return key, f"{prefix}the key {context['discriminator']} is missing"
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return key, f"{prefix}should be a table, not {value}"
-    if kind == "list_type":
-        return key, f"{prefix}should be an array, not {value}"
     message = first["msg"].removeprefix("Input ")
-    if kind == "unknown_key":
-        return (*key, context["key"]), f"{prefix}{message}"
-    if kind == "consistency":
-        return key, f"{prefix}{message}"
-    return key, f"{prefix}{message}, not {value}"
+    if kind == "missing":
+        message = "this key is missing"
+    elif kind == "union_tag_not_found":
+        message = f"the key {context['discriminator']} is missing"
+    elif kind == "unknown_key":
+        key = (*key, context["key"])
+    elif kind != "consistency":
+        message = f"{_SHOULD_BE.get(kind, message)}, not {value}"
+    return key, f"{prefix}{message}"
+
+
+_SHOULD_BE = {"list_type": "should be an array"} | dict.fromkeys(
+    ("model_type", "model_attributes_type", "dict_type"), "should be a table"
+)
+"""What pydantic says in other words, by the kind of error."""
 
 
 def abbreviate(value: Any) -> str:

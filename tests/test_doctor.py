@@ -31,5 +31,7 @@ def test_a_wrong_answer_is_found(monkeypatch):
     trial = run(doctor._make_study())
     trace = trial.trace.assign(**{"motor.velocity": 1.00001 * trial.trace["motor.velocity"]})
     monkeypatch.setattr(doctor, "run", lambda study: trial._replace(trace=trace))
-    finding = doctor._test_one_run("one run")
+    monkeypatch.setattr(doctor, "_test_two_backends", lambda: (0.0, "equal"))
+    *_, finding, other, _ = doctor.examine()
     assert not finding.good and finding.found.endswith("too far; report it with these lines")
+    assert other == ("two backends", "equal", True)

@@ -31,7 +31,7 @@ MODULES = [module_name(file) for file in FILES]
 # the floors of the house: a part imports from those below it, and nothing from beside it
 FLOORS = [
     {"json_types"},
-    {"errors", "registry", "units"},
+    {"errors", "quantity", "registry", "units"},
     {"lines"},
     {"result"},
     {"files", "validation", "workers"},

@@ -17,6 +17,7 @@ from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.free_parameters import FreeParameter, free_values
 from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
@@ -90,12 +91,12 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step]) -> JsonObj
 def describe_parameters(record: Record, free: Sequence[FreeParameter], values: Numbers, errors: Numbers) -> JsonObject:
     """Describe the model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
     return {
-        number.path: {
-            "value": values[number.path],
-            "standard_error": errors[number.path],
-            "nominal": number.nominal,
-            "unit": record.unit_of(number.path, number.unit),
-        }
+        number.path: Quantity(
+            values[number.path],
+            errors[number.path],
+            unit=record.unit_of(number.path, number.unit),
+            nominal=number.nominal,
+        ).to_dict()
         for number in free
     }
 
@@ -104,11 +105,11 @@ def describe_finding(record: Record, finding: Finding, values: Numbers, errors: 
     """Describe a finding but for its share and gain; values and standard errors by path, `where` by side."""
     units = units_of(EFFECTS[finding.effect])
     numbers = {
-        leaf: {
-            "value": values.get(f"effects.{finding.effect}.{leaf}", value),
-            "standard_error": errors.get(f"effects.{finding.effect}.{leaf}", 0.0),
-            "unit": record.unit_of(f"{finding.effect}.{leaf}", units[leaf]),
-        }
+        leaf: Quantity(
+            values.get(f"effects.{finding.effect}.{leaf}", value),
+            errors.get(f"effects.{finding.effect}.{leaf}", 0.0),
+            unit=record.unit_of(f"{finding.effect}.{leaf}", units[leaf]),
+        ).to_dict()
         for leaf, value in finding.numbers.items()
     }
     place = finding.effect.partition(".")[0]
@@ -147,7 +148,7 @@ def contradictions_of(record: Record, fitted: FittedModel, contradictions: Seque
             "parameter": contradiction.path,
             "unit": units[contradiction.path],
             "logs": [
-                {"log": value.log, "value": value.value, "standard_error": value.error}
+                {"log": value.log} | Quantity(value.value, value.error).to_dict()
                 for value in (contradiction.least, contradiction.most)
             ],
         }
@@ -174,9 +175,9 @@ def describe_observers(nominal: Experiment, observed: SideObserved, setup: Setup
             "time_constant": float(nominal.equivalent_control.time_constant),
         }
         if not views[side]["converged"]:
-            listed = ", ".join(f"{key} = {value:.3g}" for key, value in gains.items())
             notes.append(
-                f"The {side}'s observer does not converge on this log ({listed}): its "
+                f"The {side}'s observer does not converge on this log "
+                f"({', '.join(f'{key} = {value:.3g}' for key, value in gains.items())}): its "
                 "equivalent control says nothing of the missing torque. The verdict does not use it."
             )
     return views, notes

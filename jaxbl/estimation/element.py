@@ -129,8 +129,8 @@ def run_element(task: ElementTask) -> ElementIdentification:
     stiffness = element.numbers["stiffness"]
     if "stiffness" in element.open or stiffness.value <= 0.0:
         raise InputError(
-            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness.value:.3g} ± "
-            f"{stiffness.error:.2g} {stiffness.unit}); see columns and signs in [log]"
+            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}); "
+            "see columns and signs in [log]"
         )
     moved = element_displacement(record, task.gear_ratio)
     trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": element.torque})

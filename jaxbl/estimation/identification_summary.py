@@ -10,6 +10,7 @@ import numpy as np
 from jaxbl.config import Config
 from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -40,8 +41,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     at_rest = config.log.initial_state == "rest"
     segments = segments_of(record, nominal.sides, at_rest)
     noise = reading_noise(segments)
-    longest = max(map(len, segments))
-    windows, _ = windows_of(segments, nominal, min(samples, longest), at_rest)
+    windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
     left = [jit(projected_residual)(model, windows)[0] for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
@@ -74,24 +74,24 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
     values, slopes = compute_others(search_fit.fit.theta), jax.jacfwd(compute_others)(search_fit.fit.theta)
     derived = {}
     for name, value in values.items():
-        error = float(jnp.sqrt(slopes[name] @ search_fit.spread.covariance @ slopes[name]))
-        reach = [float(value) - NORMAL * error, float(value) + NORMAL * error]
-        derived[f"transmission.{name}"] = {"value": float(value), "standard_error": error, "interval": reach}
+        number, error = float(value), float(jnp.sqrt(slopes[name] @ search_fit.spread.covariance @ slopes[name]))
+        reach = number - NORMAL * error, number + NORMAL * error
+        derived[f"transmission.{name}"] = Quantity(number, error, reach).to_dict()
     return derived
 
 
-def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, JsonObject]:
+def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, Quantity]:
     """Values with standard errors and 95 % intervals, by path."""
     theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(width.covariance))
     return {
-        parameter.path: {
-            "value": float(parameter.value(theta[i])),
-            "standard_error": float(parameter.slope(theta[i])) * deviation[i],
-            "interval": interval(parameter, theta[i], deviation[i]),
-            "unit": record.unit_of(parameter.path, parameter.unit),
-            "nominal": parameter.nominal,
-        }
-        for i, parameter in enumerate(free)
+        parameter.path: Quantity(
+            float(parameter.value(coordinate)),
+            float(parameter.slope(coordinate)) * error,
+            interval(parameter, coordinate, error),
+            record.unit_of(parameter.path, parameter.unit),
+            parameter.nominal,
+        )
+        for parameter, coordinate, error in zip(free, theta, deviation, strict=True)
     }
 
 
@@ -103,11 +103,15 @@ def by_regression(
     information = np.einsum("wtsp,wtsq->pq", regression_fit.jacobian, regression_fit.jacobian)
     values, vectors = np.linalg.eigh(information)
     blind = values < 1.0 / UNSEEN**2
-    visible = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
+    visible = np.all(np.abs(vectors[:, blind]) <= 0.1, axis=1)
     parameters = _parameters(record, free, regression_fit, spread(regression_fit))
-    numbers = {path: jnp.asarray(parameter["value"]) for path, parameter in parameters.items()}
+    numbers = {path: jnp.asarray(parameter.value) for path, parameter in parameters.items()}
     return {
-        "parameters": {free[i].path: parameters[free[i].path] for i in visible},
+        "parameters": {
+            path: number.to_dict()
+            for (path, number), is_visible in zip(parameters.items(), visible, strict=True)
+            if is_visible
+        },
         "measured_transmitted_torque": record.transmitted is not None,
         "bandwidth": 0.5 / (factor * record.sample_period),
         "torque": torque_errors(record, set_leaves(nominal, numbers), parts, factor),
@@ -143,7 +147,8 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
         correlation = width / np.outer(deviation, deviation)
-    parameters = _parameters(record, search_fit.free, search_fit.fit, search_fit.spread)
+    numbers = _parameters(record, search_fit.free, search_fit.fit, search_fit.spread)
+    parameters = {path: number.to_dict() for path, number in numbers.items()}
     for path, profile in profiles.items():
         parameters[path] |= {
             "profile_interval": profile.interval,
@@ -159,10 +164,7 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
     return {
         **task.heading,
         "parameters": parameters,
-        "correlation": {
-            "parameters": [parameter.path for parameter in search_fit.free],
-            "matrix": correlation,
-        },
+        "correlation": {"parameters": [parameter.path for parameter in search_fit.free], "matrix": correlation},
         "refused": [
             {"direction": refusal.direction, "why": _explain_refusal(refusal), "relative_deviation": refusal.deviation}
             for refusal in search_fit.refused
@@ -211,9 +213,8 @@ _SHOWN_BY = {
 
 def _explain_refusal(refusal: Refusal) -> str:
     names = list(refusal.direction)
-    if len(names) == 1:
-        text = f"this log hardly depends on {names[0]}"
-    else:
+    text = f"this log hardly depends on {names[0]}"
+    if len(names) > 1:
         text = "this log depends hardly on these changing together, by the shares given"
     shown_by = dict.fromkeys(_SHOWN_BY[key] for path in names for key in _SHOWN_BY if path.endswith(key))
     helps = f"; what would help: {', or '.join(shown_by)}" if shown_by else ""

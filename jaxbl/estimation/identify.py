@@ -17,6 +17,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
@@ -55,6 +56,11 @@ class Identification:
     trace: pd.DataFrame
     replays: bool
 
+    @property
+    def parameters(self) -> dict[str, Quantity]:
+        """The numbers found, by path, with standard errors, 95 % intervals, units and nominal values."""
+        return read_quantities(self.summary["parameters"])
+
 
 def read_identification_task(
     log: Logs,
@@ -70,9 +76,10 @@ def read_identification_task(
         InputError: unfit log or study.
     """
     config, missing = read_model(model)
-    asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
-    keys = {key: value for key, value in asked.items() if value is not None}
-    config = config.with_keys("identify", **keys)
+    if parameters is not None:
+        config = config.with_keys("identify", parameters=list(parameters))
+    if profile is not None:
+        config = config.with_keys("identify", profile=profile)
     record, other = read_with_holdout(config, log, holdout)
     if any(remembers_input(effect.build()) for effect in config.effects):
         at_rest = config.log.initial_state == "rest"

@@ -92,10 +92,7 @@ def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples:
     signals = _replay_observers(experiment, jnp.asarray(longest.torque), readings)
     # compiled programs sort their results by name
     estimates = [f"{side}.{name}" for side in experiment.sides for name in ("velocity_estimate", "torque_estimate")]
-    names = [*(["twist"] if "twist" in signals else []), *estimates]
-    columns = join_columns(samples, [longest], [{name: signals[name] for name in dict.fromkeys([*names, *signals])}])
-    numbers: JsonObject = {}
-    if experiment.transmission is not None:
-        for name in experiment.transmission.truth():
-            numbers[name] = {side: float(signals[f"{side}.{name}"][-1]) for side in experiment.sides}
-    return columns, numbers
+    in_order = {name: signals[name] for name in ("twist", *estimates, *signals) if name in signals}
+    law_numbers = {} if experiment.transmission is None else experiment.transmission.truth()
+    at_end = {name: {side: float(signals[f"{side}.{name}"][-1]) for side in experiment.sides} for name in law_numbers}
+    return join_columns(samples, [longest], [in_order]), at_end

@@ -21,7 +21,7 @@ from .lowering import (
 )
 
 
-class Quantity(NamedTuple):
+class Port(NamedTuple):
     """A number that goes in or out: name in the code, unit, description, type."""
 
     name: str
@@ -56,10 +56,10 @@ class Block(NamedTuple):
     name: str
     dtype: np.dtype
     study_numbers: Mapping[str, StudyNumber]
-    start_inputs: Sequence[Quantity]
-    state: Sequence[Quantity]
-    inputs: Sequence[Quantity]
-    outputs: Sequence[Quantity]
+    start_inputs: Sequence[Port]
+    state: Sequence[Port]
+    inputs: Sequence[Port]
+    outputs: Sequence[Port]
     start: ClosedJaxpr
     step: ClosedJaxpr
     start_gives_outputs: bool = False
@@ -79,7 +79,7 @@ class Program(NamedTuple):
     """
 
     block: Block
-    state: tuple[Quantity, ...]
+    state: tuple[Port, ...]
     start: Routine
     step: Routine
     state_variables: tuple[Variable, ...]
@@ -90,8 +90,8 @@ def trace_block(
     name: str,
     dtype: np.dtype,
     study_numbers: Mapping[str, StudyNumber],
-    start_inputs: Sequence[Quantity],
-    inputs: Sequence[Quantity],
+    start_inputs: Sequence[Port],
+    inputs: Sequence[Port],
     start: Callable[[Values, Values], Any],
     step: Callable[[Values, Any, Values], tuple[Any, Outputs]],
     outputs: Callable[[Values, Any, Values], Values] | None = None,
@@ -130,12 +130,12 @@ def trace_block(
         traced_step = trace(flat_step, list(numbers.values()), leaves, list(sample_avals.values()))
     dtypes = [np.dtype(aval.dtype) for aval in traced_step.out_avals]
     output_quantities = [
-        Quantity(name, *output_descriptions[name], dtype)
+        Port(name, *output_descriptions[name], dtype)
         for name, dtype in zip(output_descriptions, dtypes[len(leaves) :], strict=True)
     ]
     leaf_names = [_name_leaf(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]
     state_quantities = [
-        Quantity(quantity, "", "", dtype) for quantity, dtype in zip(leaf_names, dtypes[: len(leaves)], strict=True)
+        Port(quantity, "", "", dtype) for quantity, dtype in zip(leaf_names, dtypes[: len(leaves)], strict=True)
     ]
     return Block(
         name,
@@ -151,7 +151,7 @@ def trace_block(
     )
 
 
-def _name_values(quantities: Sequence[Quantity], values: Sequence[Any]) -> Values:
+def _name_values(quantities: Sequence[Port], values: Sequence[Any]) -> Values:
     return {quantity.name: value for quantity, value in zip(quantities, values, strict=True)}
 
 
@@ -202,5 +202,5 @@ def lower_block(block: Block) -> Program:
     )
 
 
-def _make_variables(quantities: Sequence[Quantity]) -> list[Variable]:
+def _make_variables(quantities: Sequence[Port]) -> list[Variable]:
     return [Variable(quantity.dtype, -1, quantity.name) for quantity in quantities]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .block import Program, Quantity
+from .block import Port, Program
 from .lowering import Constant, Operation, Value, Variable, find_constants
 from .writer import Writer, find_unread_names, to_ascii, write_shortest
 
@@ -70,7 +70,7 @@ def _write_header(program: Program, head: Sequence[str]) -> str:
     guard = f"{name.upper()}_H"
     start, step = write_signatures(program)
     head_lines = "\n".join(head)
-    state = "\n".join(_write_struct(f"{name}_state", program.state or [Quantity("unused", "", "", np.dtype(np.int32))]))
+    state = "\n".join(_write_struct(f"{name}_state", program.state or [Port("unused", "", "", np.dtype(np.int32))]))
     outputs = "\n".join(_write_struct(f"{name}_outputs", block.outputs))
     return f"""{head_lines}
 #ifndef {guard}
@@ -106,7 +106,7 @@ def write_signatures(program: Program) -> tuple[str, str]:
     return f"void {name}_init({start})", f"void {name}_step({step})"
 
 
-def _write_struct(name: str, members: Sequence[Quantity]) -> list[str]:
+def _write_struct(name: str, members: Sequence[Port]) -> list[str]:
     lines = ["typedef struct", "{"]
     for member in members:
         remark = f"{member.description}{f', {member.unit}' if member.unit else ''}"
@@ -137,7 +137,7 @@ class _C(Writer):
         self,
         head: str,
         routine_index: int,
-        arguments: Sequence[Quantity],
+        arguments: Sequence[Port],
         state_variables: Sequence[Variable],
     ) -> None:
         """One of the two; `state_variables` are variables for the state that it finds."""

@@ -10,7 +10,7 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, initial_state, step
 
-from .block import Block, Outputs, Quantity, StudyNumber, Values, trace_block
+from .block import Block, Outputs, Port, StudyNumber, Values, trace_block
 from .lowering import default_precision
 
 PERIOD = "run.sample_period"
@@ -53,8 +53,8 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         experiment = as_arrays(config.build(), dtype)
     study_numbers = read_study_numbers(experiment)
     sides = experiment.sides
-    positions = [Quantity(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
-    torque = Quantity("input", "N m", "input torque, held from this sample to the next", dtype)
+    positions = [Port(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
+    torque = Port("input", "N m", "input torque, held from this sample to the next", dtype)
 
     def start(numbers: Values, inputs: Values) -> _ChainState:
         measured = {side: inputs[f"{side}_position"] for side in sides}

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from jaxbl.config import Config
 from jaxbl.sweeps.store import identity
 
-from .block import Quantity
+from .block import Port
 from .c import c_type, write_c_code
 from .plant import PlantProgram
 from .writer import to_ascii
@@ -371,7 +371,7 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
         start, is_open = _write_number(variable.start or 0.0), int(variable.above is not None)
         rows.append(f'    {{"{variable.name}", {change_rule}, {start}, {low}, {high}, {is_open}}},')
 
-    def write_arguments(quantities: Sequence[Quantity]) -> str:
+    def write_arguments(quantities: Sequence[Port]) -> str:
         places = (
             reference[_to_structured_name(plant.parameters.get(quantity.name, quantity.name))] for quantity in quantities
         )

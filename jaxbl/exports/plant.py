@@ -13,7 +13,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
 from jaxbl.simulate import Experiment, move_plant
 
-from .block import Block, Outputs, Program, Quantity, Values, lower_block, trace_block
+from .block import Block, Outputs, Port, Program, Values, lower_block, trace_block
 from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
 from .lowering import default_precision, drop_unread
 
@@ -107,11 +107,11 @@ def _trace_plant(
     if len(set(numbers.values())) < len(numbers):
         raise Unsupported("two numbers that have one name in code")
     start_inputs, step_inputs = (
-        [Quantity(numbers[path], parameter.unit, parameter.doc, dtype) for path, parameter in group.items()]
+        [Port(numbers[path], parameter.unit, parameter.doc, dtype) for path, parameter in group.items()]
         for group in (start_parameters, step_parameters)
     )
     unit = experiment.plant.input_unit
-    torque = Quantity(_INPUT, unit, f"input{' torque' * (unit == 'N m')}, held from this sample to the next", dtype)
+    torque = Port(_INPUT, unit, f"input{' torque' * (unit == 'N m')}, held from this sample to the next", dtype)
 
     def place_numbers(study_values: Values, arguments: Values) -> Experiment:
         return set_leaves(

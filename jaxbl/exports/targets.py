@@ -15,7 +15,7 @@ from jaxbl.fused import Unsupported
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.store import identity
 
-from .block import Program, Quantity, lower_block
+from .block import Port, Program, lower_block
 from .c import write_c_code
 from .chain import build_observer_chain
 from .filter import input_columns, write_filter_code
@@ -328,17 +328,17 @@ def _summarise(request: Request, program: Program) -> JsonObject:
     return {
         "precision": request.precision,
         "sample_period": block.study_numbers["run.sample_period"].value,
-        "first": [*map(_describe_quantity, block.start_inputs)],
-        "inputs": [*map(_describe_quantity, block.inputs)],
-        "outputs": [*map(_describe_quantity, block.outputs)],
+        "first": [*map(_describe_port, block.start_inputs)],
+        "inputs": [*map(_describe_port, block.inputs)],
+        "outputs": [*map(_describe_port, block.outputs)],
         "state": [{"name": quantity.name, "type": str(quantity.dtype)} for quantity in program.state],
         "operations_per_step": dict(sorted(counts.items())),
         "operations": counts.total(),
     }
 
 
-def _describe_quantity(quantity: Quantity) -> dict[str, str]:
-    return {"name": quantity.name, "unit": quantity.unit, "about": quantity.description, "type": str(quantity.dtype)}
+def _describe_port(port: Port) -> dict[str, str]:
+    return {"name": port.name, "unit": port.unit, "about": port.description, "type": str(port.dtype)}
 
 
 def count_state_bytes(program: Program) -> int:

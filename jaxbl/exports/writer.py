@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .block import Program, Quantity
+from .block import Port, Program
 from .lowering import (
     Choice,
     Constant,
@@ -175,7 +175,7 @@ def _shorten_source(source: str) -> str:
     return source.replace("<locals>.", "").replace(".<dictcomp>", "").replace(".<genexpr>", "").replace(".<lambda>", "")
 
 
-def find_unread_names(routine: Routine, quantities: Sequence[Quantity]) -> list[str]:
+def find_unread_names(routine: Routine, quantities: Sequence[Port]) -> list[str]:
     """Find the names of quantities that a routine does not read."""
     read = {variable.name for variable in drop_unread(routine)[1]}
     return [quantity.name for quantity in quantities if quantity.name not in read]

@@ -102,13 +102,6 @@ def find_best_gains(
     )
 
 
-def describe_margins(margins: dict[str, float]) -> str:
-    """Say how large margins are, the smallest first."""
-    words = {"f_plus": "alpha over f⁺", "failure": "to gains that fail", "error": "to twice the error"}
-    factors = sorted(margins.items(), key=lambda margin: margin[1])
-    return f"Margin {factors[0][1]:.3g} ({', '.join(f'{words[name]} {factor:.3g}' for name, factor in factors)})."
-
-
 def _distances(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the largest difference of a coordinate to the nearest target; infinite without targets."""
     return KDTree(targets).query(points, p=np.inf)[0] if len(targets) else np.full(len(points), np.inf)

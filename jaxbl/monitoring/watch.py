@@ -18,6 +18,7 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.logs import on_record, read_logs
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import (
     Datagrams,
@@ -34,7 +35,7 @@ from jaxbl.units import on_a_line
 from jaxbl.workers import limit_blas_threads
 
 from .live_chain import LiveChain
-from .window import BLOCKS, SETTLING, Number, SideNumbers, Window
+from .window import BLOCKS, SETTLING, SideNumbers, Window
 
 SURE = 0.999
 """Probability at which the gap has to be beyond the limit."""
@@ -343,7 +344,7 @@ class Watcher:
         for side, window in windows.items():
             for name in self._names:
                 number = window.numbers[name]
-                values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.error}
+                values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.standard_error}
         values |= self._judge_gap(windows)
         self.values.append(values)
         self._on_values(values)
@@ -357,17 +358,19 @@ class Watcher:
         numbers_by_side = {
             side: window.numbers
             for side, window in windows.items()
-            if INTERVAL * window.numbers[name].error <= _WIDEST * max(window.numbers[name].value, nominal)
+            if INTERVAL * window.numbers[name].standard_error <= _WIDEST * max(window.numbers[name].value, nominal)
         }
         if not numbers_by_side:
             return {}
-        side = min(numbers_by_side, key=lambda side: numbers_by_side[side][name].error)
+        side = min(numbers_by_side, key=lambda side: numbers_by_side[side][name].standard_error)
         values: Values = {"side": side}
         for key in self._chosen:
             number = numbers_by_side[side][key]
-            ends = (number.value + sign * INTERVAL * number.error for sign in (-1.0, 1.0))
+            ends = (number.value + sign * INTERVAL * number.standard_error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
-        bounds = {side: numbers[name].value - _BOUND * numbers[name].error for side, numbers in numbers_by_side.items()}
+        bounds = {
+            side: numbers[name].value - _BOUND * numbers[name].standard_error for side, numbers in numbers_by_side.items()
+        }
         differing = [
             key
             for key in self._chosen
@@ -381,9 +384,9 @@ class Watcher:
         return values
 
 
-def _surely_differ(first: Number, second: Number) -> bool:
+def _surely_differ(first: Quantity, second: Quantity) -> bool:
     """Return True if two numbers differ by more than their errors explain."""
-    return abs(first.value - second.value) > _BOUND * math.hypot(first.error, second.error)
+    return abs(first.value - second.value) > _BOUND * math.hypot(first.standard_error, second.standard_error)
 
 
 def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> JsonObject:

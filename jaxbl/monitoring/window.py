@@ -28,6 +28,7 @@ import numpy as np
 from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.estimation.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
+from jaxbl.quantity import Quantity
 from jaxbl.records.linear_filters import savitzky_golay_slopes
 from jaxbl.simulate import Experiment, NamedArrays
 
@@ -48,17 +49,10 @@ _SINGULAR = 1e-9
 """Smallest eigenvalue of the scaled normal equations that determines anything in double precision."""
 
 
-class Number(NamedTuple):
-    """A value and its standard error."""
-
-    value: float
-    error: float
-
-
 class SideNumbers(NamedTuple):
     """Numbers of one side from a window: of the law by its own names, `coulomb` (N m) and `viscous` (N m s/rad) friction."""
 
-    numbers: dict[str, Number]
+    numbers: dict[str, Quantity]
     law: AbstractTransmission
     zero: float
 
@@ -186,13 +180,15 @@ class Window:
             gap = numbers.get("half_gap")
             change = max(abs(shift.value), 0.0 if gap is None else abs(gap.value - float(law.half_gap)))
             law, zero = _place_numbers(law, numbers), zero + shift.value
-            if change <= _CONVERGED * (shift.error if gap is None else max(gap.error, shift.error)):
+            if change <= _CONVERGED * (
+                shift.standard_error if gap is None else max(gap.standard_error, shift.standard_error)
+            ):
                 return SideNumbers(numbers, law, zero)
         return None
 
     def _solve_with_errors(
         self, side: str, law: AbstractTransmission, information: np.ndarray, right: np.ndarray
-    ) -> dict[str, Number] | None:
+    ) -> dict[str, Quantity] | None:
         """Solve for the numbers with standard errors, and the shift of the twist's zero; None where not determined."""
         all_coefficients = _solve(information.sum(axis=0), right.sum(axis=0))
         if all_coefficients is None:
@@ -210,7 +206,7 @@ class Window:
             error = math.sqrt((BLOCKS - 1) / BLOCKS * float(((jackknife_values - jackknife_values.mean()) ** 2).sum()))
             if not (math.isfinite(number) and math.isfinite(error)):
                 return None
-            numbers[name] = Number(number, error)
+            numbers[name] = Quantity(number, error)
         return numbers if numbers["stiffness"].value > 0.0 else None
 
     def _name_coefficients(self, side: str, law: AbstractTransmission, theta: np.ndarray) -> dict[str, float]:
@@ -221,7 +217,7 @@ class Window:
         return law_numbers | {"coulomb": coulomb, "viscous": nominal + viscous, "zero": zero}
 
 
-def _place_numbers(law: AbstractTransmission, numbers: dict[str, Number]) -> AbstractTransmission:
+def _place_numbers(law: AbstractTransmission, numbers: dict[str, Quantity]) -> AbstractTransmission:
     """Place estimated numbers into the law; a negative gap becomes zero."""
     fields = {field.name for field in dataclasses.fields(law)}
     values = {name: number.value for name, number in numbers.items() if name in fields}

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
 from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
@@ -63,24 +64,6 @@ SIZE_NAMES = {
 """Term -> its linear number, by which it is multiplied."""
 
 
-class Number(NamedTuple):
-    """A number with its standard error and 95 % interval; `unit` is that of a rotary or a linear axis."""
-
-    value: float
-    error: float
-    interval: tuple[float, float]
-    unit: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the number as result files hold it."""
-        return {
-            "value": self.value,
-            "standard_error": self.error,
-            "interval": list(self.interval),
-            "unit": self.unit,
-        }
-
-
 @dataclass(frozen=True)
 class Element:
     """Model of a transmission, fitted to torque over displacement.
@@ -99,7 +82,7 @@ class Element:
         shapes, sizes: nonlinear and linear numbers as the model uses them.
     """
 
-    numbers: dict[str, Number]
+    numbers: dict[str, Quantity]
     open: tuple[str, ...]
     gains: dict[str, float]
     terms: tuple[str, ...]
@@ -462,7 +445,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
             if not error < _MAX_RELATIVE_ERROR * abs(value):
                 open_.append(name)
         unit = on_a_line(_UNITS[name]) if linear else _UNITS[name]
-        numbers[name] = Number(value, error, (low, high), unit)
+        numbers[name] = Quantity(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_torque(model)
     reversals = len(rig.stretches) - sum(rig.begins)

@@ -183,9 +183,8 @@ def _judge_element(element: Element | None) -> tuple[Identifiability, ...]:
                 Identifiability(quantity, "no", "does not predict the torque better on parts of the log that are left out")
             )
             continue
-        low, high = number.interval
-        unit = f" {number.unit}" if number.unit else ""
-        text = f"{key} = {number.value:.4g} ± {number.error:.2g}{unit}, 95 %: {low:.4g} to {high:.4g}"
+        low, high = number.ends()
+        text = f"{key} = {number}, 95 %: {low:.4g} to {high:.4g}"
         judgements.append(Identifiability(quantity, "weak" if key in element.open else "yes", text))
     return tuple(judgements)
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxbl.quantity import Quantity
+
 from .least_squares import column_rms, fit_with_jackknife, rms
 from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, low_pass_motion, trim_filter_ends
 
@@ -43,15 +45,10 @@ class RigidFit:
     slowing: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry of `inspection.json`; an infinite inflation is null."""
+        """Return the entry of `inspection.json`."""
         columns = (x.tolist() for x in (self.values, self.errors, self.inflation, self.shares))
         terms = {
-            name: {
-                "value": value,
-                "standard_error": error,
-                "inflation": inflation if np.isfinite(inflation) else None,
-                "share": share,
-            }
+            name: Quantity(value, error).to_dict() | {"inflation": inflation, "share": share}
             for name, value, error, inflation, share in zip(self.names, *columns, strict=True)
         }
         return {"terms": terms, "residual": self.residual}

@@ -11,6 +11,7 @@ from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines
+from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import (
@@ -33,7 +34,7 @@ from .figures import (
     write_inside,
 )
 from .motor_alone_figures import draw_motor_alone
-from .numbers import format_number, lead_with_doubt, percent, write_fit
+from .numbers import lead_with_doubt, number_table, percent, write_fit
 from .residuals import draw_residuals, plot_torque
 
 _BEFORE, _AFTER = VERMILION, BLUE
@@ -75,8 +76,8 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
             )
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: finding["confidence"])
-        leaf, number = next(iter(finding["parameters"].items()))
-        figures.append(KeyFigure(format_number(number), f"{finding['effect']}: {leaf}"))
+        leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
+        figures.append(KeyFigure(str(number), f"{finding['effect']}: {leaf}"))
         figures.append(KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"))
     return figures
 
@@ -85,13 +86,13 @@ def _reasons(summary: JsonObject) -> Lines:
     """Say what stands against the answer, and what each effect is like."""
     doubts, lines = [], []
     for finding in summary["findings"]:
-        numbers, others = finding["parameters"], finding["alternatives"]
-        gain = 1.0 + numbers["relative"]["value"] if "relative" in numbers else 1.0
+        numbers, others = read_quantities(finding["parameters"]), finding["alternatives"]
+        gain = 1.0 + numbers["relative"].value if "relative" in numbers else 1.0
         if not 1.0 / _FAR < gain < _FAR:
             doubts.append(
                 f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
             )
-        texts = ", ".join(f"{leaf} = {format_number(number)}" for leaf, number in numbers.items())
+        texts = ", ".join(f"{leaf} = {number}" for leaf, number in numbers.items())
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
             f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}."
@@ -107,8 +108,7 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
     """Numbers that the logs do not agree on."""
     numbers = []
     for number in summary["contradictions"]:
-        unit = f" {number['unit']}" if number["unit"] else ""
-        values = [f"{by['value']:.3g} ± {by['standard_error']:.1g}{unit} by {by['log']}" for by in number["logs"]]
+        values = [f"{Quantity.read(by | {'unit': number['unit']})} by {by['log']}" for by in number["logs"]]
         numbers.append(f"{number['parameter']} is {' and '.join(values)}")
     sentence = (
         f"By the logs {'; '.join(numbers)}. Was the load, the controller (a feedforward that u does not contain) or a unit "
@@ -196,7 +196,7 @@ _OVER = {"position": "position", "turn": "position within a turn", "speed": "spe
 
 
 def _table_lines(summary: JsonObject) -> Lines:
-    """What tables of torques without a name add."""
+    """Say what tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
     added, gap = summary["torque_tables"], summary["gap"]
@@ -247,8 +247,8 @@ def _failed_checks(summary: JsonObject) -> Lines:
             f"({100.0 * test['level']:.0f} % test): {'; '.join(over)}."
         )
     for path, z in test["far"].items():
-        number = summary["parameters"][path]
-        change = f" by {number['value'] / number['nominal'] - 1.0:+.0%}" if number["nominal"] else ""
+        number = Quantity.read(summary["parameters"][path])
+        change = f" to {number.factor:.3g} times its nominal value" if number.nominal else ""
         lines.append(
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]; this number and the effects found may "
             "offset each other. Check the noise of u, or raise [uncertainty] relative."
@@ -338,8 +338,8 @@ def _finding_table(summary: JsonObject) -> ResultTable:
         if not is_found:
             rows.append([*lead, "", "", "", ""])
             continue
-        for leaf, number in finding["parameters"].items():
-            rows.append([*lead, leaf, number["value"], number["standard_error"] or None, number["unit"]])
+        for leaf, number in read_quantities(finding["parameters"]).items():
+            rows.append([*lead, leaf, number.value, number.standard_error or None, number.unit])
     return ResultTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)
 
 
@@ -391,9 +391,7 @@ def _limits(gap: JsonObject) -> dict[str, float | None]:
 
 
 def _number_table(summary: JsonObject) -> ResultTable:
-    keys = "nominal", "value", "standard_error", "unit"
-    rows = [[path, *(number[key] for key in keys)] for path, number in summary["parameters"].items()]
-    return ResultTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
+    return number_table("Parameters of the model", read_quantities(summary["parameters"]))
 
 
 @style()

@@ -7,10 +7,11 @@ import tomli_w
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
-from jaxbl.result import Result, ResultTable
+from jaxbl.quantity import read_quantities
+from jaxbl.result import Result
 
 from .figures import BLUE, FAINT, ORANGE, Drawn, legend, outline, stacked, style, subplots
-from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, percent, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
 
 _POINTS = 6000
 """Points of a cloud: a page is about 1000 pixels wide."""
@@ -24,13 +25,12 @@ def write_element(result: ElementIdentification, folder: Path) -> str:
 
 def describe_element(summary: JsonObject) -> Result:
     """Say how well the transmission explains the torque, and its numbers, from an `identification.json`."""
-    parameters, torque = summary["parameters"], summary["torque"]["element"]
+    numbers, torque = read_quantities(summary["parameters"]), summary["torque"]["element"]
     headline = (
         f"{' and '.join(summary['method']['element']['terms'])} explain the torque but for {_size(torque, torque['unit'])}."
     )
-    rows = [[*number_row(path, number), number["unit"]] for path, number in parameters.items()]
-    tables = [ResultTable("Numbers", [*NUMBER_COLUMNS, "unit"], rows)]
-    figures, remarks = number_figures(parameters), [*summary["warnings"], *_remarks(summary)]
+    tables = [number_table("Numbers", numbers)]
+    figures, remarks = number_figures(numbers), [*summary["warnings"], *_remarks(summary)]
     return lead_with_doubt(Result(summary["title"], "good", headline, figures, remarks, summary["notes"], tables))
 
 

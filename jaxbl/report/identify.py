@@ -1,15 +1,17 @@
 """What `jaxbl identify` leaves to be read: numbers with intervals, and what the log shows of motion, torque and gap."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.search import is_noise
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines
+from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .figures import SIDES
-from .numbers import NUMBER_COLUMNS, lead_with_doubt, number_figures, number_row, percent, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
 
 
 def write_identification(result: Identification, folder: Path) -> str:
@@ -19,10 +21,8 @@ def write_identification(result: Identification, folder: Path) -> str:
 
 def describe_identification(summary: JsonObject) -> Result:
     """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
-    method, parameters = summary["method"], summary["parameters"]
-    numbers = {
-        path: number for path, number in parameters.items() if None not in (number["value"], number["standard_error"])
-    }
+    method, parameters = summary["method"], read_quantities(summary["parameters"])
+    numbers = {path: number for path, number in parameters.items() if number.is_finite}
     complete = all(is_complete for is_complete, _ in _residuals(summary))
     size = "; ".join(f"{side}: {_size(residual)}" for side, residual in summary["residual"].items())
     verdict, headline = "good", f"The model explains the log: no more than noise is left of the positions ({size})."
@@ -30,7 +30,7 @@ def describe_identification(summary: JsonObject) -> Result:
         verdict, headline = "no answer", "This log identifies none of the model's numbers."
     elif not complete:
         verdict, headline = "doubtful", f"The model does not explain the log: more than noise is left ({size})."
-    tables = [_parameter_table(summary)]
+    tables = [_parameter_table(summary, parameters)]
     if "regression" in method:
         tables.append(_regression_table(method["regression"]))
     if method["recursive"]:
@@ -51,15 +51,13 @@ _FAR = 10.0
 know them within a factor of two."""
 
 
-def _far_off(parameters: JsonObject) -> Lines:
+def _far_off(parameters: Mapping[str, Quantity]) -> Lines:
     """Say which inertias and stiffnesses cannot be what was given."""
-    far = []
-    for path, number in parameters.items():
-        nominal, value = number.get("nominal"), number["value"]
-        if path.endswith(("inertia", ".stiffness")) and nominal and value is not None:
-            ratio = value / nominal
-            if not 1.0 / _FAR < ratio < _FAR:
-                far.append(f"{path} is {ratio:.3g} times its nominal value")
+    far = [
+        f"{path} is {number.factor:.3g} times its nominal value"
+        for path, number in parameters.items()
+        if path.endswith(("inertia", ".stiffness")) and (number.factor <= 1.0 / _FAR or number.factor >= _FAR)
+    ]
     return [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
 
 
@@ -153,17 +151,17 @@ def _on_holdout(holdout: JsonObject) -> Lines:
     return lines
 
 
-def _parameter_table(summary: JsonObject) -> ResultTable:
-    parameters, columns, rows = summary["parameters"], [*NUMBER_COLUMNS, "unit", "nominal"], []
+def _parameter_table(summary: JsonObject, parameters: Mapping[str, Quantity]) -> ResultTable:
     title = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
-    has_profile = any("profile_interval" in number for number in parameters.values())
-    for path, number in parameters.items():
-        profile = number.get("profile_interval", [None, None]) if has_profile else []
-        rows.append([*number_row(path, number), number.get("unit", ""), number.get("nominal"), *profile])
-    return ResultTable(title, columns + ["by profile from", "to"] * has_profile, rows)
+    table = number_table(title, parameters)
+    profiles = [number.get("profile_interval") for number in summary["parameters"].values()]
+    if not any(profiles):
+        return table
+    rows = [[*row, *(profile or (None, None))] for row, profile in zip(table.rows, profiles, strict=True)]
+    return ResultTable(title, [*table.columns, "by profile from", "to"], rows)
 
 
 def _regression_table(regression: JsonObject) -> ResultTable:
     motion = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
     title = f"Least squares on the equations of motion, {motion}, up to {regression['bandwidth']:.3g} Hz"
-    return ResultTable(title, NUMBER_COLUMNS, [number_row(*item) for item in regression["parameters"].items()])
+    return number_table(title, read_quantities(regression["parameters"]))

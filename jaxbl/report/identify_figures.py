@@ -11,7 +11,7 @@ from matplotlib.colors import ListedColormap, LogNorm
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.identify import Identification
-from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 
 from .figures import (
     BLACK,
@@ -78,40 +78,26 @@ def _finish(ax: Axes, label: str, ends: Pair | None, columns: int = 1) -> None:
     legend(ax, columns)
 
 
-def _with_error(value: float, error: float, unit: str) -> str:
-    """A value to the digits that its error leaves, the error, and its share."""
-    digits, share = 4, ""
-    if value and error and np.isfinite(error):
-        digits = int(np.clip(np.ceil(np.log10(abs(value) / error)) + 1, 1, 9))
-        share = f" ({percent(error / abs(value))})"
-    width = f" ± {error:.1g}" if error else ""
-    return f"{value:.{digits}g}{width}{f' {unit}' if unit else ''}{share}"
-
-
-def _reach(number: JsonObject) -> list[float]:
-    """The interval of a number; the number itself where there is none."""
-    return [number["value"] if end is None else end for end in number["interval"]]
-
-
 def _intervals(result: Identification) -> Drawn:
     fitted = {
-        path: number
-        for path, number in result.summary["parameters"].items()
-        if None not in (number.get("nominal"), number["value"], number["standard_error"])
+        path: (number, nominal)
+        for path, number in result.parameters.items()
+        if (nominal := number.nominal) is not None and number.is_finite
     }
     names = list(dict.fromkeys([*fitted, *result.summary["held"]]))
     figure, (ax,) = subplots(9.0, 1.1 + 0.4 * len(names))
     beside: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
     inside = [0.0]
-    for i, number in enumerate(fitted.values()):
-        value, nominal, (low, high) = number["value"], number["nominal"], _reach(number)
+    for i, (number, nominal) in enumerate(fitted.values()):
+        value, (low, high) = number.value, number.ends()
         half, size = 0.5 * abs(high - low), abs(nominal) or abs(value) or 1.0
         low, middle, high = (100.0 * (end - nominal) / size for end in (low, value, high))
         ax.plot([low, high], [i, i], color=BLUE, lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=BLUE, ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=BLUE, ms=5)
         inside += [max(low, middle - 100.0), min(high, middle + 100.0)]
-        ax.annotate(_with_error(value, half, number.get("unit", "")), (1.01, i), **beside)
+        text = f"{Quantity(value, half, unit=number.unit)} ({percent(half / (abs(value) or 1.0))})"
+        ax.annotate(text, (1.01, i), **beside)
     for i in range(len(fitted), len(names)):
         ax.plot(0.0, i, "o", mfc="white", mec=FAINT, ms=6)
         ax.annotate("held at nominal: not seen in this log", (1.01, i), color="#555555", **beside)
@@ -373,13 +359,13 @@ def _path(log: LogSignals) -> Drawn:
             _draw(ax, log, values, log.observed, color=SIDE_COLOURS[side], label=f"recursive, {side} side")
             ends.append(values[late])
         path = f"transmission.{name}"
-        fitted = result.summary["parameters"].get(path)
+        fitted = result.parameters.get(path)
         if fitted is not None:
-            interval = _reach(fitted)
+            interval = fitted.ends()
             ax.axhspan(*interval, color=_MODEL, alpha=0.15, lw=0.0)
-            ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
+            ax.axhline(fitted.value, color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
             ends.append(np.array(interval))
-            lines.append(fitted["value"])
+            lines.append(fitted.value)
         label = with_unit(name.replace("_", " "), result.record.unit_of(path, units.get(name, "rad")))
         ax.set(ylabel=label, ylim=limits(*ends, share=0.02, room=0.25, shown=lines))
     legend(axes[0], 3, of=axes)

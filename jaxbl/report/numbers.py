@@ -1,15 +1,17 @@
 """Numbers that were found in a log: as key figures, as rows of a table, and as files."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
 import tomli_w
 
-from jaxbl.files import json_with_checksum, write_atomic
-from jaxbl.json_types import JsonObject
+from jaxbl.files import json_with_checksum, to_jsonable, write_atomic
 from jaxbl.lines import DOUBT, doubts_among
-from jaxbl.result import KeyFigure, Result
+from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
+from jaxbl.result import KeyFigure, Result, ResultTable
 
 if TYPE_CHECKING:
     from jaxbl.diagnosis.diagnose import Diagnosis
@@ -18,30 +20,24 @@ if TYPE_CHECKING:
 
 _FIGURES = 4
 """Numbers at the head of a page; its table has all."""
-NUMBER_COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
 
 
-def number_figures(numbers: JsonObject) -> list[KeyFigure]:
+def number_figures(numbers: Mapping[str, Quantity]) -> list[KeyFigure]:
     """Key figures of numbers by path: those of the transmission first, as they are asked for most."""
     first = sorted(numbers, key=lambda path: not path.startswith("transmission."))[:_FIGURES]
-    return [KeyFigure(format_number(numbers[path]), path) for path in first]
+    return [KeyFigure(str(numbers[path]), path) for path in first]
 
 
-def format_number(number: JsonObject) -> str:
-    """A number with its standard error and unit."""
-    unit = f" {number['unit']}" if number.get("unit") else ""
-    error = f" ± {number['standard_error']:.2g}" if number["standard_error"] else ""
-    return f"{number['value']:.5g}{error}{unit}"
+def number_table(heading: str, numbers: Mapping[str, Quantity]) -> ResultTable:
+    """Table of numbers by path, without columns that would be empty."""
+    rows = [[path, *number.row()] for path, number in numbers.items()]
+    table = pd.DataFrame(rows, columns=["path", *QUANTITY_COLUMNS]).dropna(axis=1, how="all")
+    return ResultTable(heading, list(table), to_jsonable(table.to_numpy()))
 
 
 def percent(share: float) -> str:
     """A share in text, of two digits up to 10 %."""
     return f"{100.0 * share:.2g} %" if abs(share) < 0.095 else f"{100.0 * share:.0f} %"
-
-
-def number_row(path: str, number: JsonObject) -> list[object]:
-    """Cells of a number that was found, below `NUMBER_COLUMNS`."""
-    return [path, number["value"], number["standard_error"], *number["interval"]]
 
 
 def lead_with_doubt(result: Result) -> Result:

@@ -25,7 +25,7 @@ from jaxbl.cli import app, main
 from jaxbl.errors import InputError
 from jaxbl.files import read_json
 from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch, watch_columns
-from jaxbl.monitoring.window import Number
+from jaxbl.quantity import Quantity
 
 LIMIT = 1.25 * HALF_GAP
 WINDOW = {"window": 4.0, "interval": 0.5}
@@ -164,7 +164,7 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
     )
     for motor, load, alarm, contrary in ((0.13, 0.131, True, False), (0.13, 0.09, False, True), (0.09, 0.13, False, True)):
         result = {
-            side: SimpleNamespace(numbers={"half_gap": Number(gap, 1e-3 + i * 1e-4), "stiffness": Number(60.0, 1.0)})
+            side: SimpleNamespace(numbers={"half_gap": Quantity(gap, 1e-3 + i * 1e-4), "stiffness": Quantity(60.0, 1.0)})
             for i, (side, gap) in enumerate((("motor", motor), ("load", load)))
         }
         values = watcher._judge_gap(result)

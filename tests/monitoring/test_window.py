@@ -107,14 +107,14 @@ def test_the_same_as_a_fit_by_scipy():
     for name, value in zip(("stiffness", "half_gap", "_", "coulomb", "viscous"), fit.x, strict=False):
         if name != "_":
             # the constant torque is held at zero a little, velocities are of other readings
-            assert numbers[name].value == pytest.approx(value, abs=0.1 * numbers[name].error), name
+            assert numbers[name].value == pytest.approx(value, abs=0.1 * numbers[name].standard_error), name
 
 
 def test_standard_errors_are_the_scatter():
     values = [fill_window(observer_rows(noise=0.5, seed=seed)).estimate()["motor"].numbers for seed in range(60)]
     for name in ("half_gap", "stiffness", "coulomb", "viscous"):
         scatter = np.std([numbers[name].value for numbers in values], ddof=1)
-        stated_error = np.sqrt(np.mean([numbers[name].error ** 2 for numbers in values]))
+        stated_error = np.sqrt(np.mean([numbers[name].standard_error ** 2 for numbers in values]))
         # both have errors of a tenth with 60 windows of ten blocks
         assert stated_error == pytest.approx(scatter, rel=0.35), name
 
@@ -128,7 +128,7 @@ def test_what_determines_nothing_gives_nothing():
     flank = rows | {"twist": 0.15 + 0.2 * np.abs(rows["twist"])}
     flank["motor.torque"] = filter_late(hinge_torque(flank["twist"], STIFFNESS, HALF_GAP, 0.0))
     estimate = fill_window(flank).estimate().get("motor")
-    assert estimate is None or estimate.numbers["half_gap"].error > HALF_GAP
+    assert estimate is None or estimate.numbers["half_gap"].standard_error > HALF_GAP
     infinite = rows | {"motor.torque": np.full(10_000, np.inf)}
     assert "motor" not in fill_window(infinite).estimate()
 

@@ -36,7 +36,7 @@ def test_a_gap_hysteresis_and_friction_are_told_apart():
     for name, value in truth.items():
         number = fit.numbers[name]
         # 3.5 standard errors of eleven degrees of freedom: one in two hundred
-        assert abs(number.value - value) < 3.5 * number.error, (name, number)
+        assert abs(number.value - value) < 3.5 * number.standard_error, (name, number)
         assert name == "offset" or abs(number.value / value - 1.0) < 0.05, (name, number)
     assert fit.residual == pytest.approx(0.1, rel=0.1)
     assert fit.numbers["stiffness"].unit == "N m/rad"

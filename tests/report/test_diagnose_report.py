@@ -98,11 +98,11 @@ def test_the_card_has_verdict_numbers_and_gap():
     assert result.key_figures == [
         ("0.5 → 0.0055 N m", "motor: missing torque: rms error on held-out data (noise 0.005)"),
         ("0.1 → 0.0011 rad", "motor position: rms error on held-out data (noise 0.001)"),
-        ("0.274 ± 0.0021 N m", "load.coulomb_friction: torque"),
+        ("0.274 ± 0.002 N m", "load.coulomb_friction: torque"),
         ("0.93", "confidence that it is load.coulomb_friction"),
     ]
     assert result.remarks == [
-        "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m; 12 % of the driving torque.",
+        "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.002 N m; 12 % of the driving torque.",
         "Not ruled out by this log in place of load.coulomb_friction: load.stribeck_friction (0.07).",
     ]
     lines = result.details
@@ -158,7 +158,7 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     assert describe_part(share=0.9987, remainder=True).headline == partial.format("99.9 %")
     assert describe_part(share=-0.2, remainder=True).headline == partial.format("none")
     remarks = describe_part(far={"drive.motor_inertia": -25.0}).remarks
-    far = "drive.motor_inertia had to change by -50%, 25 times its [uncertainty]; this number"
+    far = "drive.motor_inertia had to change to 0.5 times its nominal value, 25 times its [uncertainty]; this number"
     assert any(line.startswith(far) for line in remarks)
     worse = describe_part(worse=True)
     assert worse.verdict == "failed" and worse.headline.endswith("but it predicts the held-out data worse with it.")
