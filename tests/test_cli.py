@@ -399,12 +399,37 @@ def test_values_and_observers_are_changed_on_the_command_line(call, tmp_path):
     assert call("sweep", "study.toml", *changes, "--out", "map")[0] == 0
     study = tomllib.loads((tmp_path / "map" / "study.toml").read_text())
     assert study["observer"]["motor"]["lambda"] == 7.0 and study["observer"]["discretisation"] == "explicit"
-    with pytest.raises(InputError, match=r"--set observer: should be PATH=VALUE, such as observer.motor.lambda=3"):
-        call("simulate", "study.toml", "--set", "observer")
-    with pytest.raises(InputError, match=r"unknown path 'observer.motor.lamda'; .* 'observer.motor.lambda'"):
-        call("simulate", "study.toml", "--set", "observer.motor.lamda=1")
-    with pytest.raises(InputError, match=r"none.toml: no such file"):
-        call("simulate", "study.toml", "--gains", "none.toml")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "observer"], "--set observer: should be PATH=VALUE, such as observer.motor.lambda=3"),
+        (
+            ["--set", "observer.motor.lamda=1"],
+            "--set observer.motor.lamda=1: unknown path 'observer.motor.lamda'; nearest valid path: 'observer.motor.lambda'",
+        ),
+        (
+            ["--set", "run.duration=1", "--set", "observer.motor.lambda=x"],
+            "--set observer.motor.lambda=x: observer.motor.lambda: should be a valid number, not 'x'",
+        ),
+        (
+            ["--set", "observer.motor.lambda=-2"],
+            "--set observer.motor.lambda=-2: observer.motor.lambda: should be greater than or equal to 0, not -2.0",
+        ),
+        (["--gains", "none.toml"], "--gains none.toml: no such file; here are gains.toml, study.toml"),
+        (["--gains", "gains.toml"], "--gains gains.toml: observer.motor.alpha: should be a valid number, not 'much'"),
+        # of two keys that do not go together, found when the runs begin
+        (["--set", "run.sample_period=3"], "--set run.sample_period=3: "),
+    ],
+)
+@pytest.mark.parametrize("command", ["simulate", "sweep", "tune", "verify", "export"])
+def test_a_wrong_change_is_said_by_its_option_and_not_by_the_study(command, options, message, call, tmp_path):
+    write_study(tmp_path, rigid_study(axes=AXES))
+    (tmp_path / "gains.toml").write_text("[observer.motor]\nlambda = 7.0\nalpha = 'much'\n")
+    with pytest.raises(InputError) as error:
+        call(command, "study.toml", *options)
+    assert str(error.value).startswith(message)
 
 
 def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):

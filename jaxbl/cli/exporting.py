@@ -1,6 +1,6 @@
 """The command that writes code for other systems."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -30,7 +30,6 @@ def export(
         option("SIDE", "of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"),
     ] = None,
     fmi: Annotated[int | None, option("2|3", "version of an FMU [default: 3]")] = None,
-    **changes: Any,
 ) -> Outcome:
     """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator.
 
@@ -38,7 +37,7 @@ def export(
 
     Read on: docs/export.md
     """
-    study, _ = read_study(config, None, **changes)
+    study = read_study(context, config)
     folder = folder_of(config, target, out)
     with show_task(context, "exporting"):
         result = jaxbl.export(study, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)

@@ -54,9 +54,11 @@ class Outcome(NamedTuple):
             fields |= {"verdict": self.content.verdict, "found": self.content.sentences, "next": steps}
         if self.folder is not None:
             files = [file for pattern in ("*.*", "figures/*.*") for file in list_paths(self.folder, pattern)]
-            fields["folder"] = str(self.folder)
-            fields["open"] = str(self.folder / self.page) if self.page else None
-            fields["files"] = [str(file) for file in files if not file.name.startswith(".")]
+            fields |= {
+                "folder": str(self.folder),
+                "open": str(self.folder / self.page) if self.page else None,
+                "files": [str(file) for file in files if not file.name.startswith(".")],
+            }
         if self.summary is not None:
             folder = self.folder or Path()
             fields["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary
@@ -74,11 +76,8 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
         except (InputError, NoResult) as error:
             report = {"exit": 2 if isinstance(error, InputError) else 1, "error": str(error)}
             raise
-        except typer.Exit as end:
-            report = {"exit": end.exit_code, "error": "interrupted"}
-            raise
-        except KeyboardInterrupt:
-            report = {"exit": INTERRUPTED, "error": "interrupted"}
+        except (typer.Exit, KeyboardInterrupt) as end:
+            report = {"exit": getattr(end, "exit_code", INTERRUPTED), "error": "interrupted"}
             raise
         else:
             if json:
@@ -97,8 +96,13 @@ def print_outcome(command: Callable[..., Outcome]) -> Callable[..., None]:
 
 
 def with_changes(command: Callable[..., Outcome]) -> Callable[..., Outcome]:
-    """Give a command on a study the options --set and --gains, which :func:`.studies.read_study` takes."""
-    return with_options(command, command, {"changes": SetOption, "gains": GainsOption}, None)
+    """Give a command on a study the options --set and --gains, which :func:`.studies.read_study` finds in the context."""
+
+    @functools.wraps(command)
+    def run(*, changes: object, gains: object, **arguments: Any) -> Outcome:
+        return command(**arguments)
+
+    return with_options(run, command, {"changes": SetOption, "gains": GainsOption}, None)
 
 
 def with_options(

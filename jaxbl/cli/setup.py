@@ -194,7 +194,7 @@ def doctor(context: typer.Context) -> Outcome:
 
 def demo(
     context: typer.Context,
-    out: OutOption = None,
+    out: OutOption = "results/gain_map",
     backend: BackendOption = None,
 ) -> Outcome:
     """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute.
@@ -204,8 +204,7 @@ def demo(
     Read on: README.md
     """
     config = _find_shipped_study("gain_map.toml")
-    study, chosen = read_study(config, backend)
-    return compute(context, config, study, out or "results/gain_map", False, chosen, jaxbl.sweep, "sweep", after_demo)
+    return compute(context, config, read_study(context, config), jaxbl.sweep, "sweep", after_demo)
 
 
 def _find_shipped_study(name: str) -> Path:

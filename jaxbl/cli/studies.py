@@ -59,7 +59,6 @@ def simulate(
     seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0, max=2**31 - 1)] = 0,
     every: Annotated[int, option("N", "keep every N-th sample of the trace", min=1)] = 1,
     overwrite: OverwriteOption = False,
-    **changes: Any,
 ) -> Outcome:
     """Simulate a study once: trace, figures, summary.
 
@@ -70,7 +69,7 @@ def simulate(
     workers.start_jax()
     from jaxbl.sweeps.store import claim_folder
 
-    study, _ = read_study(config, None, **changes)
+    study = read_study(context, config)
     folder = folder_of(config, "run", out)
     with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
         claim_folder(folder, study, "simulate", overwrite=overwrite)
@@ -95,7 +94,6 @@ def sweep(
     share: Annotated[
         str | None, option("I/N", "compute the I-th of N shares into a folder that other processes write into, too")
     ] = None,
-    **changes: Any,
 ) -> Outcome:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep.
 
@@ -109,7 +107,7 @@ def sweep(
             "--overwrite or --verify-store, as others may be at work in the folder; choose another one with --out"
         )
     share_numbers = None if share is None else _parse_share(share)
-    study, chosen = read_study(config, backend, **changes)
+    study, chosen = read_study(context, config), context.params["backend"]
     from jaxbl.report.checks import check_figures
     from jaxbl.sweeps.points import Points
 
@@ -119,8 +117,8 @@ def sweep(
         check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
             return _estimate_cost(study, chosen)
-    run = functools.partial(jaxbl.sweep, verify_store=verify_store, scheduler=scheduler)
-    collect = functools.partial(compute, context, config, study, out, overwrite, chosen, run, "sweep", after_sweep)
+    run = functools.partial(jaxbl.sweep, verify_store=verify_store)
+    collect = functools.partial(compute, context, config, study, run, "sweep", after_sweep)
     if detach or share_numbers is not None:
         folder = folder_of(config, "map", out)
         with run_with_progress(context, config, folder) as progress:
@@ -210,7 +208,6 @@ def tune(
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
     scheduler: SchedulerOption = None,
-    **changes: Any,
 ) -> Outcome:
     """Choose the observers' gains, or their kind: gains.toml, comparison, report. Continues an interrupted search.
 
@@ -218,9 +215,7 @@ def tune(
 
     Read on: docs/tutorial.md
     """
-    study, chosen = read_study(config, backend, **changes)
-    run = functools.partial(jaxbl.tune, scheduler=scheduler)
-    return compute(context, config, study, out, overwrite, chosen, run, "tune")
+    return compute(context, config, read_study(context, config), jaxbl.tune, "tune")
 
 
 @with_changes
@@ -231,7 +226,6 @@ def verify(
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
     scheduler: SchedulerOption = None,
-    **changes: Any,
 ) -> Outcome:
     """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification.
 
@@ -239,22 +233,33 @@ def verify(
 
     Read on: docs/theory.md
     """
-    study, chosen = read_study(config, backend, **changes)
-    run = functools.partial(jaxbl.verify, scheduler=scheduler)
-    return compute(context, config, study, out, overwrite, chosen, run, "verify")
+    return compute(context, config, read_study(context, config), jaxbl.verify, "verify")
 
 
-def read_study(
-    config: Path, backend: str | None, changes: Sequence[str] | None = None, gains: Path | None = None
-) -> tuple["Config", "Backend | None"]:
-    """Read a study, with changed values and other gains, and the backend option."""
+def read_study(context: typer.Context, config: Path) -> "Config":
+    """Read a study, with the values of --set and the observers of --gains, and check --backend.
+
+    Raises:
+        InputError: one line that names the option, or the file, that is wrong.
+    """
     workers.start_jax()
     from jaxbl.config import with_values
     from jaxbl.sweeps.programs import check_backend
 
-    chosen = check_backend(backend, "--backend")
-    study = jaxbl.read_config(config if gains is None else {"include": [str(config), str(gains)]})
-    return with_values(study, dict(map(_parse_change, changes or ()))), chosen
+    options = context.params
+    check_backend(options.get("backend"), "--backend")
+    gains, changes = options.get("gains"), options.get("changes") or ()
+    try:
+        study = jaxbl.read_config(config if gains is None else {"include": [str(config), str(gains)]})
+    except InputError as error:
+        message = str(error).removeprefix("config: include: ")
+        raise InputError(f"--gains {message}" if message.startswith(f"{gains}:") else message) from None
+    values = dict(map(_parse_change, changes))
+    try:
+        return with_values(study, values)
+    except InputError as error:
+        wrong = [change for change in changes if change.partition("=")[0] in str(error)] or changes
+        raise InputError(f"--set {' --set '.join(wrong)}: {error}") from None
 
 
 def _parse_change(text: str) -> tuple[str, Any]:
@@ -283,20 +288,20 @@ def compute(
     context: typer.Context,
     config: Path,
     study: "Config",
-    out: str | None,
-    overwrite: bool,
-    backend: "Backend | None",
     run: Callable[..., Any],
     command: str,
     steps: Callable[["Result", "Config", Path], Sequence[NextStep]] = lambda *_: (),
 ) -> Outcome:
     """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took.
 
-    `steps` says what to try next, by what was found, the study and the folder.
+    Folder, --overwrite, --backend and --scheduler are those of the call. `steps` says what to try next, by what was found,
+    the study and the folder.
     """
-    folder = folder_of(config, _FOLDERS[command], out)
+    options = context.params
+    folder = folder_of(config, _FOLDERS[command], options["out"])
     with run_with_progress(context, config, folder) as progress:
-        result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
+        passed_on = {name: options[name] for name in ("overwrite", "backend", "scheduler") if name in options}
+        result = run(study, folder, progress=progress, **passed_on)
     with show_task(context, "drawing"):
         # what draws is loaded when there is something to be drawn
 
