@@ -81,7 +81,7 @@ def inspect(
             f"Proposed by jaxbl inspect --write from {log.name}. Look it through: names, units, and the drive.",
             *guesses,
         ]
-        write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
+        write_atomic(write, "".join(f"# {escape_unprintable(remark)}\n" for remark in remarks) + tomli_w.dumps(study))
         remarks = [f"{write}: a first model.", *guesses, *card.remarks]
         card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
     jaxbl.write_report(inspection, folder, card)

@@ -30,6 +30,11 @@ class Port(NamedTuple):
     dtype: np.dtype
 
 
+def describe_number(number: "Quantity | StudyNumber") -> str:
+    """Describe a number with its unit."""
+    return f"{number.description}{f', {number.unit}' if number.unit else ''}"
+
+
 class StudyNumber(NamedTuple):
     """A number of the study: its value, unit and description."""
 

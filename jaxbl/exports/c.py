@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .block import Port, Program
+from .block import Port, Program, describe_number
 from .lowering import Constant, Operation, Value, Variable, find_constants
-from .writer import Writer, find_unread_names, to_ascii, write_shortest
+from .writer import Writer, find_unread_names, write_comment, write_shortest
 
 _TYPES = {
     "float64": "double",
@@ -19,6 +19,7 @@ _TYPES = {
     "uint64": "uint64_t",
     "bool": "bool",
 }
+C_MARKS = "/*", "*/"
 _WIDTH = 110
 
 
@@ -44,17 +45,12 @@ def write_c_code(program: Program, head_lines: Sequence[str]) -> Code:
     name = program.block.name
     writer = _C(program)
     writer.write_routines()
-    head = [*write_comment(head_lines), ""]
+    head = write_comment(C_MARKS, *head_lines)
     constants = writer.define_constants(set.intersection(*writer.constants_read))
     includes = [f'#include "{name}.h"', "", *(["#include <math.h>", ""] if writer.needs_math else [])]
-    parts = [*head, *includes, *constants, "" if constants else None, *writer.write_helpers(), *writer.lines]
+    parts = [head, "", *includes, *constants, "" if constants else None, *writer.write_helpers(), *writer.lines]
     source = "\n".join(part for part in parts if part is not None)
-    return Code(to_ascii(f"{source.rstrip()}\n"), to_ascii(_write_header(program, head)))
-
-
-def write_comment(lines: Sequence[str]) -> list[str]:
-    """Write a comment of several lines."""
-    return ["/*", *(f" * {line}".rstrip().replace("*/", "* /").replace("/*", "/ *") for line in lines), " */"]
+    return Code(f"{source.rstrip()}\n", _write_header(program, head))
 
 
 def describe_constant(program: Program, constant: Constant) -> str:
@@ -62,17 +58,17 @@ def describe_constant(program: Program, constant: Constant) -> str:
     study_number = program.block.study_numbers.get(constant.formula)
     if study_number is None:
         return constant.formula.removeprefix("(").removesuffix(")") if constant.formula.startswith("(") else constant.formula
-    return f"{constant.formula}{f', {study_number.unit}' if study_number.unit else ''}: {study_number.description}"
+    return f"{constant.formula}: {describe_number(study_number)}"
 
 
-def _write_header(program: Program, head: Sequence[str]) -> str:
+def _write_header(program: Program, head: str) -> str:
     block, name = program.block, program.block.name
     guard = f"{name.upper()}_H"
     start, step = write_signatures(program)
-    head_lines = "\n".join(head)
     state = "\n".join(_write_struct(f"{name}_state", program.state or [Port("unused", "", "", np.dtype(np.int32))]))
     outputs = "\n".join(_write_struct(f"{name}_outputs", block.outputs))
-    return f"""{head_lines}
+    return f"""{head}
+
 #ifndef {guard}
 #define {guard}
 
@@ -109,12 +105,14 @@ def write_signatures(program: Program) -> tuple[str, str]:
 def _write_struct(name: str, members: Sequence[Port]) -> list[str]:
     lines = ["typedef struct", "{"]
     for member in members:
-        remark = f"{member.description}{f', {member.unit}' if member.unit else ''}"
-        lines.append(f"    {c_type(member.dtype)} {member.name};{f' /* {remark} */' if remark else ''}")
+        remark = f" {write_comment(C_MARKS, describe_number(member))}" if member.description else ""
+        lines.append(f"    {c_type(member.dtype)} {member.name};{remark}")
     return [*lines, f"}} {name};", ""]
 
 
 class _C(Writer):
+    marks = C_MARKS
+
     def __init__(self, program: Program):
         super().__init__(program)
         self.needs_math = False
@@ -171,8 +169,8 @@ class _C(Writer):
         lines = []
         for constant, name in self.constants.items():
             if constant in constants:
-                remark = describe_constant(self.program, constant)
-                lines.append(f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; /* {remark} */")
+                remark = write_comment(C_MARKS, describe_constant(self.program, constant))
+                lines.append(f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; {remark}")
         return lines
 
     def literal(self, constant):
@@ -191,9 +189,6 @@ class _C(Writer):
                 kind, str(value)
             )
         return f"({text})" if text.startswith("-") else text
-
-    def remark(self, text):
-        return f"/* {text} */"
 
     def define(self, out, text):
         self.add_lines(f"const {c_type(out.dtype)} {self.name(out)} = {text};")

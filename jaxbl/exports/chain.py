@@ -1,6 +1,6 @@
 """The chain that runs in real time beside a drive: observers, equivalent control, identifier, as one block."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,24 +18,18 @@ LAST_SAMPLE = np.iinfo(np.int32).max
 """Largest index of a sample."""
 
 
-class _ChainState(NamedTuple):
-    """State of the chain.
+class _ChainState(State):
+    """State of the chain without the plant.
 
     Attributes:
-        observer, equivalent_control, identifier: as in :class:`jaxbl.simulate.State`.
-        samples: index of the sample; it stays at the largest integer once it has reached it.
-        unsettled: samples since the identifier's sums were compensated last.
+        samples: index of the sample; from the largest integer on, that of the last block again and again.
     """
 
-    observer: Any
-    equivalent_control: Any
-    identifier: Any
     samples: Any
-    unsettled: Any
 
 
-def _make_chain_state(state: State, samples: Any, unsettled: Any) -> _ChainState:
-    return _ChainState(state.observer, state.equivalent_control, state.identifier, samples, unsettled)
+def _make_chain_state(state: State, samples: Any) -> _ChainState:
+    return _ChainState(**vars(state) | {"plant": None, "samples": samples})
 
 
 def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
@@ -58,15 +52,13 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
 
     def start(numbers: Values, inputs: Values) -> _ChainState:
         measured = {side: inputs[f"{side}_position"] for side in sides}
-        zero = jnp.zeros((), jnp.int32)
-        return _make_chain_state(initial_state(set_leaves(experiment, numbers), measured), zero, zero)
+        return _make_chain_state(initial_state(set_leaves(experiment, numbers), measured), jnp.zeros((), jnp.int32))
 
     def sample(numbers: Values, state: _ChainState, inputs: Values) -> tuple[_ChainState, Outputs]:
         lane = set_leaves(experiment, numbers)
         measured = {side: inputs[f"{side}_position"] for side in sides}
         time = state.samples.astype(dtype) * lane.run.sample_period
-        before = State(None, state.observer, state.equivalent_control, state.identifier)
-        new, signals = step(lane, before, Sample(time, input=inputs["input"], measured=measured))
+        new, signals = step(lane, state, Sample(time, input=inputs["input"], measured=measured))
         out: Outputs = {}
         for side in sides:
             estimates = signals.side(side)
@@ -86,10 +78,10 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
             }
         out |= _identified_outputs(lane, new)
         # sums lose nothing over some hundred samples
-        full = state.unsettled >= LONGEST_BLOCK - 1
+        full = jax.lax.rem(state.samples, jnp.int32(LONGEST_BLOCK)) == LONGEST_BLOCK - 1
         compensated = jax.lax.cond(full, lambda state: end_block(lane, (state, ()))[0], lambda state: state, new)
-        samples = jnp.minimum(state.samples, LAST_SAMPLE - 1) + 1
-        return _make_chain_state(compensated, samples, jnp.where(full, 0, state.unsettled + 1).astype(jnp.int32)), out
+        samples = jnp.where(state.samples == LAST_SAMPLE, LAST_SAMPLE - LONGEST_BLOCK, state.samples) + 1
+        return _make_chain_state(compensated, samples), out
 
     return trace_block(name, dtype, study_numbers, positions, [torque, *positions], start, sample)
 

@@ -3,7 +3,8 @@
 from jaxbl.records import POSITION_CHANNELS
 
 from .block import Program
-from .c import c_type, to_ascii, write_comment
+from .c import C_MARKS, c_type
+from .writer import write_comment
 
 
 def input_columns(program: Program) -> list[str]:
@@ -35,8 +36,7 @@ def write_filter_code(program: Program) -> str:
     for output in block.outputs:
         printed.append(f"outputs.{output.name} ? 1 : 0" if output.dtype == bool else f"{cast}outputs.{output.name}")
     places = {"input": "row[1]"} | {quantity.name: f"row[{2 + i}]" for i, quantity in enumerate(block.start_inputs)}
-    head = "\n".join(write_comment(remarks))
-    text = f'''{head}
+    return f'''{write_comment(C_MARKS, *remarks)}
 
 #include <stdio.h>
 #include <stdlib.h>
@@ -119,4 +119,3 @@ int main(int argc, char *argv[])
     return ((fclose(out) == 0) && (started == 1)) ? 0 : 1;
 }}
 '''
-    return to_ascii(text)

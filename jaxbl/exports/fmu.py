@@ -18,12 +18,12 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from jaxbl.config import Config
+from jaxbl.errors import escape_unprintable
 from jaxbl.sweeps.store import identity
 
 from .block import Port
 from .c import c_type, write_c_code
 from .plant import PlantProgram
-from .writer import to_ascii
 
 FMI = {2: "2.0", 3: "3.0"}
 """Versions by their numbers in options."""
@@ -270,7 +270,7 @@ def _write_description(
         "fmiVersion": FMI[fmi],
         "modelName": name,
         "guid" if fmi == 2 else "instantiationToken": token,
-        **({"description": config.title} if config.title else {}),
+        **({"description": escape_unprintable(config.title)} if config.title else {}),
         "generationTool": f"jaxbl {version('jaxbl')}",
         "variableNamingConvention": "structured",
     }
@@ -387,7 +387,7 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
     ]
     longest_name = max(len(variable.name) for variable in variables)
     row_lines, output_lines = "\n".join(rows), "\n".join(outputs)
-    return to_ascii(f"""/*
+    return f"""/*
  * Variables of {name} by value reference, and the calls of its code with them.
  */
 
@@ -454,4 +454,4 @@ static void model_sample(Model *model)
 }}
 
 #endif /* FMI_MODEL_HEADER */
-""")
+"""

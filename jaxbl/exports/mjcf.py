@@ -17,6 +17,7 @@ from jaxbl.units import on_a_line
 
 from .mujoco_parts import IMPEDANCE, RESOLUTION, Answer, MujocoParts, SideParts, Spring, exactly, unsaid
 from .to_mujoco import to_mujoco
+from .writer import separate
 
 MUJOCO = "4.0"
 """The version for which models are written."""
@@ -293,9 +294,7 @@ def _make_keyframe(experiment: Experiment, parts: MujocoParts) -> ET.Element:
 def _add_comments(parent: ET.Element, *texts: str) -> None:
     for text in texts:
         # two dashes end a comment
-        while "--" in text:
-            text = text.replace("--", "- -")
-        parent.append(ET.Comment(f" {text} "))
+        parent.append(ET.Comment(f" {separate(text, '--')} "))
 
 
 def _format_numbers(*values: Any) -> str:

@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxbl.fused import Unsupported
 
-from .block import Program
+from .block import Program, describe_number
 from .c import C_INFIX, describe_constant
 from .lowering import Constant, Operation, Value
-from .writer import Writer, to_ascii, write_shortest
+from .writer import Writer, write_comment, write_shortest
 
 _TYPES = {"float64": "LREAL", "float32": "REAL", "int32": "DINT", "uint32": "UDINT", "int64": "LINT", "uint64": "ULINT",
           "bool": "BOOL"}  # fmt: skip
@@ -26,7 +26,7 @@ def write_st_code(program: Program, head_lines: Sequence[str]) -> str:
     Raises:
         Unsupported: the program has an operation that structured text cannot express exactly.
     """
-    return to_ascii(_St(program).write_block(head_lines))
+    return _St(program).write_block(head_lines)
 
 
 def st_type(dtype: np.dtype) -> str:
@@ -35,6 +35,8 @@ def st_type(dtype: np.dtype) -> str:
 
 
 class _St(Writer):
+    marks = "(*", "*)"
+
     def __init__(self, program: Program):
         super().__init__(program)
         self._temporary: list[tuple[str, np.dtype]] = []
@@ -68,7 +70,7 @@ class _St(Writer):
         self._assign_together(program.state_variables, program.step.results[:count])
         body = self.lines
         inputs = {quantity.name: quantity for quantity in (*block.start_inputs, *block.inputs)}.values()
-        self.lines, self._depth = [f"(* {head_lines[0]}", *(f"   {line}".rstrip() for line in head_lines[1:]), "*)"], 0
+        self.lines, self._depth = [write_comment(self.marks, *head_lines)], 0
         self.add_lines(f"FUNCTION_BLOCK {block.name}")
         self._declare_variables(
             "VAR_INPUT",
@@ -77,8 +79,9 @@ class _St(Writer):
         )
         self._declare_variables("VAR_OUTPUT", [(quantity.name, quantity.dtype, quantity) for quantity in block.outputs])
         constants = [
-            f"{name}: {st_type(quantity.dtype)} := {self.literal(quantity)}; (* {describe_constant(program, quantity)} *)"
-            for quantity, name in self.constants.items()
+            f"{name}: {st_type(constant.dtype)} := {self.literal(constant)}; "
+            + write_comment(self.marks, describe_constant(program, constant))
+            for constant, name in self.constants.items()
         ]
         self._declare_variables("VAR CONSTANT", [], *constants)
         states = [(self.name(variable), variable.dtype, None) for variable in program.state_variables]
@@ -91,11 +94,7 @@ class _St(Writer):
             return
         self.add_lines(kind)
         for name, dtype, quantity in variables:
-            remark = (
-                f" (* {quantity.description}{f', {quantity.unit}' if quantity.unit else ''} *)"
-                if quantity is not None
-                else ""
-            )
+            remark = f" {write_comment(self.marks, describe_number(quantity))}" if quantity else ""
             self.add_lines(f"    {name}: {st_type(dtype)};{remark}")
         self.add_lines(*(f"    {line}" for line in more_lines), "END_VAR")
 
@@ -111,9 +110,6 @@ class _St(Writer):
         mantissa, mark, exponent = text.partition("E")
         # the standard wants a point in each real number
         return f"{kind}#{mantissa if '.' in mantissa else f'{mantissa}.0'}{mark}{exponent}"
-
-    def remark(self, text):
-        return f"(* {text} *)"
 
     def define(self, out, text):
         self.declare(out, text)

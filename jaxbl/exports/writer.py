@@ -1,11 +1,14 @@
 """From operations to text: what the languages have in common."""
 
 import abc
+import re
 from collections.abc import Sequence
 from itertools import chain, count
 from typing import Any
 
 import numpy as np
+
+from jaxbl.errors import escape_unprintable
 
 from .block import Port, Program
 from .lowering import (
@@ -28,6 +31,8 @@ class Writer(abc.ABC):
     statements contract nothing."""
 
     indent = "    "
+    marks: tuple[str, str]
+    """Those between which a comment stands."""
 
     def __init__(self, program: Program):
         self.program = program
@@ -46,10 +51,6 @@ class Writer(abc.ABC):
     @abc.abstractmethod
     def literal(self, constant: Constant) -> str:
         """Write a number."""
-
-    @abc.abstractmethod
-    def remark(self, text: str) -> str:
-        """Write a comment."""
 
     @abc.abstractmethod
     def define(self, out: Variable, text: str) -> None:
@@ -119,7 +120,7 @@ class Writer(abc.ABC):
             file = statement.source.partition(":")[0]
             if file and file != self._source:
                 self._source = file
-                self.add_lines(self.remark(_shorten_source(statement.source)))
+                self.add_lines(write_comment(self.marks, _shorten_source(statement.source)))
             if isinstance(statement, Operation):
                 self.write_operation(statement)
             elif isinstance(statement, Repeat):
@@ -187,11 +188,28 @@ def write_shortest(value: Any) -> str:
     return text if any(mark in text for mark in ".en") else f"{text}.0"
 
 
-_LETTERS = {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho"}
+_LETTERS = {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho", "\\": "/"}
+
+
+_COMMENT_MARKS = "*/", "/*", "(*", "*)", "??"
+"""Pairs of letters that begin or end a comment; two question marks begin a trigraph of C."""
+
+
+def separate(text: str, *pairs: str) -> str:
+    """Write text of any origin as one printable line, with a blank within each of these pairs of letters."""
+    pattern = "|".join(f"{re.escape(first)}(?={re.escape(second)})" for first, second in pairs)
+    return re.sub(pattern, r"\g<0> ", escape_unprintable(text))
+
+
+def write_comment(marks: tuple[str, str], *lines: str) -> str:
+    """Write a comment between its marks. No line of it ends the comment, or is joined with the next one."""
+    begin, end = marks
+    texts = (f"   {separate(to_ascii(line), *_COMMENT_MARKS)}".rstrip() for line in lines)
+    return f"{begin}{chr(10).join(texts)[2:]} {end}"
 
 
 def to_ascii(text: str) -> str:
-    """Replace the letters that not every compiler reads."""
+    """Replace the letters that not every compiler reads, and the one that joins lines."""
     for letter, other in _LETTERS.items():
         text = text.replace(letter, other)
     return text.encode("ascii", "replace").decode()
