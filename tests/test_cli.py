@@ -673,7 +673,7 @@ def test_inspect_writes_a_first_model(call, tmp_path):
     with pytest.raises(InputError, match=r"axis.toml: is there already; --write needs a new name"):
         call("inspect", "axis.csv", "--write", "axis.toml")
     # a name of a log is no line of the model
-    os.rename("axis.csv", "axis\nseed = 7\n.csv")
+    Path("axis.csv").rename("axis\nseed = 7\n.csv")
     assert call("inspect", "axis\nseed = 7\n.csv", "--write", "again.toml", "--out", "named")[0] == 0
     assert "seed" not in tomllib.loads((tmp_path / "again.toml").read_text())
 

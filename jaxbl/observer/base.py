@@ -93,7 +93,6 @@ class AbstractObserver(eqx.Module):
             config_key(field.name): float(getattr(self, field.name)) for field, _ in parameters(self) if not field.kw_only
         }
 
-    @abc.abstractmethod
     def start(self, position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar) -> ObserverState:
         """Return the state before the first sample.
 
@@ -102,6 +101,7 @@ class AbstractObserver(eqx.Module):
             acceleration: nominal acceleration without input.
             period: sampling period, s.
         """
+        return ObserverState(position, velocity)
 
     @abc.abstractmethod
     def step(

@@ -111,8 +111,7 @@ def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """
     log_ratio = _log_peak_ratio(lambda_, alpha, f_plus)
     overdamped = lambda_**2 >= 8.0 * (alpha + f_plus)
-    ratio = jnp.where(overdamped, 0.0, jnp.exp(jnp.where(overdamped, 0.0, log_ratio)))
-    return _infinite_unless_above(alpha, f_plus, ratio)
+    return _infinite_unless_above(alpha, f_plus, jnp.exp(jnp.where(overdamped, -jnp.inf, log_ratio)))
 
 
 def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
@@ -258,9 +257,8 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     l2 changes sign at most once. By homogeneity it switches on a ray. The ray with the largest time to the origin is found
     by a search on grids, each eight times finer than the one before.
     """
-    shape = jnp.broadcast_shapes(jnp.shape(lambda_), jnp.shape(alpha), jnp.shape(f_plus))
-    dtype = jnp.result_type(lambda_, alpha, f_plus, float)
-    lambda_, alpha, f_plus = (jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (lambda_, alpha, f_plus))
+    lambda_, alpha, f_plus = jnp.broadcast_arrays(*(x + 0.0 for x in (lambda_, alpha, f_plus)))
+    dtype = lambda_.dtype
     c1 = 2.0 * _safe_excess(alpha, f_plus)
     lowest = _lowest_ray(lambda_, c1)
     real = jnp.isfinite(lowest)
@@ -288,7 +286,7 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
         step = (high - low) / (_GRID_RAYS - 1)
         return (jnp.maximum(share - step, 0.0), jnp.minimum(share + step, 1.0)), share
 
-    ends = jnp.zeros(shape, dtype), jnp.ones(shape, dtype)
+    ends = jnp.zeros_like(lambda_), jnp.ones_like(lambda_)
     _, slowest_shares = jax.lax.scan(zoom, ends, length=_GRID_ROUNDS)
     # rounding must not decide between the root's ray and a ray close to it, nor between an x1 below exp(-9) and zero
     share = slowest_shares[-1]

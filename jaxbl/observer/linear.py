@@ -195,12 +195,12 @@ def _solve_riccati(transposed: Matrix, q: Matrix) -> Matrix:
         q: covariance of the process noise over a period.
     """
     zero = 0.0 * q[0][0]
-    g = [[zero + 1.0, zero, zero], [zero, zero, zero], [zero, zero, zero]]
+    g = _unit_diagonal(zero, 1)
 
     def double(_: Any, carry: tuple[Matrix, Matrix, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
         # b is the transposed transition over 2^k samples
         b, g, p = carry
-        inverse = _invert(_add(_identity(zero), _multiply(g, p)))
+        inverse = _invert(_add(_unit_diagonal(zero, 3), _multiply(g, p)))
         b_transposed, b_inverse = _transpose(b), _multiply(b, inverse)
         return (
             _multiply(b_inverse, b),
@@ -211,8 +211,8 @@ def _solve_riccati(transposed: Matrix, q: Matrix) -> Matrix:
     return jax.lax.fori_loop(0, _DOUBLINGS, double, (transposed, g, q))[2]
 
 
-def _identity(zero: Any) -> Matrix:
-    return [[zero + float(i == j) for j in range(3)] for i in range(3)]
+def _unit_diagonal(zero: Any, size: int) -> Matrix:
+    return [[zero + float(i == j < size) for j in range(3)] for i in range(3)]
 
 
 def _multiply(a: Matrix, b: Matrix) -> Matrix:

@@ -55,12 +55,19 @@ class IdentifierState(NamedTuple):
         information: upper triangle of the information matrix, n (n + 1) / 2 sums.
         right: n sums for each side.
         weight: the part of settled totals that forgetting has left.
+        most: largest determinant of the information matrix so far.
     """
 
     regressors: tuple[Number, ...]
     information: tuple[RunningSum, ...]
     right: dict[str, tuple[RunningSum, ...]]
     weight: Number
+    most: Number
+
+
+REMAINING = 0.01
+"""Least share of the most information that has to remain, for each unknown: that of a motion a tenth as large. Where
+forgetting has left less, as in a standstill, the numbers are those of noise."""
 
 
 class Identifier(eqx.Module):
@@ -76,12 +83,8 @@ class Identifier(eqx.Module):
         """Return the state without samples; `zero` has the dtype."""
         n = len(law.regressors(zero))
         empty = RunningSum(zero, zero, zero)
-        return IdentifierState(
-            regressors=(zero,) * n,
-            information=(empty,) * (n * (n + 1) // 2),
-            right=dict.fromkeys(sides, (empty,) * n),
-            weight=jnp.ones_like(zero),
-        )
+        moments = dict.fromkeys(sides, (empty,) * n)
+        return IdentifierState((zero,) * n, (empty,) * (n * (n + 1) // 2), moments, jnp.ones_like(zero), zero)
 
     def step(
         self,
@@ -111,17 +114,15 @@ class Identifier(eqx.Module):
         # half a period of slack, as time is a rounded multiple of the period
         counts = (time > self.start - 0.5 * step).astype(z.dtype)
         weighted = tuple(counts * p for p in phi)
+
         # forgetting needs no start time: before it the sums are zero
-        n = len(raw)
-        pairs = [(i, j) for i in range(n) for j in range(i, n)]
-        information = tuple(
-            total.add(self.forgetting, weighted[i] * phi[j]) for total, (i, j) in zip(state.information, pairs, strict=True)
-        )
-        moments = {
-            side: tuple(total.add(self.forgetting, p * torque[side]) for total, p in zip(totals, weighted, strict=True))
-            for side, totals in state.right.items()
-        }
-        return IdentifierState(filtered, information, moments, self.forgetting * state.weight)
+        def add_terms(sums: tuple[RunningSum, ...], *terms: Number) -> tuple[RunningSum, ...]:
+            return tuple(total.add(self.forgetting, term) for total, term in zip(sums, terms, strict=True))
+
+        information = add_terms(state.information, *(p * q for i, p in enumerate(weighted) for q in phi[i:]))
+        moments = {side: add_terms(sums, *(p * torque[side] for p in weighted)) for side, sums in state.right.items()}
+        new = IdentifierState(filtered, information, moments, self.forgetting * state.weight, state.most)
+        return new._replace(most=jnp.maximum(state.most, _determinant(_sum_values(new, information))))
 
     def settle(self, state: IdentifierState) -> IdentifierState:
         """Settle all sums, so that further samples lose no digits; :func:`jaxbl.simulate.scan` does so block by block."""
@@ -130,7 +131,7 @@ class Identifier(eqx.Module):
             (state.information, state.right),
             is_leaf=lambda node: isinstance(node, RunningSum),
         )
-        return IdentifierState(state.regressors, information, moments, weight=jnp.ones_like(state.weight))
+        return state._replace(information=information, right=moments, weight=jnp.ones_like(state.weight))
 
     def estimate(self, state: IdentifierState, law: AbstractTransmission) -> dict[str, dict[str, Number]]:
         """Parameters of the law, as each side identifies them, e.g. `{"motor": {"stiffness": ..., "half_gap": ...}, ...}`.
@@ -145,40 +146,47 @@ class Identifier(eqx.Module):
     def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
         """Return for each side if the excitation determines the coefficients theta, and theta, which is always finite."""
         information = _sum_values(state, state.information)
+        remains = _determinant(information) > REMAINING ** len(state.regressors) * state.most
         return {
-            side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.right.items()
+            side: _solve_normal_equations(information, _sum_values(state, sums), remains)
+            for side, sums in state.right.items()
         }
 
     def excitation(self, state: IdentifierState) -> Number:
         """Smallest eigenvalue of the information matrix, scaled to unit diagonal: 0 is undetermined, 1 is orthogonal."""
-        information = _sum_values(state, state.information)
-        if len(information) == 1:
-            return (information[0] > 0.0).astype(information[0].dtype)
-        return 1.0 - jnp.abs(_regressor_correlation(information))
+        return 1.0 - jnp.abs(_regressor_correlation(_sum_values(state, state.information)))
 
 
 def _sum_values(state: IdentifierState, sums: tuple[RunningSum, ...]) -> tuple[Number, ...]:
     return tuple(total.value(state.weight) for total in sums)
 
 
+def _determinant(information: tuple[Number, ...]) -> Number:
+    return information[0] if len(information) == 1 else information[0] * information[2] - information[1] ** 2
+
+
 def _regressor_correlation(information: tuple[Number, ...]) -> Number:
+    """Correlation of two regressors; of one, 0. It is 1 where there is no information."""
+    if len(information) == 1:
+        return 1.0 - jnp.sign(information[0])
     first, product, second = information
     size = jnp.sqrt(first) * jnp.sqrt(second)
     return jnp.where(size > 0.0, product / jnp.where(size > 0.0, size, 1.0), 1.0)
 
 
 def _solve_normal_equations(
-    information: tuple[Number, ...], moments: tuple[Number, ...]
+    information: tuple[Number, ...], moments: tuple[Number, ...], remains: Number
 ) -> tuple[Number, tuple[Number, ...]]:
-    """True if the scaled normal equations for n = 1 or 2 have one solution, and the solution; elementwise over lanes."""
+    """True if the scaled normal equations for n = 1 or 2 have one solution, and the solution; elementwise over lanes.
+
+    `remains` is False where forgetting has left too little information.
+    """
     if len(moments) == 1:
-        total = information[0]
-        determined = total > 0.0
-        return determined, (moments[0] / jnp.where(determined, total, 1.0),)
+        return remains, (moments[0] / jnp.where(remains, information[0], 1.0),)
     first, second = jnp.sqrt(information[0]), jnp.sqrt(information[2])
     correlation = _regressor_correlation(information)
     determinant = 1.0 - correlation * correlation
-    determined = determinant > 4.0 * jnp.finfo(determinant.dtype).eps
+    determined = remains & (determinant > 4.0 * jnp.finfo(determinant.dtype).eps)
     first, second, determinant = (jnp.where(determined, x, 1.0) for x in (first, second, determinant))
     a, b = moments[0] / first, moments[1] / second
     return determined, ((a - correlation * b) / (determinant * first), (b - correlation * a) / (determinant * second))

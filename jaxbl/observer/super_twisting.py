@@ -34,9 +34,6 @@ class AbstractSuperTwisting(AbstractObserver):
         # with alpha below f_plus the observer does not follow every disturbance exactly, but may have less noise
         return {"lambda": (0.01 * root, 1e3 * root), "alpha": (0.01 * conditions.f_plus, 1e3 * conditions.f_plus)}
 
-    def start(self, position, velocity, acceleration, period):
-        return ObserverState(position, velocity)
-
 
 OBSERVERS.add(AbstractSuperTwisting)
 

@@ -92,6 +92,21 @@ def test_many_steps_are_the_traced_step_bit_for_bit(exported_code, repeats):
 
 
 @pytest.mark.program("gcc")
+@pytest.mark.program("gcc")
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_nothing_is_identified_after_a_standstill(tmp_path, precision):
+    data = study() | {"identifier": {"forgetting": 0.99}}
+    inputs = draw_samples(4000, 2)
+    inputs[2000:] = inputs[2000] * [0.0, 1.0, 1.0] + 1e-5 * np.random.default_rng(3).standard_normal((2000, 3))
+    native = export_native(tmp_path, data, precision)
+    outputs = run_native(native, inputs)
+    assert (to_integers(outputs[-1]) == to_integers(run_strict(data, precision, inputs)[-1])).all()
+    columns = dict(zip((output["name"] for output in native.summary["outputs"]), outputs.T, strict=True))
+    for side in ("motor", "load"):
+        assert columns[f"{side}_identified"][1999] and columns[f"{side}_stiffness"][1999]
+        assert not columns[f"{side}_identified"][-1] and not columns[f"{side}_stiffness"][-1]
+
+
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("law", ["sigmoid_backlash", "dead_zone", "linear_shaft", None])
 def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):

@@ -203,3 +203,40 @@ def test_excitation_is_the_least_eigenvalue_of_the_normalised_matrix():
     np.testing.assert_allclose(excitation, np.linalg.eigvalsh(information * np.outer(scale, scale))[0], rtol=1e-9)
     _, _, single = identify(Identifier(), LinearShaft(1.0), z, torques)
     assert single == 1.0
+
+
+def stiffness_after(law, standstill, at, noise, dtype, forgetting, resumed=0):
+    """Stiffness identified after 4 s of motion, `standstill` samples at one twist, and `resumed` ones of motion."""
+    random = np.random.default_rng(7)
+    motion = 0.3 * np.sin(2.0 * np.pi * 3.0 * H * np.arange(4000))
+    z = np.concatenate([motion, np.full(standstill, at), motion[:resumed]])
+    torque = np.asarray(law.torque(law.deflection(jnp.asarray(z)))) + 1e2 * noise * random.normal(size=z.size)
+    readings = z + noise * random.normal(size=z.size)
+    identifier = Identifier(0.0, forgetting, "none")
+    return float(identify(identifier, law, readings, {"motor": torque}, dtype=dtype, block=500)[1]["motor"]["stiffness"])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+def test_after_a_standstill_there_are_no_numbers_or_good_ones(law, dtype, repeats):
+    random = np.random.default_rng(8)
+    for _ in range(repeats(3, 100)):
+        # standstills of a tenth to thirty times the memory
+        standstill = int(random.choice([2_000, 20_000]))
+        memory = standstill / 10.0 ** random.uniform(-1.0, 1.5)
+        case = random.choice([0.0, 0.02, 0.2]), 10.0 ** random.uniform(-5.0, -4.0), dtype, 1.0 - 1.0 / max(memory, 300.0)
+        before, after = stiffness_after(law, 0, *case), stiffness_after(law, standstill, *case)
+        again = stiffness_after(law, standstill, *case, resumed=2000)
+        assert np.isnan(after) or abs(after / before - 1.0) < 0.5, (standstill, case, after)
+        assert abs(again / before - 1.0) < 0.3, (standstill, case)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+def test_a_standstill_takes_nothing_away_that_is_not_forgotten(law):
+    before, after = (stiffness_after(law, standstill, 0.0, 1e-4, jnp.float64, 1.0) for standstill in (0, 20_000))
+    assert abs(after / before - 1.0) < 0.01
+
+
+@pytest.mark.parametrize("at", [0.0, 0.02, 0.2])
+def test_a_long_standstill_leaves_no_numbers_of_two_unknowns(at):
+    assert np.isnan(stiffness_after(SIGMOID, 20_000, at, 1e-4, jnp.float64, 0.999))
