@@ -100,9 +100,9 @@ def _check_cache() -> Finding:
 def _check_results_folder(folder: Path) -> Finding:
     """Check the folder for results."""
     where = folder.absolute()
-    if os.access(where, os.W_OK):
-        return Finding("results", f"{where / 'results'}")
-    return Finding("results", f"{where} cannot be written to; go to another folder, or give --out", False)
+    good = os.access(where, os.W_OK)
+    fault = f"{where} cannot be written to; go to another folder, or give --out"
+    return Finding("results", f"{where / 'results'}" if good else fault, good)
 
 
 _GAINS = {"lambda": 4.0, "alpha": 9.0}

@@ -136,7 +136,7 @@ class SideSignals(NamedTuple):
     """Signals of one side at one sample.
 
     Attributes:
-        measured: reading of the encoder, rad.
+        measured: reading of the encoder, rad; NaN where a simulated one is missed.
         position_estimate: rad.
         velocity_estimate: rad/s.
         equivalent_control: filtered equivalent control (15), rad/s^2.
@@ -171,7 +171,7 @@ class Signals(NamedTuple):
     load: SideSignals | None
 
     def side(self, side: str) -> SideSignals:
-        return self.motor if side == "motor" else self.load  # type: ignore[return-value]
+        return getattr(self, side)
 
 
 def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
@@ -221,16 +221,21 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     if sample.noise is None:
         measured, after = sample.measured or {}, None
     else:
-        noise = {side: draw.astype(jnp.result_type(period)) for side, draw in sample.noise.items()}
         measured = {
             side: experiment.encoders.measure(
-                side, plant.read(side, before.position[side], before.velocity[side]), noise[side], drive.ratio(side)
+                side, plant.read(side, before.position[side], before.velocity[side]), sample.noise[side], drive.ratio(side)
             )
             for side in drive.sides
         }
         after = move_plant(plant, experiment.run, before, torque_in, sample.time)
 
-    observers, filtered, estimates = {}, {}, {}
+    missed, readings = {}, measured
+    if sample.noise is None or experiment.encoders.missed is not None:
+        missed = {side: ~jnp.isfinite(reading + torque_in) for side, reading in measured.items()}
+        readings = {side: jnp.where(lost, state.observer[side].position, measured[side]) for side, lost in missed.items()}
+        torque_in = jnp.where(jnp.isfinite(torque_in), torque_in, 0.0)
+
+    observers, filtered, torques, sides = {}, {}, {}, {}
     for side in drive.sides:
 
         def nominal_acceleration(velocity: Number, side: str = side) -> Number:
@@ -238,29 +243,29 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
             return nominal if sample.added_accelerations is None else nominal + sample.added_accelerations[side]
 
         observer = getattr(experiment.observer, side)
-        observers[side], estimates[side] = observer.step(state.observer[side], measured[side], nominal_acceleration, period)
-        filtered[side] = experiment.equivalent_control.filter(
-            state.equivalent_control[side], estimates[side].control, period
-        )
-    torques = {side: drive.inertia(side) * filtered[side] / drive.torque_gain(side) for side in drive.sides}
-
-    identifier = state.identifier
-    twist = plant.twist(measured) if len(drive.sides) == 2 else None
-    if identifier is not None:
-        assert experiment.identifier is not None and experiment.transmission is not None and twist is not None
-        identifier = experiment.identifier.step(
-            identifier, experiment.transmission, experiment.equivalent_control, twist, torques, sample.time, period
-        )
-
-    sides = {}
-    for side in drive.sides:
-        estimate = estimates[side]
+        observers[side], estimate = observer.step(state.observer[side], readings[side], nominal_acceleration, period)
+        last = state.equivalent_control[side]
+        filtered[side] = experiment.equivalent_control.filter(last, estimate.control, period)
+        if missed:
+            filtered[side] = jnp.where(missed[side], last, filtered[side])
+        torques[side] = drive.inertia(side) * filtered[side] / drive.torque_gain(side)
         true = None
         if after is not None:
             acceleration = (after.velocity[side] - before.velocity[side]) / period
             perturbation = acceleration - drive.acceleration(side, estimate.velocity, torque_in)
             true = TrueSide(before.position[side], before.velocity[side], acceleration, perturbation)
         sides[side] = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side], true)
+
+    identifier = state.identifier
+    twist = plant.twist(readings) if len(drive.sides) == 2 else None
+    if identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None and twist is not None
+        # no sample counts before the start
+        time = functools.reduce(lambda time, side: jnp.where(side, -period, time), missed.values(), sample.time)
+        identifier = experiment.identifier.step(
+            identifier, experiment.transmission, experiment.equivalent_control, twist, torques, time, period
+        )
+
     torque = None
     if after is not None and experiment.transmission is not None:
         torque, _ = plant.transmitted_torque(before.position, before.velocity, before.effects)
@@ -312,8 +317,7 @@ def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tup
     same noise.
     """
     key = jax.random.key(seed)
-    keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
-    draws = jax.vmap(lambda key: jax.random.normal(key, (2,), jnp.float32))(keys)
+    draws = jax.vmap(lambda index: jax.random.normal(jax.random.fold_in(key, index), (2,), jnp.float32))(indices)
     return {side: draws[:, i] for i, side in enumerate(sides)}
 
 
@@ -356,8 +360,7 @@ def end_block(experiment: Experiment, carry: Carry) -> Carry:
     state, totals = carry
     if experiment.identifier is None or state.identifier is None:
         return carry
-    identifier = experiment.identifier.settle(state.identifier)
-    return eqx.tree_at(lambda state: state.identifier, state, identifier), totals
+    return dataclasses.replace(state, identifier=experiment.identifier.settle(state.identifier)), totals
 
 
 def compute_metrics(experiment: Experiment, reducers: Reducers, carry: Carry) -> TracedArrays:
@@ -374,8 +377,8 @@ def all_done(experiment: Experiment, reducers: Reducers, carry: Carry) -> Array 
     state, totals = carry
     if not reducers or any(reducer.done is None for reducer in reducers):
         return None
-    flags = [reducer.done(experiment, total, state) for reducer, total in zip(reducers, totals, strict=True)]  # type: ignore[misc]
-    return functools.reduce(jnp.logical_and, flags)
+    done = (reducer.done(experiment, total, state) for reducer, total in zip(reducers, totals, strict=True))  # type: ignore[misc]
+    return functools.reduce(jnp.logical_and, done)
 
 
 def scan(
@@ -511,7 +514,7 @@ def plant_trajectory(
         t = time + index.astype(torque.dtype) * run.sample_period
         return move_plant(plant, run, correct_by_readings(state, readings, gain or {}), torque, t), state
 
-    readings = measured if measured is not None and gain is not None else {}
+    readings = measured if measured and gain else {}
     indices = jnp.arange(len(torque), dtype=jnp.int32)
     _, states = jax.lax.scan(predict_sample, start, (indices, torque, readings))
     return states

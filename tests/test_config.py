@@ -489,7 +489,14 @@ def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
         assert numbers[path].doc
         changed_config = with_values(config, {path: 0.625})
         assert get_leaf(changed_config.build(), path) == 0.625, path
-    structural = {"observer.discretisation", "observer.kind", "run.duration", "run.sample_period", "run.substeps"}
+    structural = {
+        "encoders.missed",
+        "observer.discretisation",
+        "observer.kind",
+        "run.duration",
+        "run.sample_period",
+        "run.substeps",
+    }
     absent = {"encoders.load_noise", "identifier.regressor_filter"} if experiment.identifier else set()
     assert set(numbers) - set(leaves) == structural | absent
 

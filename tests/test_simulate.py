@@ -1,5 +1,7 @@
 """The whole chain: the figures it has to reach, its noise, lanes, records, derivatives, and an independent copy of it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -320,9 +322,11 @@ def test_one_compilation_serves_all_values():
     assert traces == 1
 
 
-@pytest.mark.parametrize("stride", [1, 7])
-def test_a_replayed_record_gives_what_the_observers_gave(stride):
+@pytest.mark.parametrize(("stride", "missed"), [(1, None), (7, None), (1, 0.2)])
+def test_a_replayed_record_gives_what_the_observers_gave(stride, missed):
     experiment = paper_experiment(noise=1e-4, start=0.1, steps=700)
+    encoders = dataclasses.replace(experiment.encoders, missed=None if missed is None else jnp.asarray(missed))
+    experiment = dataclasses.replace(experiment, encoders=encoders)
     signals = scan_trace(experiment)
     measured = {side: signals.side(side).measured for side in experiment.sides}
     run = jit(lambda *columns: replay(*columns, record=record_signals, stride=stride, state=initial_state(experiment)))

@@ -1,6 +1,7 @@
 """Position encoders with Gaussian noise and quantisation."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .parameters import Scalar, ScalarArray, parameter
@@ -18,6 +19,9 @@ class Encoders(eqx.Module):
     )
     motor_resolution: Scalar = parameter("rad", "motor encoder count; 0 is ideal", default=0.0, minimum=0.0)
     load_resolution: Scalar = parameter("rad", "load encoder count; 0 is ideal", default=0.0, minimum=0.0)
+    missed: Scalar | None = parameter(
+        "", "share of readings that are missed, at random; left out: none", default=None, minimum=0.0, maximum=1.0
+    )
 
     def noise_of(self, side: str, ratio: Scalar) -> Scalar:
         """Rms noise of a side's encoder, rad; `ratio` is the motor angle for one unit of the side's angle."""
@@ -31,13 +35,18 @@ class Encoders(eqx.Module):
         Args:
             side: "motor" or "load".
             position: true position, rad, as the effects of encoders change it.
-            unit_noise: draw of a standard normal distribution.
+            unit_noise: draw of a standard normal distribution, float32.
             ratio: motor angle for one unit of the side's angle.
 
         Returns:
-            The reading, rad.
+            The reading, rad; NaN where it is missed.
         """
         noisy = position + self.noise_of(side, ratio) * unit_noise
         resolution = self.motor_resolution if side == "motor" else self.load_resolution
         count = jnp.where(resolution > 0.0, resolution, 1.0)
-        return jnp.where(resolution > 0.0, count * jnp.round(noisy / count), noisy)
+        reading = jnp.where(resolution > 0.0, count * jnp.round(noisy / count), noisy)
+        if self.missed is None:
+            return reading
+        # the last bits of a draw are as good as independent of it
+        bits = jax.lax.bitcast_convert_type(unit_noise, jnp.int32) & 0xFFFF
+        return jnp.where(bits < 0x10000 * self.missed, jnp.nan, reading)

@@ -49,13 +49,6 @@ def _aliasing_fault(name: str, frequency: float, period: float) -> str:
     return f"{name} {frequency:g} Hz has to be below half the sampling rate, {0.5 / period:g} Hz; run.sample_period sets it"
 
 
-def _hold_fault(hold: float, period: float) -> str:
-    # most levels that are shorter than a sample are never applied
-    if hold > (1.0 - 1e-6) * period:
-        return ""
-    return f"hold {hold:g} s has to be at least run.sample_period, {period:g} s"
-
-
 EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractExcitation))
 """Excitations by name, those of installed packages included."""
 
@@ -129,51 +122,50 @@ def _rounding_bound(time: ScalarArray) -> ScalarArray:
     return 4.0 * float(jnp.finfo(jnp.result_type(time)).eps) * time
 
 
-def _hold_index(hold: Scalar, time: ScalarArray) -> Array:
-    """Index of the hold interval at a time; at an edge a little early, since rounding must not make it a sample late."""
-    holds = time / hold
-    return jnp.floor(holds + 1e-4 + _rounding_bound(holds)).astype(jnp.int32)
-
-
-@EXCITATIONS.add
-class Steps(AbstractExcitation):
-    """Random steps: levels that are uniform in [-amplitude, amplitude], each held for `hold` seconds."""
-
-    name = "steps"
+class _HeldLevels(AbstractExcitation):
     amplitude: Scalar = parameter("N m", "largest level")
     hold: Scalar = parameter("s", "time that each level is held", above=0.0)
-    seed: int = option("seed of the levels", default=0, minimum=0)
 
     @classmethod
     def find_fault(cls, numbers, period):
-        return _hold_fault(numbers["hold"], period)
+        # most levels that are shorter than a sample are never applied
+        hold = numbers["hold"]
+        too_short = f"hold {hold:g} s has to be at least run.sample_period, {period:g} s"
+        return "" if hold > (1.0 - 1e-6) * period else too_short
+
+    def find_index(self, time: ScalarArray) -> Array:
+        """Index of the hold interval at a time; at an edge a little early, since rounding must not make it a sample late."""
+        holds = time / self.hold
+        return jnp.floor(holds + 1e-4 + _rounding_bound(holds)).astype(jnp.int32)
+
+
+@EXCITATIONS.add
+class Steps(_HeldLevels):
+    """Random steps: levels that are uniform in [-amplitude, amplitude], each held for `hold` seconds."""
+
+    name = "steps"
+    seed: int = option("seed of the levels", default=0, minimum=0)
 
     def __call__(self, time):
         # 0x57E9 separates the levels from encoder noise of the same seed
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), _hold_index(self.hold, time))
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), self.find_index(time))
         level = jax.random.uniform(key, (), jnp.float32, -1.0, 1.0)
         return self.amplitude * level.astype(jnp.result_type(time))
 
 
 @EXCITATIONS.add
-class Prbs(AbstractExcitation):
+class Prbs(_HeldLevels):
     """Pseudo-random binary sequence +-amplitude: a maximum-length shift register of `order` bits, one bit per `hold`."""
 
     name = "prbs"
-    amplitude: Scalar = parameter("N m", "amplitude")
-    hold: Scalar = parameter("s", "time of one bit", above=0.0)
     order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
-
-    @classmethod
-    def find_fault(cls, numbers, period):
-        return _hold_fault(numbers["hold"], period)
 
     def __call__(self, time):
         from scipy.signal import max_len_seq  # its import takes half a second, which only this excitation needs
 
         bits, _ = max_len_seq(self.order)
         levels = 2.0 * jnp.asarray(bits, jnp.result_type(time)) - 1.0
-        return self.amplitude * levels[_hold_index(self.hold, time) % len(levels)]
+        return self.amplitude * levels[self.find_index(time) % len(levels)]
 
 
 @EXCITATIONS.add

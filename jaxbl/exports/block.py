@@ -30,7 +30,7 @@ class Port(NamedTuple):
     dtype: np.dtype
 
 
-def describe_number(number: "Quantity | StudyNumber") -> str:
+def describe_number(number: "Port | StudyNumber") -> str:
     """Describe a number with its unit."""
     return f"{number.description}{f', {number.unit}' if number.unit else ''}"
 

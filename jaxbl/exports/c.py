@@ -1,5 +1,6 @@
 """A program in C99: one source file and one header, without allocation and without libm beyond sqrt and fabs."""
 
+import re
 import textwrap
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
@@ -65,7 +66,7 @@ def _write_header(program: Program, head: str) -> str:
     block, name = program.block, program.block.name
     guard = f"{name.upper()}_H"
     start, step = write_signatures(program)
-    state = "\n".join(_write_struct(f"{name}_state", program.state or [Port("unused", "", "", np.dtype(np.int32))]))
+    state = "\n".join(_write_struct(f"{name}_state", program.state))
     outputs = "\n".join(_write_struct(f"{name}_outputs", block.outputs))
     return f"""{head}
 
@@ -146,8 +147,6 @@ class _C(Writer):
         # constants that only this routine reads
         definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
         self.add_lines(*definitions, *([""] if definitions else []))
-        if not program.state:
-            self.add_lines("(void)state;" if routine_index else "state->unused = 0;")
         self.add_lines(*(f"(void){name};" for name in find_unread_names(routine, arguments)))
         for quantity, variable in zip(program.state, state_variables, strict=routine_index == 1):
             self.give_name(variable, f"old_{quantity.name}")
@@ -166,12 +165,12 @@ class _C(Writer):
 
     def define_constants(self, constants: Collection[Constant]) -> list[str]:
         """Write definitions of constants, in the order of the code."""
-        lines = []
-        for constant, name in self.constants.items():
-            if constant in constants:
-                remark = write_comment(C_MARKS, describe_constant(self.program, constant))
-                lines.append(f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; {remark}")
-        return lines
+        return [
+            f"static const {c_type(constant.dtype)} {name} = {self.literal(constant)}; "
+            f"{write_comment(C_MARKS, describe_constant(self.program, constant))}"
+            for constant, name in self.constants.items()
+            if constant in constants
+        ]
 
     def literal(self, constant):
         kind, value = str(constant.dtype), constant.value.item()
@@ -267,17 +266,15 @@ class _C(Writer):
             "real": real,
             "fabs": "fabsf" if single else "fabs",
             "integer": "int32_t" if single else "int64_t",
-            "whole": "8388608.0f" if single else "4503599627370496.0",
-            "largest": "2147483648.0f" if single else "2147483648.0",
-            **{f"n{key}": f"{value}{'f' if single else ''}" for key, value in
-               {"0": "0.0", "1": "1.0", "2": "2.0", "half": "0.5"}.items()},
-        }  # fmt: skip
+            "whole": "8388608.0" if single else "4503599627370496.0",
+        }
         lines = list[str]()
-        order = ["floor", "ceil", "round_even", "round_away", "power_of_two"]
-        for name in sorted(self._helper_types, key=lambda name: order.index(name) if name in order else len(order)):
+        # those that call floor after it
+        for name in sorted(self._helper_types, key="floor".__ne__):
             argument_type, result_type = self._helper_types[name]
             template = _HELPERS["bitcast" if name.startswith("bits_of_") else name]
             text = template % (words | {"given": c_type(argument_type), "made": c_type(result_type)})
+            text = re.sub(r"\d\.\d", r"\g<0>f", text) if single else text
             lines += [*textwrap.dedent(text).strip("\n").split("\n"), ""]
         return lines
 
@@ -306,7 +303,7 @@ _HELPERS = {
 /* x without its fraction; 0 where no integer is that large, or x is not a number: in C such a conversion is undefined. */
 static int32_t integer_of(%(real)s x)
 {
-    return (%(fabs)s(x) < %(largest)s) ? (int32_t)x : 0;
+    return (%(fabs)s(x) < 2147483648.0) ? (int32_t)x : 0;
 }
 """,
     "floor": """
@@ -319,7 +316,7 @@ static %(real)s floor_of(%(real)s x)
         const %(real)s whole = (%(real)s)(%(integer)s)x;
         if (whole > x)
         {
-            y = whole - %(n1)s;
+            y = whole - 1.0;
         }
         else if (whole < x)
         {
@@ -347,16 +344,16 @@ static %(real)s nearest(%(real)s x)
     const %(real)s size = %(fabs)s(x);
     %(real)s y = floor_of(size);
     const %(real)s rest = size - y;
-    const %(real)s half = floor_of(y * %(nhalf)s);
-    if ((rest > %(nhalf)s) || ((rest >= %(nhalf)s) && ((%(n2)s * half) < y)))
+    const %(real)s half = floor_of(y * 0.5);
+    if ((rest > 0.5) || ((rest >= 0.5) && ((2.0 * half) < y)))
     {
-        y = y + %(n1)s;
+        y = y + 1.0;
     }
-    if (x < %(n0)s)
+    if (x < 0.0)
     {
         y = -y;
     }
-    return (size > %(n0)s) ? y : x;
+    return (size > 0.0) ? y : x;
 }
 """,
     "round_away": """
@@ -365,23 +362,23 @@ static %(real)s nearest_away(%(real)s x)
 {
     const %(real)s size = %(fabs)s(x);
     %(real)s y = floor_of(size);
-    if ((size - y) >= %(nhalf)s)
+    if ((size - y) >= 0.5)
     {
-        y = y + %(n1)s;
+        y = y + 1.0;
     }
-    if (x < %(n0)s)
+    if (x < 0.0)
     {
         y = -y;
     }
-    return (size > %(n0)s) ? y : x;
+    return (size > 0.0) ? y : x;
 }
 """,
     "power_of_two": """
 /* 2 to the power n, exactly; n within the range of exponents. */
 static %(real)s power_of_two(int32_t n)
 {
-    %(real)s power = %(n1)s;
-    %(real)s factor = (n < 0) ? %(nhalf)s : %(n2)s;
+    %(real)s power = 1.0;
+    %(real)s factor = (n < 0) ? 0.5 : 2.0;
     uint32_t left = (n < 0) ? (uint32_t)(-n) : (uint32_t)n;
     while (left > 0u)
     {

@@ -23,13 +23,11 @@ class _ChainState(State):
 
     Attributes:
         samples: index of the sample; from the largest integer on, that of the last block again and again.
+        missed: count of missed samples by side, up to the largest integer.
     """
 
     samples: Any
-
-
-def _make_chain_state(state: State, samples: Any) -> _ChainState:
-    return _ChainState(**vars(state) | {"plant": None, "samples": samples})
+    missed: Any
 
 
 def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
@@ -51,8 +49,11 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
     torque = Port("input", "N m", "input torque, held from this sample to the next", dtype)
 
     def start(numbers: Values, inputs: Values) -> _ChainState:
-        measured = {side: inputs[f"{side}_position"] for side in sides}
-        return _make_chain_state(initial_state(set_leaves(experiment, numbers), measured), jnp.zeros((), jnp.int32))
+        readings = {side: inputs[f"{side}_position"] for side in sides}
+        measured = {side: jnp.where(jnp.isfinite(reading), reading, 0.0) for side, reading in readings.items()}
+        zero = jnp.zeros((), jnp.int32)
+        state = initial_state(set_leaves(experiment, numbers), measured)
+        return _ChainState(**vars(state), samples=zero, missed=dict.fromkeys(sides, zero))
 
     def sample(numbers: Values, state: _ChainState, inputs: Values) -> tuple[_ChainState, Outputs]:
         lane = set_leaves(experiment, numbers)
@@ -60,6 +61,8 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         time = state.samples.astype(dtype) * lane.run.sample_period
         new, signals = step(lane, state, Sample(time, input=inputs["input"], measured=measured))
         out: Outputs = {}
+        missed = {side: ~jnp.isfinite(reading + inputs["input"]) for side, reading in measured.items()}
+        counts = jax.tree.map(lambda count, more: jnp.minimum(count, LAST_SAMPLE - 1) + more, state.missed, missed)
         for side in sides:
             estimates = signals.side(side)
             out |= {
@@ -75,13 +78,15 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
                     "N m",
                     f"transmitted torque by the {side}'s observer",
                 ),
+                f"{side}_missed": (missed[side], "", f"whether the {side}'s position or the input is not finite"),
+                f"{side}_missed_samples": (counts[side], "", f"count of the {side}'s missed samples"),
             }
         out |= _identified_outputs(lane, new)
         # sums lose nothing over some hundred samples
         full = jax.lax.rem(state.samples, jnp.int32(LONGEST_BLOCK)) == LONGEST_BLOCK - 1
         compensated = jax.lax.cond(full, lambda state: end_block(lane, (state, ()))[0], lambda state: state, new)
         samples = jnp.where(state.samples == LAST_SAMPLE, LAST_SAMPLE - LONGEST_BLOCK, state.samples) + 1
-        return _make_chain_state(compensated, samples), out
+        return _ChainState(**vars(compensated), samples=samples, missed=counts), out
 
     return trace_block(name, dtype, study_numbers, positions, [torque, *positions], start, sample)
 
@@ -106,6 +111,8 @@ def _identified_outputs(experiment: Experiment, state: State) -> Outputs:
     solutions = identifier.solution(state.identifier)
     for side in experiment.sides:
         determined, theta = solutions[side]
+        # laws divide by the stiffness
+        determined = determined & (theta[0] != 0.0)
         law_numbers = law.from_theta(tuple(jnp.where(determined, x, 1.0) for x in theta))
         for value in law_numbers.values():
             determined = determined & jnp.isfinite(value)

@@ -28,13 +28,13 @@ def write_filter_code(program: Program) -> str:
         "",
         "Lines have to come at the sampling period; times are only copied. A first line without numbers is passed over.",
     ]
-    formats = ["%.9g" if single else "%.17g", *("%d" if quantity.dtype == bool else "%.9g" if single else "%.17g"
-               for quantity in block.outputs)]  # fmt: skip
-    names = ["t", *(quantity.name for quantity in block.outputs)]
-    cast = "(double)" if single else ""
-    printed = [f"{cast}row[0]"]
+    real_format, cast = ("%.9g", "(double)") if single else ("%.17g", "")
+    names, formats, printed = ["t"], [real_format], [f"{cast}row[0]"]
     for output in block.outputs:
-        printed.append(f"outputs.{output.name} ? 1 : 0" if output.dtype == bool else f"{cast}outputs.{output.name}")
+        is_whole = output.dtype.kind in "bi"
+        names.append(output.name)
+        formats.append("%d" if is_whole else real_format)
+        printed.append(f"{'(int)' if is_whole else cast}outputs.{output.name}")
     places = {"input": "row[1]"} | {quantity.name: f"row[{2 + i}]" for i, quantity in enumerate(block.start_inputs)}
     return f'''{write_comment(C_MARKS, *remarks)}
 

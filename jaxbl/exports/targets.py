@@ -343,7 +343,7 @@ def _describe_port(port: Port) -> dict[str, str]:
 
 def count_state_bytes(program: Program) -> int:
     """Return the size of the state's struct in bytes where numbers are aligned to their own size."""
-    sizes = [quantity.dtype.itemsize for quantity in program.state] or [4]
+    sizes = [quantity.dtype.itemsize for quantity in program.state]
     end = 0
     for size in sizes:
         end = -(-end // size) * size + size

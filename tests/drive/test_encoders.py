@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from jaxbl.drive import Encoders, as_arrays
+from jaxbl.simulate import unit_noise
 
 RATIO = 5.0
 SIDES = st.sampled_from(["motor", "load"])
@@ -54,3 +55,25 @@ def test_the_other_side_is_not_quantised_and_float32_stays_float32():
     encoders = Encoders(load_resolution=0.5)
     assert read_encoder(encoders, "motor", 0.3, dtype=jnp.float32) == jnp.float32(0.3)
     assert read_encoder(encoders, "load", 0.3, dtype=jnp.float32) == 0.5
+
+
+@pytest.mark.parametrize("missed", [0.0, 1e-3, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_readings_are_missed_at_random(missed, dtype):
+    count = 200_000
+    encoders = as_arrays(Encoders(noise=1.0, missed=missed), dtype)
+    draws = unit_noise(3, jnp.arange(count), ("motor", "load"))
+    lost = {}
+    for side, draw in draws.items():
+        readings = np.asarray(encoders.measure(side, dtype(0.0), draw, dtype(1.0)))
+        assert readings.dtype == dtype
+        lost[side] = np.isnan(readings)
+        deviation = np.sqrt(missed * (1.0 - missed) / count)
+        assert abs(lost[side].mean() - missed) <= 5.0 * deviation
+        # neither the noise of what is read, nor the next sample, nor the other side has to do with it
+        kept = np.asarray(draw)[~lost[side]]
+        assert (readings[~lost[side]] == kept).all()
+        if kept.size:
+            assert abs(kept.mean()) < 5.0 / np.sqrt(kept.size) and abs(kept.std() - 1.0) < 5.0 / np.sqrt(2.0 * kept.size)
+        assert abs((lost[side][1:] & lost[side][:-1]).mean() - missed**2) <= 5.0 * deviation
+    assert abs((lost["motor"] & lost["load"]).mean() - missed**2) <= 5.0 * deviation

@@ -107,6 +107,56 @@ def test_nothing_is_identified_after_a_standstill(tmp_path, precision):
         assert not columns[f"{side}_identified"][-1] and not columns[f"{side}_stiffness"][-1]
 
 
+def draw_faults(inputs, random):
+    """Samples with readings and inputs that are not finite, alone and in a row, the first one perhaps among them."""
+    faulty = inputs.copy()
+    for _ in range(random.integers(1, 5)):
+        first, column = random.integers(0, len(inputs) - 50), random.integers(0, inputs.shape[1])
+        faulty[first * (random.random() > 0.2) :][: random.integers(1, 20), column] = random.choice(
+            [np.nan, np.inf, -np.inf]
+        )
+    return faulty
+
+
+@pytest.mark.program("gcc")
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("kind", ["super_twisting", "kalman", "differentiator_3", "dirty_derivative"])
+def test_a_reading_that_is_not_finite_is_a_missed_one(exported_code, kind, precision, repeats):
+    (_, native), random = exported_code(precision, kind), np.random.default_rng(46)
+    inputs = draw_samples(400, 2)
+    names = [output["name"] for output in native.summary["outputs"]]
+    usual = dict(zip(names, run_native(native, inputs).T, strict=True))
+    assert not usual["motor_missed"].any() and not usual["load_missed_samples"].any()
+    for _ in range(repeats(3, 50)):
+        faulty = draw_faults(inputs, random)
+        outputs = run_native(native, faulty)
+        assert np.isfinite(outputs).all()
+        assert (to_integers(outputs) == to_integers(run_strict(study(kind), precision, faulty))).all()
+        columns = dict(zip(names, outputs.T, strict=True))
+        for i, side in enumerate(("motor", "load"), 1):
+            missed = ~np.isfinite(faulty[:, [0, i]]).all(axis=1)
+            assert (columns[f"{side}_missed"] == missed).all()
+            assert (columns[f"{side}_missed_samples"] == np.cumsum(missed)).all()
+            held = columns[f"{side}_torque_estimate"]
+            assert (held[1:] == held[:-1])[missed[1:]].all()
+            # before the first missed sample nothing differs
+            clean = np.cumsum(~np.isfinite(faulty).all(axis=1)) == 0
+            assert (columns[f"{side}_velocity_estimate"] == usual[f"{side}_velocity_estimate"])[clean].all()
+
+
+@pytest.mark.program("gcc")
+def test_the_example_filter_takes_rows_that_are_not_finite(tmp_path):
+    jaxbl.export(study(), tmp_path, name="drive", precision="float")
+    run_program("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)
+    rows = "0,0,nan,0\n0.001,0,0,inf\n0.002,0,0,0\n"
+    lines = run_program("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}").stdout.splitlines()
+    names = lines[0].split(",")
+    table = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
+    assert [row["motor_missed"] for row in table] == ["1", "0", "0"]
+    assert [row["load_missed_samples"] for row in table] == ["0", "1", "1"]
+    assert not any("nan" in line or "inf" in line for line in lines)
+
+
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("law", ["sigmoid_backlash", "dead_zone", "linear_shaft", None])
 def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):

@@ -15,8 +15,15 @@ _LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
 """Trial values of a time constant, in samples, apart by factors of about 2."""
 
 
+class _TorqueMemory(ActuatorEffect):
+    """An effect whose state is torques of the past."""
+
+    def settled(self, torque):
+        return tuple(past + torque for past in type(self).init(self))
+
+
 @EFFECTS.add
-class Delay(ActuatorEffect):
+class Delay(_TorqueMemory):
     """Dead time of the torque: u(t - T), exact for an input held from sample to sample. Before t = 0 the input was zero."""
 
     kind = "delay"
@@ -26,9 +33,6 @@ class Delay(ActuatorEffect):
 
     def init(self):
         return (jnp.zeros_like(self.delay),) * DELAY_SAMPLES
-
-    def settled(self, torque):
-        return (jnp.zeros_like(self.delay) + torque,) * DELAY_SAMPLES
 
     def receive(self, state, torque, period):
         commanded = (torque, *state)
@@ -78,7 +82,7 @@ class Saturation(ActuatorEffect):
 
 
 @EFFECTS.add
-class Lag(ActuatorEffect):
+class Lag(_TorqueMemory):
     """First-order lag of the torque: T du_a/dt = u - u_a, exact for a held input; u_a is zero at t = 0."""
 
     kind = "lag"
@@ -88,9 +92,6 @@ class Lag(ActuatorEffect):
 
     def init(self):
         return (jnp.zeros_like(self.time_constant),)
-
-    def settled(self, torque):
-        return (jnp.zeros_like(self.time_constant) + torque,)
 
     def actuate(self, state, torque, step):
         (lagged,) = state
