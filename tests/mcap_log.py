@@ -5,11 +5,11 @@ import json
 import pytest
 
 
-def write_mcap(path, topics):
-    """Messages in JSON, `(time, message)` by topic, at times of recording (s)."""
+def write_mcap(path, topics, **options):
+    """Messages in JSON, `(time, message)` by topic, at times of recording (s); `options` are those of the writer."""
     library = pytest.importorskip("mcap.writer", reason="the extra logs is not installed")
     with path.open("wb") as file:
-        writer = library.Writer(file)
+        writer = library.Writer(file, **options)
         writer.start()
         schema = writer.register_schema("state", "jsonschema", b"{}")
         for name, messages in topics.items():

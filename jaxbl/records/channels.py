@@ -91,27 +91,31 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
     return False
 
 
-def _read_numbers(file: LogFile, name: str, column: ColumnName, bits: int | None, stamps: TimeStamps) -> np.ndarray:
-    """Read the numbers of a column at the selected rows; unsigned words become signed."""
+def _read_numbers(
+    file: LogFile, name: str, column: ColumnName, table: PositionTable | SpeedTable | TorqueTable, stamps: TimeStamps
+) -> np.ndarray:
+    """Read the numbers of a column at the selected rows; words become signed numbers."""
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
     values = file.load_numbers(column, f"{name}.column")
-    if bits is not None:
-        signed_words = to_signed(values, bits)
-        is_no_word = np.isnan(signed_words)
-        if is_no_word.any():
-            row = int(np.argmax(is_no_word))
-            raise file.error(
-                f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
-                f"{name}.signed_bits"
-            )
-        values = signed_words
-    return values[stamps.rows]
+    signed_words = decode_words(table, values)
+    is_no_word = np.isnan(signed_words)
+    if is_no_word.any():
+        row = int(np.argmax(is_no_word))
+        bits, key = (table.signed_bits, "signed_bits") if table.sign_bit is None else (table.sign_bit + 1, "sign_bit")
+        raise file.error(
+            f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] {name}.{key}"
+        )
+    return signed_words[stamps.rows]
 
 
-def to_signed(values: np.ndarray, bits: int) -> np.ndarray:
-    """Return words of `bits` bits as signed numbers; NaN for a value that is not such a word."""
-    is_word = (values == np.round(values)) & (values >= -(2.0 ** (bits - 1))) & (values < 2.0**bits)
-    return np.where(is_word, np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values), np.nan)
+def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+    """Return the numbers of a column, of which words with a sign become signed; NaN for a value that is no such word."""
+    if table.sign_bit is None and table.signed_bits is None:
+        return values
+    limit = 2.0 ** ((table.signed_bits or 0) - 1 if table.sign_bit is None else table.sign_bit)
+    least, negative = (-limit, values - 2.0 * limit) if table.sign_bit is None else (0.0, limit - values)
+    is_word = (values == np.round(values)) & (values >= least) & (values < 2.0 * limit)
+    return np.where(is_word, np.where(values >= limit, negative, values), np.nan)
 
 
 def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
@@ -137,9 +141,9 @@ SPEED_FACTORS = {
 
 def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     column = table.column_or(name)
-    values = _read_numbers(file, name, column, table.signed_bits, stamps)
+    values = _read_numbers(file, name, column, table, stamps)
     if table.minus is not None:
-        values = values - _read_numbers(file, name, table.minus, table.signed_bits, stamps)
+        values = values - _read_numbers(file, name, table.minus, table, stamps)
     if np.ptp(values) == 0.0:
         raise file.error(
             f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
@@ -162,7 +166,7 @@ def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeSt
     """Integrate a speed to a position by the trapezoidal rule, 0 at the first row."""
     channel = SPEED_CHANNELS[name]
     column = table.column_or(channel)
-    values = _read_numbers(file, channel, column, table.signed_bits, stamps)
+    values = _read_numbers(file, channel, column, table, stamps)
     if np.ptp(values) == 0.0:
         raise file.error(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
     step = find_resolution(values)
@@ -178,10 +182,10 @@ def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeSt
 
 def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, is_linear: bool) -> RawChannel:
     column = table.column_or(name)
-    values = _read_numbers(file, name, column, table.signed_bits, stamps)
+    values = _read_numbers(file, name, column, table, stamps)
     if is_linear and table.unit == "N m":
         raise file.error(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
-    if table.signed_bits is None:
+    if table.signed_bits is None and table.sign_bit is None:
         _check_unsigned(file, name, column, values)
     if name == "u" and np.ptp(values) == 0.0:
         file.notes.append(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")

@@ -14,8 +14,9 @@ import re
 import warnings
 from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +38,8 @@ _LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
 )
 """First bytes, name and reader of the kinds that need a library."""
 _SUFFIXES = (
-    ".csv", ".txt", ".tsv", ".dat", ".parquet", ".mat", ".h5", ".hdf5", ".json", ".mf4", ".mdf", ".tdms", ".mcap", ".bag"
+    ".csv", ".txt", ".tsv", ".dat", ".parquet", ".mat", ".h5", ".hdf5", ".json", ".jsonl", ".mf4", ".mdf", ".tdms", ".mcap",
+    ".bag",
 )  # fmt: skip
 """Suffixes of log files that this package reads by itself."""
 
@@ -84,7 +86,7 @@ class LogFile:
 
     def __init__(self, path: Path, columns: Columns):
         self.path, self.columns = path, columns
-        self.units, self.notes = columns.units, [*columns.notes]
+        self.units, self.notes = columns.units, [*columns.notes, *columns.describe_unread()]
         self.warnings: list[str] = []
         self.corrections: dict[str, float] = {}
         self.contradiction = ""
@@ -116,7 +118,8 @@ class LogFile:
                 + (f", as [log] {channel}" if channel else "")
             )
         key = f"; [log] {channel} can name another" if channel else ""
-        raise self.error(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}")
+        unread = " ".join(["", *self.columns.describe_unread()])
+        raise self.error(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}{unread and '.' + unread}")
 
     def count_values(self, name: ColumnName) -> int:
         """Count the values of a column without loading it; InputError if there are too many."""
@@ -570,41 +573,29 @@ def _check_names(cells: list[str]) -> list[str]:
 
 
 def _read_json(text: str) -> Columns:
-    """Read an array of objects or of rows of numbers, an object that holds one array of objects, or arrays by name."""
+    """Read an array of objects or of rows of numbers, an object that holds one, objects line by line, or arrays by name."""
     try:
         content = json.loads(text)
     except RecursionError:
         raise InputError("is nested too deep; a log holds rows, or arrays by name") from None
     except ValueError as error:
-        raise InputError(f"is not valid JSON: {error}") from None
+        try:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except (RecursionError, ValueError):
+            raise InputError(f"is not valid JSON: {error}") from None
     if isinstance(content, dict):
         arrays = [value for value in content.values() if isinstance(value, list) and value and isinstance(value[0], dict)]
-        if len(arrays) != 1:
-            columns = Columns()
-            for name, value in content.items():
-                _add_json_columns(columns, name, value)
-            if not columns:
-                raise InputError("holds no array of rows or of numbers; a log needs one")
-            return columns
-        content = arrays[0]
+        content = arrays[0] if len(arrays) == 1 else content
+    columns = Columns()
     if _is_matrix(content):
-        return Columns(enumerate(np.asarray(content, dtype=float).T))
-    if not isinstance(content, list) or not content or not all(isinstance(row, dict) for row in content):
+        columns.update(enumerate(np.asarray(content, dtype=float).T))
+    elif isinstance(content, dict):
+        _add_columns(columns, "", content)
+    elif content and isinstance(content, list) and all(isinstance(row, dict) for row in content):
+        _add_columns(columns, "", pd.json_normalize(content))
+    else:
         raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
-    names = dict.fromkeys(name for row in content for name in row)
-    return Columns({name: _to_array([row.get(name) for row in content]) for name in names})
-
-
-def _add_json_columns(columns: Columns, name: str, value: Any) -> None:
-    """Add an array, the columns of a matrix as `name[0]`, and the arrays of an object as `name.key`."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _add_json_columns(columns, f"{name}.{key}", inner)
-    elif _is_matrix(value):
-        for i, column in enumerate(np.asarray(value, dtype=float).T):
-            columns[f"{name}[{i}]"] = column
-    elif isinstance(value, list):
-        columns[name] = _to_array(value)
+    return _require_columns(columns)
 
 
 def _is_matrix(value: Any) -> bool:
@@ -615,54 +606,101 @@ def _is_matrix(value: Any) -> bool:
     return has_numbers and len({len(row) for row in value}) == 1
 
 
-def _to_array(values: list[Any]) -> np.ndarray:
-    return np.asarray(pd.Series(values, dtype=object).infer_objects())
+def _add_columns(columns: Columns, name: str, value: Any) -> None:
+    """Add a vector, the columns of a matrix (`name[0]`), members of a structure (`name.key`) or of cells (`name[0]`)."""
+    if isinstance(value, pd.DataFrame):
+        # the times of a timetable are its index
+        frame = value.reset_index() if value.index.name else value
+        value = {column: cells.tolist() if cells.dtype == object else cells for column, cells in frame.items()}
+    elif isinstance(value, list):
+        value = np.asarray(value, float) if _is_matrix(value) else pd.Series(value, dtype=object).infer_objects()
+    if not isinstance(value, dict):
+        value = np.squeeze(np.asarray(value))
+        if "s2" in (value.dtype.names or ()):
+            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({value['s2'].item().decode()})")
+            return
+        if value.dtype.names and not value.ndim:
+            value = {field: value[field] for field in value.dtype.names}
+    if isinstance(value, dict):
+        for key, member in value.items():
+            _add_columns(columns, f"{name}.{key}" if name else key, member)
+    elif value.dtype == object and not value.ndim:
+        if isinstance(value.item(), np.ndarray | pd.DataFrame):
+            _add_columns(columns, name, value.item())
+    elif value.dtype.names or (value.dtype == object and any(isinstance(cell, np.ndarray | dict) for cell in value.flat)):
+        for i, member in enumerate(value.flat):
+            _add_columns(columns, f"{name}[{i}]", member)
+    elif value.dtype.kind in "biufMmO":
+        _add_vectors(columns, name, value.shape, lambda: value)
 
 
 def _read_matlab(path: Path, selection: Selection) -> Columns:
     """Read vectors, columns of matrices (`name[0]`), fields of structures (`name.field`), and cells (`name[0]`)."""
-    from scipy.io import loadmat, whosmat
+    from scipy.io import loadmat
 
     def load_variable(name: str) -> Any:
         with _report_errors("a MATLAB file"):
             return loadmat(path, variable_names=[name], squeeze_me=True, struct_as_record=True)[name]
 
     with _report_errors("a MATLAB file"):
-        variables = whosmat(path)
-    selected_variables = {re.split(r"[.\[]", str(column))[0] for column in selection}
+        variables = _list_matlab_variables(path)
+    selected_variables = {*map(_find_variable, selection)}
     columns = Columns()
     postponed = []
     for name, shape, kind in variables:
         if kind in ("cell", "struct"):
             # the columns in them are not known before they are loaded
             if not selection or name in selected_variables:
-                _add_matlab_columns(columns, name, load_variable(name))
+                _add_columns(columns, name, load_variable(name))
             else:
                 postponed.append(name)
         elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
             _add_vectors(columns, name, shape, partial(load_variable, name))
+        elif kind != "char":
+            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({kind})")
     # a message that lists columns has to know their names
     for name in postponed if not any(column in columns for column in selection) else ():
-        _add_matlab_columns(columns, name, load_variable(name))
+        _add_columns(columns, name, load_variable(name))
+    return _add_matlab_objects(columns, path)
+
+
+_MATLAB_OBJECTS = "objects of MATLAB; save their vectors, as t = seconds(T.Time), or pip install 'jaxbl[logs]' for tables"
+
+
+def _find_variable(column: ColumnName) -> str:
+    """Return the variable of a MATLAB file that holds a column."""
+    return re.split(r"[.\[ ]", str(column))[0]
+
+
+def _list_matlab_variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
+    """Return name, shape and class of the variables of a MATLAB file; SciPy lists none where one is an object."""
+    from scipy.io import loadmat, matlab, whosmat
+
+    with suppress(TypeError):
+        return whosmat(path)
+    variables = []
+    with path.open("rb") as file:
+        for _, stream in matlab.varmats_from_mat(file):
+            try:
+                variables += whosmat(stream)
+            except TypeError:
+                stream.seek(0)
+                opaque = loadmat(stream)["None"][0]
+                variables.append((opaque["s0"].decode(), (), opaque["s2"].decode()))
+    # of objects, without a name
+    return [variable for variable in variables if not variable[0].startswith("__")]
+
+
+def _add_matlab_objects(columns: Columns, path: Path) -> Columns:
+    """Add the columns of tables and dates by the library mat-io, where it is installed and knows them."""
+    names = columns.unread.get(_MATLAB_OBJECTS, [])
+    # without the library, or for what it does not know, the names are said
+    with suppress(Exception):
+        variables = list({*map(_find_variable, names)})
+        for name, variable in import_module("matio").load_from_mat(path, variable_names=variables).items() if names else ():
+            names[:] = [unread for unread in names if _find_variable(unread) != name]
+            _add_columns(columns, name, variable)
     return _require_columns(columns)
-
-
-def _add_matlab_columns(columns: Columns, name: str, value: Any) -> None:
-    value = np.asarray(value)
-    if value.dtype.names:
-        if value.ndim == 0:
-            for field in value.dtype.names:
-                _add_matlab_columns(
-                    columns, f"{name}.{field}", value[field].item() if value[field].dtype == object else value[field]
-                )
-        elif value.ndim == 1:
-            for i, structure in enumerate(value):
-                _add_matlab_columns(columns, f"{name}[{i}]", structure)
-    elif value.dtype == object:
-        for i, cell in enumerate(value.ravel() if value.ndim else []):
-            _add_matlab_columns(columns, f"{name}[{i}]", cell)
-    elif value.dtype.kind in "biuf":
-        _add_vectors(columns, name, value.shape, lambda: value)
 
 
 def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
@@ -685,7 +723,7 @@ def _read_hdf5(path: Path) -> Columns:
 
     columns = Columns()
     visited_addresses: set[Any] = set()
-    external_names: list[str] = []
+    unread = columns.unread.setdefault
 
     def load_dataset(place: str) -> np.ndarray:
         with _report_errors("a MATLAB file"), h5py.File(path) as file:
@@ -693,15 +731,21 @@ def _read_hdf5(path: Path) -> Columns:
 
     def add_node(name: str, node: Any) -> None:
         # groups may hold one another, or themselves
-        address = h5py.h5o.get_info(node.id).addr
-        if isinstance(node, h5py.Group):
+        place = h5py.h5o.get_info(node.id)
+        address, matlab_class = place.addr, node.attrs.get("MATLAB_class", b"").decode()
+        if place.fileno != own_number:
+            # a link to a link into another file
+            unread(_OTHER_FILES, []).append(name)
+        elif isinstance(node, h5py.Group):
             if address not in visited_addresses:
                 visited_addresses.add(address)
                 add_group(node, f"{name}.")
         elif node.is_virtual or node.external:
-            external_names.append(name)
-        elif node.attrs.get("MATLAB_class") == b"char":
+            unread(_OTHER_FILES, []).append(name)
+        elif matlab_class == "char":
             return
+        elif "MATLAB_object_decode" in node.attrs:
+            unread(_MATLAB_OBJECTS, []).append(f"{name} ({matlab_class})")
         elif node.dtype.kind in "biuf":
             _add_vectors(columns, name, node.shape, partial(load_dataset, node.name))
         elif h5py.check_ref_dtype(node.dtype) is not None:
@@ -718,19 +762,24 @@ def _read_hdf5(path: Path) -> Columns:
             if not prefix and key.startswith("#"):
                 continue
             if isinstance(group.get(key, getlink=True), h5py.ExternalLink):
-                external_names.append(f"{prefix}{key}")
+                unread(_OTHER_FILES, []).append(f"{prefix}{key}")
             elif (node := group.get(key)) is not None:
                 add_node(f"{prefix}{key}", node)
 
     with _report_errors("a MATLAB file"), h5py.File(path) as file:
-        visited_addresses.add(h5py.h5o.get_info(file.id).addr)
+        root = h5py.h5o.get_info(file.id)
+        own_number = root.fileno
+        visited_addresses.add(root.addr)
         add_group(file, "")
-    if external_names:
-        columns.notes.append(f"Not read, as the data are in other files: {', '.join(external_names[:20])}.")
-    return _require_columns(columns)
+    return _add_matlab_objects(columns, path)
+
+
+_OTHER_FILES = "the data are in other files"
 
 
 def _require_columns(columns: Columns) -> Columns:
     if not columns:
-        raise InputError("holds no vectors of numbers; a log needs them")
+        raise InputError(
+            " ".join(["holds no vectors of numbers; a log needs them.", *columns.describe_unread()]).rstrip(".")
+        )
     return columns

@@ -9,7 +9,6 @@ from .least_squares import (
     fit_with_jackknife,
     residual_mean_square,
     rms,
-    scale_columns,
 )
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .resampling import Grid
@@ -376,9 +375,7 @@ def _regress_motor(
         if len(sample) < 3 * rows.shape[1] or is_clear.sum() < 0.25 * len(is_clear):
             continue
         flank = rows[:, 2] = join_segments([low_pass(smooth_sign(m), cutoff, period) for m in mixed])
-        scaled = scale_columns(rows[sample])
-        fitted = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[sample], rcond=1e-12)[0]
-        mean_square = float(np.mean((target[sample] - scaled @ fitted) ** 2))
+        mean_square = residual_mean_square(target[sample], rows[sample])
         if best is None or mean_square < best[0]:
             best = (mean_square, flank, is_clear)
     if best is None:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from .least_squares import fit_with_jackknife, rms, scale_columns
-from .linear_filters import welch_spectrum
 from .resampling import Grid
 from .signal_quality import (
     MIN_SAMPLES,
@@ -121,6 +120,8 @@ def _fit_lateness(
         lateness += step
         if abs(step) < 0.01 * period:
             break
+    from scipy.signal import welch
+
     # the slope that no other column explains, and the torque that no column does
     scaled = scale_columns(regressors)
     own_slope = slope + scaled[:, :-1] @ np.linalg.lstsq(scaled[:, :-1], -slope, rcond=1e-12)[0]
@@ -128,7 +129,7 @@ def _fit_lateness(
     for signal_part in (target - regressors @ values, own_slope):
         signal = np.zeros(len(rows))
         signal[rows] = signal_part
-        densities.append(welch_spectrum(signal, min(2048, len(signal) // 4))[1])
+        densities.append(welch(signal, nperseg=min(2048, len(signal) // 4))[1])
     # a torque that the columns lack hides in the slope at most what it leaves at the slope's frequencies
     missing_error = float(np.sum(np.sqrt(densities[0] * densities[1])) / np.sum(densities[1]))
     accelerating_torque = regressors[:, :encoder_count] @ values[:encoder_count]

@@ -27,12 +27,18 @@ class Columns(dict[ColumnName, Any]):
     Attributes:
         units: units that the file itself gives, by column; `jaxbl inspect --write` puts them into `[log]`.
         notes: remarks on how it was read, in sentences.
+        unread: reason -> names of what was not read for it.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.units: dict[ColumnName, str] = {}
         self.notes: list[str] = []
+        self.unread: dict[str, list[str]] = {}
+
+    def describe_unread(self) -> list[str]:
+        """Return a sentence on each kind of what was not read."""
+        return [f"Not read: {', '.join(names[:20])}: {reason}." for reason, names in self.unread.items() if names]
 
 
 class Column:
@@ -118,21 +124,26 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
     library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
-        summary = library.make_reader(file).get_summary()
+        summary = library.make_reader(file, validate_crcs=True).get_summary()
+        if summary is not None and not summary.chunk_indexes:
+            # the one checksum of a file without chunks is that of all its messages
+            file.seek(0)
+            for _ in import_module("mcap.stream_reader").StreamReader(file, validate_crcs=True).records:
+                pass
     if summary is None or summary.statistics is None:
         raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
     types: dict[int, Any] = {}
-    counts, other_topics = {}, set()
+    counts, other_topics = {}, list[str]()
     for number, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         if channel.message_encoding == "json" or (channel.message_encoding == "cdr" and schema is not None):
             counts[channel.topic] = counts.get(channel.topic, 0) + summary.statistics.channel_message_counts.get(number, 0)
         else:
-            other_topics.add(f"{channel.topic} ({channel.message_encoding})")
+            other_topics.append(f"{channel.topic} ({channel.message_encoding})")
 
     def iterate_messages(topics: Collection[str]) -> _Messages:
         with path.open("rb") as file:
-            for schema, channel, message in library.make_reader(file).iter_messages(topics=list(topics)):
+            for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=list(topics)):
                 if channel.message_encoding == "json":
                     yield channel.topic, message.log_time, json.loads(message.data)
                 else:
@@ -141,10 +152,7 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
                     yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
     columns = _recording_columns(counts, iterate_messages, selection)
-    if other_topics:
-        columns.notes.append(
-            f"Messages in other formats than JSON and ROS 2 are not read: {', '.join(sorted(other_topics))}."
-        )
+    columns.unread["messages in other formats than JSON and ROS 2"] = other_topics
     return columns
 
 

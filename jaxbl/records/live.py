@@ -20,7 +20,7 @@ import numpy as np
 from jaxbl.errors import InputError, shorten
 from jaxbl.validation import check_file
 
-from .channels import to_si, to_signed
+from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
@@ -157,24 +157,19 @@ class _ChannelReader:
         else:
             stamps = values[:, self._indices[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
         torque_table = self._table.u or TorqueTable()
-        torque = to_si(torque_table, self._read_numbers(values, torque_table.column_or("u"), torque_table.signed_bits))
+        torque = to_si(torque_table, decode_words(torque_table, values[:, self._indices[torque_table.column_or("u")]]))
         signals = [stamps, torque]
         for name in POSITION_CHANNELS.values():
             channel, position_table = self._table.position_source(name)
-            bits = position_table.signed_bits
-            numbers = self._read_numbers(values, position_table.column_or(channel), bits)
+            numbers = decode_words(position_table, values[:, self._indices[position_table.column_or(channel)]])
             if isinstance(position_table, PositionTable) and position_table.minus is not None:
-                numbers = numbers - self._read_numbers(values, position_table.minus, bits)
+                numbers = numbers - decode_words(position_table, values[:, self._indices[position_table.minus]])
             signals.append(numbers)
         samples = np.stack(signals)
         samples = samples[:, np.isfinite(samples).all(axis=0)]
         for i, name in enumerate(POSITION_CHANNELS.values(), 2):
             samples[i] = self._read_position(name, samples[i], samples[0])
         return samples, len(values) - samples.shape[1]
-
-    def _read_numbers(self, values: np.ndarray, column: ColumnName, bits: int | None) -> np.ndarray:
-        numbers = values[:, self._indices[column]]
-        return numbers if bits is None else to_signed(numbers, bits)
 
     def _read_position(self, name: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .linear_filters import butterworth_coefficients, filter_both_ways, welch_spectrum
-
 MIN_SAMPLES = 64
 """Samples that a log needs, and a segment that is filtered and regressed: ten for each of six terms of a regression.
 
@@ -72,10 +70,12 @@ def power_spectrum(values: np.ndarray, period: float) -> tuple[np.ndarray, np.nd
     Returns:
         Frequencies, Hz, without 0, and densities, unit²/Hz.
     """
+    from scipy.signal import welch
+
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
     length = min(max(len(differences) // 4, 16), 4096, len(differences))
-    frequency, density = welch_spectrum(differences, length)
+    frequency, density = welch(differences, nperseg=length)
     frequency, density = frequency[1:], density[1:]
     return frequency / period, density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
 
@@ -162,9 +162,10 @@ def low_pass(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
     """
     if 2.0 * cutoff * period > 0.8:
         return values
-    return filter_both_ways(
-        values, *butterworth_coefficients(2.0 * cutoff * period), min(len(values) - 1, round(2.0 / (cutoff * period)))
-    )
+    from scipy.signal import butter, sosfiltfilt
+
+    padding = min(len(values) - 1, round(2.0 / (cutoff * period)))
+    return sosfiltfilt(butter(2, 2.0 * cutoff * period, output="sos"), values, axis=0, padlen=padding)
 
 
 def trim_filter_ends(samples: int, cutoff: float, period: float) -> slice:

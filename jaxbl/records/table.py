@@ -85,6 +85,13 @@ class _ChannelTable(_ColumnTable):
 
     sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
     signed_bits: int | None = _optional("word length of two's complement numbers that were logged as unsigned", ge=2, le=63)
+    sign_bit: int | None = _optional("bit, counted from 0, that is the sign of sign-magnitude words", ge=1, le=62)
+
+    @model_validator(mode="after")
+    def _check_words(self) -> Any:
+        if self.signed_bits is not None and self.sign_bit is not None:
+            raise table_error("has both signed_bits and sign_bit; two's complement words have no bit for the sign alone")
+        return self
 
 
 class PositionTable(_ChannelTable):

@@ -1,7 +1,9 @@
 """Columns out of files of every kind."""
 
 import json
+import struct
 import sys
+from contextlib import suppress
 from types import SimpleNamespace
 
 import h5py
@@ -126,6 +128,99 @@ def test_cells_of_matlab_and_matrices_of_json(tmp_path):
             np.testing.assert_array_equal(file.load_numbers(column), values)
 
 
+def write_objects(path, objects, columns):
+    """Write vectors, and objects (class by name) as MATLAB does: in a v7 file, or as `-v7.3` (suffix .h5)."""
+    if path.suffix == ".h5":
+        write_matlab73(path, **columns)
+        with h5py.File(path, "r+") as file:
+            for name, kind in objects.items():
+                file[name] = np.array([[3707764736, 2, 1, 1, 1, 1]], dtype=np.uint32)
+                file[name].attrs.update({"MATLAB_class": np.bytes_(kind), "MATLAB_object_decode": np.int32(3)})
+        return
+
+    def element(code, content):
+        return struct.pack("<II", code, len(content)) + content + bytes(-len(content) % 8)
+
+    savemat(path, columns)
+    with path.open("ab") as file:
+        for name, kind in objects.items():
+            reference = np.array([3707764736, 2, 1, 1, 1, 1], dtype="<u4").tobytes()
+            matrix = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 6, 1)) + element(1, b"")
+            texts = b"".join(element(1, text.encode()) for text in (name, "MCOS", kind))
+            file.write(
+                element(14, element(6, struct.pack("<II", 17, 0)) + texts + element(14, matrix + element(6, reference)))
+            )
+
+
+OBJECT_CLASSES = ("table", "timetable", "timeseries", "datetime", "duration", "string", "categorical", "containers.Map")
+
+
+@pytest.mark.parametrize("ending", [".mat", ".h5"])
+@pytest.mark.parametrize("seed", range(5))
+def test_vectors_beside_objects_of_matlab_are_read_and_the_objects_named(tmp_path, seed, ending):
+    random = np.random.default_rng(seed)
+    kinds = random.choice(OBJECT_CLASSES, random.integers(1, 4), replace=False)
+    objects = {f"object{i}": str(kind) for i, kind in enumerate(kinds)}
+    columns = {f"x{i}": random.standard_normal(70) for i in range(random.integers(1, 4))}
+    write_objects(tmp_path / f"log{ending}", objects, columns)
+    file = read_log_file(tmp_path / f"log{ending}")
+    assert list(file.columns) == list(columns)
+    for name, values in columns.items():
+        np.testing.assert_array_equal(file.load_numbers(name), values)
+    (note,) = file.notes
+    assert all(f"{name} ({kind})" in note for name, kind in objects.items()) and "save" in note
+    with pytest.raises(InputError, match=r"no column 'theta'.*object0"):
+        file.find_column("theta")
+    write_objects(tmp_path / f"alone{ending}", objects, {})
+    with pytest.raises(InputError, match=r"holds no vectors of numbers.*object0"):
+        read_log_file(tmp_path / f"alone{ending}")
+
+
+@pytest.mark.filterwarnings("ignore")  # of the library
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+def test_tables_and_dates_of_matlab_by_their_library(tmp_path, version):
+    library = pytest.importorskip("matio", reason="the extra logs is not installed")
+    table = pd.DataFrame({"t": T, "u": U})
+    times = table.set_index(pd.to_timedelta(T, unit="s").rename("Time"))
+    library.save_to_mat(tmp_path / "log.mat", {"T": table, "S": times, "s": {"inner": table}, "u": U}, version=version)
+    file = read_log_file(tmp_path / "log.mat")
+    for column in ("T.u", "S.u", "s.inner.u", "u"):
+        np.testing.assert_array_equal(file.load_numbers(column), U)
+    np.testing.assert_allclose(file.load_seconds("S.Time", 1.0), T, atol=1e-12)
+    assert not file.notes
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_links_of_hdf5_that_end_in_other_files_are_not_followed(tmp_path, seed):
+    """A soft link may lead to an external one, or through it, at any depth."""
+    random = np.random.default_rng(seed)
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        secret["group/u"] = secret["u"] = U
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["t"] = T
+        is_dataset, depth, inside = random.integers(0, 2), random.integers(1, 4), random.integers(0, 2) * "run/"
+        target = "/u" if is_dataset else "/group"
+        file[f"{inside}link"] = h5py.ExternalLink(tmp_path / "secret.h5", target)
+        place = f"/{inside}link"
+        for i in range(depth):
+            file[f"soft{i}"] = h5py.SoftLink(place if i or is_dataset else f"{place}/u")
+            place = f"/soft{i}"
+        file["own"] = h5py.SoftLink("/t")
+    log = read_log_file(tmp_path / "log.h5")
+    assert set(log.columns) == {"t", "own"}
+    assert all(f"soft{i}" in log.notes[0] for i in range(depth)) and "other files" in log.notes[0]
+
+
+def test_lines_of_json_and_objects_within_rows(tmp_path):
+    rows = [{"t": t, "motor": {"u": u, "q": [u, t]}} for t, u in zip(T.tolist(), U.tolist(), strict=True)]
+    (tmp_path / "log.jsonl").write_text("\n".join(map(json.dumps, rows)) + "\n")
+    (tmp_path / "log.json").write_text(json.dumps(rows))
+    for name in ("log.jsonl", "log.json"):
+        file = read_log_file(tmp_path / name)
+        for column, values in {"t": T, "motor.u": U, "motor.q[0]": U, "motor.q[1]": T}.items():
+            np.testing.assert_array_equal(file.load_numbers(column), values)
+
+
 def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkeypatch):
     frame = pd.DataFrame({"t": T, "u": U, "other": 2.0 * U})
     frame.to_csv(tmp_path / "log.csv", index=False)
@@ -152,7 +247,7 @@ BAD_FILES = {
     "ragged.csv": (b"t,u\n1,2\n1,2,3\n", "cannot be read as a table: .* line 3"),
     "photo.png": (b"\x89PNG\0\0\0", "is not a log of a known kind"),
     "broken.json": (b'{"t": [1, 2', "is not valid JSON"),
-    "scalars.json": (b'{"t": 1}', "holds no array of rows or of numbers"),
+    "scalars.json": (b'{"t": 1}', "holds no vectors of numbers"),
     "list.json": (b"[1, 2]", "should hold an array of objects, one a row, or of rows of equally many numbers"),
     "ragged.json": (b"[[1, 2], [3]]", "should hold an array of objects"),
     "bag.db3": (b"SQLite format 3\0", "perhaps of a ROS 2 bag; give the bag's folder"),
@@ -309,6 +404,30 @@ def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
     file = read_log_file(tmp_path / "bag", {"t", "/joint_states.position[0]"})
     for column, values in {"t": T, "/joint_states.position[0]": T, "/joint_states.effort[0]": U}.items():
         np.testing.assert_allclose(file.load_numbers(column), values, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "options", [{"chunk_size": 2000}, {"compression": 0}, {"use_chunking": False, "enable_data_crcs": True}]
+)
+def test_a_flipped_bit_of_an_mcap_file_is_found(tmp_path, options, repeats):
+    random = np.random.default_rng(0)
+    path, names = tmp_path / "log.mcap", ("t", "/axis.u", "/axis.x")
+    pytest.importorskip("mcap")
+    if "compression" in options:
+        from mcap.writer import CompressionType
+
+        options = {"compression": CompressionType.NONE}
+    messages = [(0.01 * i, {"u": u, "x": x}) for i, (u, x) in enumerate(random.standard_normal((100, 2)).tolist())]
+    write_mcap(path, {"axis": messages}, **options)
+    content, file = path.read_bytes(), read_log_file(path, names)
+    truth = [file.load_numbers(name) for name in names]
+    for _ in range(repeats(40, 400)):
+        damaged = bytearray(content)
+        damaged[random.integers(len(content))] ^= 1 << random.integers(8)
+        path.write_bytes(damaged)
+        with suppress(InputError):
+            file = read_log_file(path, names)
+            np.testing.assert_array_equal([file.load_numbers(name) for name in names], truth)
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,12 @@ TABLES = {
         "theta_e": {"column": "sum", "minus": "deg", "unit": "deg"},
         "theta_s": {"column": "deg", "unit": "deg"},
     },
+    "sign and magnitude": {
+        "t": {"column": "ms", "unit": "ms"},
+        "u": {"column": "magnitude", "factor": 0.01, "sign_bit": 10},
+        "theta_e": {"column": "sum", "minus": "deg", "unit": "deg"},
+        "theta_s": {"column": "deg", "unit": "deg"},
+    },
     "numbers, without stamps": {"t": {"period": PERIOD}, "u": 1, "theta_e": {"column": 5, "unit": "deg"}, "theta_s": 3},
     "speed": {
         "t": {"column": "ms", "unit": "ms"},
@@ -167,6 +173,7 @@ def make_columns(count=2000):
             "word": np.round(100.0 * np.cos(3.0 * time)) % 65536,
             "sum": np.rad2deg(motor + load),
             "rpm": 120.0 * np.cos(3.0 * time) * 30.0 / np.pi,
+            "magnitude": np.abs(np.round(100.0 * np.cos(3.0 * time))) + 1024 * (np.cos(3.0 * time) < 0.0),
         }
     )
 

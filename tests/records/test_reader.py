@@ -100,19 +100,20 @@ def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
 @settings(max_examples=40, deadline=None)
 @given(
     st.sampled_from(["N m", "V", "A", "counts"]), st.floats(0.01, 100.0), st.sampled_from([1, -1]), st.floats(-1.0, 1.0),
-    st.booleans(),
+    st.sampled_from(["", "signed_bits", "sign_bit"]), st.integers(15, 20),
 )  # fmt: skip
-def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, sign, offset, words):
+def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, sign, offset, words, sign_bit):
     truth = simulate_log(count=400, period=2e-3)
     log = {"column": "x", "unit": unit, "factor": factor, "sign": sign, "offset": offset}
     column = (truth["u"].to_numpy() - offset) * sign / factor
     step = 0.0
     if words:
         log["factor"] = factor = 1e-4
-        column, step = np.round((truth["u"].to_numpy() - offset) * sign / 1e-4) % 2.0**16, 1e-4
+        column, step = np.round((truth["u"].to_numpy() - offset) * sign / 1e-4), 1e-4
         if np.abs(truth["u"] - offset).max() > 3.2:
             return
-        log["signed_bits"] = 16
+        log[words] = sign_bit + (words == "signed_bits")
+        column = column % 2.0 ** (sign_bit + 1) if words == "signed_bits" else np.abs(column) + (column < 0) * 2.0**sign_bit
     path = write_frame(tmp_path_factory.mktemp("units"), truth.assign(x=column))
     record = read_record(path, {"u": log})
     np.testing.assert_allclose(record.torque, truth["u"], atol=0.5 * step + 1e-9)
@@ -413,6 +414,7 @@ BAD = {
         r"set signed_bits = 16 in \[log\] u",
     ),
     "no such word": (lambda f: f, {"u": {"signed_bits": 8}}, r"column 'u', data row 1: .* is no word of 8 bits"),
+    "no such magnitude": (lambda f: f, {"u": {"sign_bit": 10}}, r"column 'u', data row 1: .* is no word of 11 bits"),
     "beyond saturation": (lambda f: f, {"u": {"saturation": 0.1}}, r"exceeds \[log\] u.saturation = 0.1"),
     "degrees": (
         replace_columns(theta_e=lambda f: np.round(f["theta_e"] / (2.0 * np.pi) * 8192) * 360.0 / 8192),
