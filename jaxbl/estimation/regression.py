@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
 from jaxbl.records.least_squares import BlockRegression
-from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
 from .compilation import jit
@@ -238,7 +237,9 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
     """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
     if factor == 1:
         return values
-    return jnp.convolve(values, jnp.asarray(low_pass_taps(20 * factor + 1, 1.0 / factor), values.dtype), "valid")[::factor]
+    from scipy.signal import firwin
+
+    return jnp.convolve(values, jnp.asarray(firwin(20 * factor + 1, 1.0 / factor), values.dtype), "valid")[::factor]
 
 
 def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:

@@ -96,16 +96,17 @@ def _read_numbers(
 ) -> np.ndarray:
     """Read the numbers of a column at the selected rows; words become signed numbers."""
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
-    values = file.load_numbers(column, f"{name}.column")
+    values = file.load_numbers(column, f"{name}.column", stamps.rows)
     signed_words = decode_words(table, values)
     is_no_word = np.isnan(signed_words)
     if is_no_word.any():
         row = int(np.argmax(is_no_word))
         bits, key = (table.signed_bits, "signed_bits") if table.sign_bit is None else (table.sign_bit + 1, "sign_bit")
         raise file.error(
-            f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] {name}.{key}"
+            f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
+            f"{name}.{key}"
         )
-    return signed_words[stamps.rows]
+    return signed_words
 
 
 def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
-from .least_squares import BLOCKS, column_rms, fit_with_jackknife, rms
+from .least_squares import BLOCKS, BlockRegression, column_rms, fit_with_jackknife, rms
 from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass
 
 _MAX_SAMPLES = 20_000
@@ -394,12 +394,8 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
 def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
     """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
     columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
-    errors = []
-    for block in np.array_split(np.arange(len(torque)), _FOLDS):
-        sizes = _fit_sizes(np.delete(columns, block, axis=0), np.delete(torque, block))
-        errors.append(float(np.mean((torque[block] - columns[block] @ sizes) ** 2)))
     # rounding, for a log without noise
-    return np.array(errors) + 1e-24 * float(np.mean(torque**2))
+    return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * float(np.mean(torque**2))
 
 
 def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:

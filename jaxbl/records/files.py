@@ -12,11 +12,10 @@ import json
 import math
 import re
 import warnings
-from codecs import BOM_UTF8
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +30,8 @@ from .libraries import Column, ColumnName, Columns, Selection, read_bag, read_mc
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
-    (b"TDSm", "TDMS", lambda path, selection: read_tdms(path)),
-    (b"MDF", "MDF", lambda path, selection: read_mdf(path)),
+    (b"TDSm", "TDMS", read_tdms),
+    (b"MDF", "MDF", read_mdf),
     (b"\x89MCAP", "MCAP", read_mcap),
     (b"#ROSBAG", "a ROS bag", read_bag),
 )
@@ -140,26 +139,33 @@ class LogFile:
         """
         name = self.find_column(column, channel)
         stamps = self.load_values(name)
+        if stamps.dtype.kind not in "biufcMm":
+            # a decimal comma; hours, minutes and seconds are those of any day
+            texts = pd.Series(stamps).astype(str).str.replace(",", ".")
+            if pd.to_numeric(texts, errors="coerce").isna().all():
+                stamps = pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).dt.tz_convert(None).to_numpy()
         if stamps.dtype.kind not in "Mm":
             return self.load_numbers(column, channel) * unit
         if unit != 1.0:
             raise self.error(f"column {name!r} holds dates or times, which have their own unit; remove [log] t.unit")
         if np.isnat(stamps).any():
             row = int(np.argmax(np.isnat(stamps))) + 1
-            raise self.error(f"column {name!r}, data row {row} is empty; it should be a time")
+            raise self.error(f"column {name!r}, data row {row} is no time, or empty")
         if stamps.dtype.kind == "M" and len(stamps):
             self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
         # of whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
         return 1e-9 * (stamps - stamps[:1]).astype("timedelta64[ns]").astype(np.int64)
 
-    def load_numbers(self, column: ColumnName, channel: str = "") -> np.ndarray:
-        """Load a column of finite numbers, shape (rows,).
+    def load_numbers(self, column: ColumnName, channel: str = "", rows: np.ndarray | None = None) -> np.ndarray:
+        """Load a column of finite numbers, or some `rows` of it, shape (rows,).
 
         Raises:
             InputError: a row, counted from 1, holds no finite number.
         """
         name = self.find_column(column, channel)
         cells = self.load_values(name)
+        rows = np.arange(len(cells)) if rows is None else rows
+        cells = cells[rows]
         if cells.dtype.kind in "cMm":
             kind = "complex numbers" if cells.dtype.kind == "c" else "dates or times"
             raise self.error(f"column {name!r} holds {kind}; it should hold real numbers")
@@ -167,14 +173,12 @@ class LogFile:
         is_finite = np.abs(values) <= LARGEST
         if not is_finite.all():
             row = int(np.argmin(is_finite))
-            cell = np.asarray(cells, dtype=object)[row]
+            cell, place = np.asarray(cells, dtype=object)[row], f"column {name!r}, data row {rows[row] + 1} is"
             if np.isfinite(values[row]):
-                raise self.error(
-                    f"column {name!r}, data row {row + 1} is {values[row]:g}; a reading should be below {LARGEST:g}"
-                )
+                raise self.error(f"{place} {values[row]:g}; a reading should be below {LARGEST:g}")
             is_empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
             fault = "empty or not a number" if is_empty else repr(cell)
-            raise self.error(f"column {name!r}, data row {row + 1} is {fault}; it should be a finite number")
+            raise self.error(f"{place} {fault}; it should be a finite number, as 1234.5")
         return values
 
     def check_length(self, name: ColumnName, length: int) -> None:
@@ -257,17 +261,29 @@ def _read_columns(path: Path, selection: Selection) -> Columns:
         return _read_hdf5(path)
     if suffix == ".mat":
         return _read_matlab(path, selection)
-    if head.startswith(b"SQLite format 3"):
-        raise InputError("is a database, perhaps of a ROS 2 bag; give the bag's folder, the one with metadata.yaml")
+    for first_bytes, remedy in _REMEDIES.items():
+        if head.startswith(first_bytes):
+            raise InputError(remedy)
+    if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        # Excel and LabVIEW
+        return _read_text(path, head, "utf-16", is_complete, selection)
     if b"\0" in head:
         raise InputError(f"is not a log of a known kind; {_READABLE_KINDS}")
-    # whole lines, so that no letter is cut
-    head = head if is_complete else head[: head.rfind(b"\n") + 1] or head
     try:
-        return _read_text(path, head.decode("utf-8-sig"), "utf-8-sig", is_complete, selection)
+        return _read_text(path, head, "utf-8-sig", is_complete, selection)
     except UnicodeDecodeError:
         # a degree sign in a header of an old program
-        return _read_text(path, head.decode("latin-1"), "latin-1", is_complete, selection)
+        return _read_text(path, head, "latin-1", is_complete, selection)
+
+
+_REMEDIES = {
+    b"SQLite format 3": "is a database, perhaps of a ROS 2 bag; give the bag's folder, the one with metadata.yaml",
+    b"\x93NUMPY": "is an array of NumPy; save it by numpy.savetxt",
+    b"\x1f\x8b": "is compressed; unpack it first, as by gunzip",
+    b"PK": "is a workbook or an archive; save its sheet or arrays as CSV",
+    b"\xd0\xcf\x11\xe0": "is a workbook; save the sheet as CSV",
+}
+"""First bytes of a kind that is not read -> fault and remedy."""
 
 
 def _read_with_installed_reader(path: Path, suffix: str) -> Columns:
@@ -285,8 +301,11 @@ def _read_with_installed_reader(path: Path, suffix: str) -> Columns:
     return columns
 
 
-def _read_text(path: Path, head: str, encoding: str, is_complete: bool, selection: Selection) -> Columns:
-    """Read JSON or a table. `head` is the beginning of the text, or all of it (`is_complete`)."""
+def _read_text(path: Path, start: bytes, encoding: str, is_complete: bool, selection: Selection) -> Columns:
+    """Read JSON or a table. `start` is the beginning of the file, or all of it (`is_complete`)."""
+    # whole lines and letters
+    head = getincrementaldecoder(encoding)().decode(start, is_complete)
+    head = head if is_complete else head[: head.rfind("\n") + 1] or head
 
     def load_text() -> str:
         check_file(path, _MAX_WHOLE_BYTES)
@@ -343,14 +362,14 @@ def _report_errors(kind: str, *unchanged: type[Exception]) -> Iterator[None]:
 
 
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_VALUE = re.compile(rf"{_NUMBER.pattern}|.*\d[:-]\d.*", re.IGNORECASE)
+"""A number, a date or a time."""
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
 def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], str], selection: Selection) -> Columns:
     """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks."""
     lines = head.splitlines()
-    if max(map(len, lines)) == len(head) and len(head) > _HEAD_BYTES // 2:
-        raise InputError(f"has no line break in its first {len(head)} characters; a log has a line for each row")
     if (columns := _read_after_remarks(lines, load_text)) is not None:
         return columns
     text_format = detect_text_format(lines)
@@ -506,14 +525,16 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
         return None
     count = len(_split_cells(lines[start], separator))
     is_known_program = any(title in line for line in remarks for title in ("EPOS Studio", "Starttime of export"))
-    if not is_known_program and len(_split_cells(remarks[0], separator)) == count:
+    titles = [_split_cells(line, separator) for line in remarks]
+    # a row of units has no number
+    is_row = len(titles[0]) == count and any(map(_VALUE.fullmatch, titles[-1]))
+    if is_row and not is_known_program:
         return None
     rows = [line for line in load_text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
     decimal = _find_decimal_sign(rows, separator)
     frame = pd.read_csv(
         io.StringIO("\n".join(rows)), sep=separator, header=None, decimal=decimal, skipinitialspace=True, index_col=False
     )
-    titles = [_split_cells(line, separator) for line in remarks]
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope_names = [cells for cells in titles if cells[0] == "Name"]
     if scope_names:
@@ -530,7 +551,7 @@ def _is_number_row(line: str) -> bool:
     separator = _find_separator(line)
     cells = [] if separator == _WHITE_SPACE else _split_cells(line, separator)
     cells = cells[:-1] if cells and not cells[-1] else cells
-    return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)
+    return len(cells) > 1 and all(map(_VALUE.fullmatch, cells))
 
 
 def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
@@ -543,15 +564,15 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
             own_times = column
             if i:
                 continue
-            name = "t"
-        elif not np.array_equal(own_times, times, equal_nan=True):
+            name = name if name not in ("", "Name") else "t"
+        elif own_times is not times and not np.array_equal(own_times, times, equal_nan=True):
             is_finite = np.isfinite(own_times) & np.isfinite(column)
             column = np.interp(times, own_times[is_finite], column[is_finite])
             columns.notes.append(f"'{name}' was sampled at other times: it is interpolated to those of the first column.")
         name = name or f"column {i}"
         columns[name] = column
         if i < len(units) and units[i]:
-            columns.units[name] = units[i]
+            columns.units[name] = units[i].strip("[]()")
     if columns.units:
         units_text = ", ".join(f"{name} {unit}" for name, unit in columns.units.items())
         columns.notes.append(f"The file gives these units, which [log] should repeat: {units_text}.")
@@ -609,9 +630,7 @@ def _is_matrix(value: Any) -> bool:
 def _add_columns(columns: Columns, name: str, value: Any) -> None:
     """Add a vector, the columns of a matrix (`name[0]`), members of a structure (`name.key`) or of cells (`name[0]`)."""
     if isinstance(value, pd.DataFrame):
-        # the times of a timetable are its index
-        frame = value.reset_index() if value.index.name else value
-        value = {column: cells.tolist() if cells.dtype == object else cells for column, cells in frame.items()}
+        value = {column: cells.tolist() if cells.dtype == object else cells for column, cells in value.items()}
     elif isinstance(value, list):
         value = np.asarray(value, float) if _is_matrix(value) else pd.Series(value, dtype=object).infer_objects()
     if not isinstance(value, dict):
@@ -625,12 +644,12 @@ def _add_columns(columns: Columns, name: str, value: Any) -> None:
         for key, member in value.items():
             _add_columns(columns, f"{name}.{key}" if name else key, member)
     elif value.dtype == object and not value.ndim:
-        if isinstance(value.item(), np.ndarray | pd.DataFrame):
+        if isinstance(value.item(), np.ndarray):
             _add_columns(columns, name, value.item())
     elif value.dtype.names or (value.dtype == object and any(isinstance(cell, np.ndarray | dict) for cell in value.flat)):
         for i, member in enumerate(value.flat):
             _add_columns(columns, f"{name}[{i}]", member)
-    elif value.dtype.kind in "biufMmO":
+    elif value.dtype.kind in "biufO":
         _add_vectors(columns, name, value.shape, lambda: value)
 
 
@@ -644,7 +663,7 @@ def _read_matlab(path: Path, selection: Selection) -> Columns:
 
     with _report_errors("a MATLAB file"):
         variables = _list_matlab_variables(path)
-    selected_variables = {*map(_find_variable, selection)}
+    selected_variables = {re.split(r"[.\[]", str(column))[0] for column in selection}
     columns = Columns()
     postponed = []
     for name, shape, kind in variables:
@@ -661,15 +680,10 @@ def _read_matlab(path: Path, selection: Selection) -> Columns:
     # a message that lists columns has to know their names
     for name in postponed if not any(column in columns for column in selection) else ():
         _add_columns(columns, name, load_variable(name))
-    return _add_matlab_objects(columns, path)
+    return _require_columns(columns)
 
 
-_MATLAB_OBJECTS = "objects of MATLAB; save their vectors, as t = seconds(T.Time), or pip install 'jaxbl[logs]' for tables"
-
-
-def _find_variable(column: ColumnName) -> str:
-    """Return the variable of a MATLAB file that holds a column."""
-    return re.split(r"[.\[ ]", str(column))[0]
+_MATLAB_OBJECTS = "objects of MATLAB; save their vectors, as t = seconds(T.Time); u = T.u"
 
 
 def _list_matlab_variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
@@ -691,18 +705,6 @@ def _list_matlab_variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]
     return [variable for variable in variables if not variable[0].startswith("__")]
 
 
-def _add_matlab_objects(columns: Columns, path: Path) -> Columns:
-    """Add the columns of tables and dates by the library mat-io, where it is installed and knows them."""
-    names = columns.unread.get(_MATLAB_OBJECTS, [])
-    # without the library, or for what it does not know, the names are said
-    with suppress(Exception):
-        variables = list({*map(_find_variable, names)})
-        for name, variable in import_module("matio").load_from_mat(path, variable_names=variables).items() if names else ():
-            names[:] = [unread for unread in names if _find_variable(unread) != name]
-            _add_columns(columns, name, variable)
-    return _require_columns(columns)
-
-
 def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
     """Add a vector, or the columns of a matrix, whose values `load` returns; lengths of 1 in `shape` do not count."""
     shape = tuple(length for length in shape if length != 1)
@@ -718,63 +720,52 @@ def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Call
 
 
 def _read_hdf5(path: Path) -> Columns:
-    """Read MATLAB 7.3, or any HDF5 file of vectors. Links into other files are not followed: they could name any file."""
+    """Read MATLAB 7.3, or any HDF5 file of vectors. Links are not followed: they could name any file."""
     import h5py
 
     columns = Columns()
-    visited_addresses: set[Any] = set()
-    unread = columns.unread.setdefault
+    referring_nodes: set[Any] = set()
 
     def load_dataset(place: str) -> np.ndarray:
         with _report_errors("a MATLAB file"), h5py.File(path) as file:
             return np.asarray(file[place])
 
     def add_node(name: str, node: Any) -> None:
-        # groups may hold one another, or themselves
-        place = h5py.h5o.get_info(node.id)
-        address, matlab_class = place.addr, node.attrs.get("MATLAB_class", b"").decode()
-        if place.fileno != own_number:
-            # a link to a link into another file
-            unread(_OTHER_FILES, []).append(name)
-        elif isinstance(node, h5py.Group):
-            if address not in visited_addresses:
-                visited_addresses.add(address)
-                add_group(node, f"{name}.")
-        elif node.is_virtual or node.external:
-            unread(_OTHER_FILES, []).append(name)
-        elif matlab_class == "char":
+        if not isinstance(node, h5py.Group):
+            return add_dataset(name, node)
+
+        def add_member(place: str, link: Any) -> None:
+            member = f"{name}.{place}".strip(".").replace("/", ".")
+            if isinstance(link, h5py.HardLink):
+                add_dataset(member, node[place])
+            else:
+                columns.unread.setdefault(_LINKS, []).append(member)
+
+        return node.visititems_links(add_member)
+
+    def add_dataset(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Group) or name.startswith("#"):
             return
+        matlab_class = node.attrs.get("MATLAB_class", b"").decode()
+        if node.is_virtual or node.external:
+            columns.unread.setdefault(_LINKS, []).append(name)
         elif "MATLAB_object_decode" in node.attrs:
-            unread(_MATLAB_OBJECTS, []).append(f"{name} ({matlab_class})")
-        elif node.dtype.kind in "biuf":
+            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({matlab_class})")
+        elif node.dtype.kind in "biuf" and matlab_class != "char":
             _add_vectors(columns, name, node.shape, partial(load_dataset, node.name))
-        elif h5py.check_ref_dtype(node.dtype) is not None:
-            # cells, and structures with several elements
-            if node.size > _MAX_COLUMNS or address in visited_addresses:
-                return
-            visited_addresses.add(address)
+        # cells, and structures with several elements; they may hold one another
+        elif h5py.check_ref_dtype(node.dtype) is not None and node.size <= _MAX_COLUMNS and node not in referring_nodes:
+            referring_nodes.add(node)
             for i, reference in enumerate(np.ravel(node[()])):
                 if reference:
                     add_node(f"{name}[{i}]", node.file[reference])
 
-    def add_group(group: Any, prefix: str) -> None:
-        for key in group:
-            if not prefix and key.startswith("#"):
-                continue
-            if isinstance(group.get(key, getlink=True), h5py.ExternalLink):
-                unread(_OTHER_FILES, []).append(f"{prefix}{key}")
-            elif (node := group.get(key)) is not None:
-                add_node(f"{prefix}{key}", node)
-
     with _report_errors("a MATLAB file"), h5py.File(path) as file:
-        root = h5py.h5o.get_info(file.id)
-        own_number = root.fileno
-        visited_addresses.add(root.addr)
-        add_group(file, "")
-    return _add_matlab_objects(columns, path)
+        add_node("", file)
+    return _require_columns(columns)
 
 
-_OTHER_FILES = "the data are in other files"
+_LINKS = "links are not followed; copy the data into the file"
 
 
 def _require_columns(columns: Columns) -> Columns:

@@ -8,10 +8,12 @@ from array import array
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from jaxbl.errors import InputError
 
@@ -66,7 +68,7 @@ def _import_library(name: str, kind: str, package: str = "") -> Any:
         raise InputError(f"is {kind}, which needs the package {package or name}: pip install 'jaxbl[logs]'") from None
 
 
-def read_tdms(path: Path) -> Columns:
+def read_tdms(path: Path, _: Selection = ()) -> Columns:
     """Read channels of a TDMS file by name, by `group/channel` if a name occurs twice; `t` from their increment, s."""
     library = _import_library("nptdms", "TDMS")
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
@@ -88,7 +90,7 @@ def read_tdms(path: Path) -> Columns:
     return columns
 
 
-def read_mdf(path: Path) -> Columns:
+def read_mdf(path: Path, _: Selection = ()) -> Columns:
     """Read channels of an MDF file by name; `t` are the times of the group with the most samples, s.
 
     Channels of other groups, which have their own times, are interpolated to these.
@@ -115,6 +117,9 @@ def read_mdf(path: Path) -> Columns:
 _MAX_LIST_LENGTH = 64
 """Elements of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
 
+_FIRST_MESSAGES = 100
+"""Messages of a topic whose names are listed before any of it is selected: several publishers may write to it."""
+
 
 _Messages = Iterator[tuple[str, int, Any]]
 """Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
@@ -125,11 +130,6 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     library = _import_library("mcap.reader", "MCAP", "mcap")
     with path.open("rb") as file:
         summary = library.make_reader(file, validate_crcs=True).get_summary()
-        if summary is not None and not summary.chunk_indexes:
-            # the one checksum of a file without chunks is that of all its messages
-            file.seek(0)
-            for _ in import_module("mcap.stream_reader").StreamReader(file, validate_crcs=True).records:
-                pass
     if summary is None or summary.statistics is None:
         raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
     types: dict[int, Any] = {}
@@ -168,7 +168,7 @@ def _message_types(schema: Any) -> Any:
 
 
 def read_bag(path: Path, selection: Selection = ()) -> Columns:
-    """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
+    """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[arm]`; `t` is their time, s.
 
     A time is the stamp in the message's header, or the time of recording if there is none. Among the topics of the
     `selection` the one with the most messages gives the times; the others are interpolated to them.
@@ -191,84 +191,98 @@ def read_bag(path: Path, selection: Selection = ()) -> Columns:
 def _recording_columns(
     counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Selection
 ) -> Columns:
-    """Return the columns of a recording; the first one that is used of a topic loads all its selected ones.
+    """Return the columns of a recording. All messages of the selected topics are read, of others the first ones.
 
     `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of topics.
     """
-    fields: dict[str, dict[str, list[ColumnName]]] = {}
-    for topic, count in counts.items():
-        first_message = next(iterate_messages([topic]), None) if count else None
-        if first_message is not None:
-            fields[topic] = dict(_find_numbers(first_message[2], []))
-    places = {f"{topic}.{field}": (topic, field) for topic, paths in fields.items() for field in paths}
-    if not places:
-        raise InputError("holds no messages with numbers; a log needs them")
-    selected_topics = {places[name][0] for name in selection if name in places}
-    main = max((topic for topic in selected_topics or fields if fields[topic]), key=lambda topic: counts[topic])
-    loaded_values: dict[str, np.ndarray] = {}
+    loaded_values: dict[ColumnName, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
 
-    def load_topic(topic: str, name: str = "") -> None:
-        names = [column for column, place in places.items() if place[0] == topic and (column in selection or column == name)]
-        paths = [fields[topic][places[column][1]] for column in names]
-        stamps, recording_times, rows = array("q"), array("q"), array("d")
+    def load_topic(topic: str, names: list[ColumnName]) -> dict[str, None]:
+        """Load the times and some columns of a topic; return the names of all its columns."""
+        stamps, recording_times, rows, field_names = array("q"), array("q"), array("d"), dict[str, None]()
         for _, time, message in iterate_messages([topic]):
-            stamps.append(_header_time(message))
+            numbers = dict(_find_numbers(message, topic, {}))
+            field_names |= dict.fromkeys(numbers)
+            stamps.append(_find_stamp(message))
             recording_times.append(time)
-            rows.extend(float(_number_at(message, path)) for path in paths)
+            rows.extend(float(numbers.get(str(name), np.nan)) for name in names)
         # a clock may begin at 0; headers that are not filled in are all 0
         has_stamps = len(stamps) > 1 and all(stamps[1:])
         times[topic] = np.frombuffer(stamps if has_stamps else recording_times, dtype=np.int64)
         values = np.frombuffer(rows, dtype=float).reshape(len(stamps), len(names))
         loaded_values.update(zip(names, values.T, strict=True))
+        return field_names
+
+    places: dict[str, str] = {}
+    selected_topics = list[str]()
+    for topic in filter(counts.get, counts):
+        names = [name for name in selection if str(name).startswith(f"{topic}.")]
+        selected_topics += [topic] if names else []
+        messages = () if names else islice(iterate_messages([topic]), _FIRST_MESSAGES)
+        field_names = (
+            load_topic(topic, names) if names else [name for m in messages for name, _ in _find_numbers(m[2], topic, {})]
+        )
+        places |= dict.fromkeys(field_names, topic)
+    if not places:
+        raise InputError("holds no messages with numbers; a log needs them")
+    main = max(selected_topics or places.values(), key=lambda topic: counts[topic])
 
     def load_seconds(topic: str) -> np.ndarray:
         for needed_topic in {main, topic} - {*times}:
-            load_topic(needed_topic)
+            load_topic(needed_topic, [])
         return 1e-9 * (times[topic] - times[main][0])
 
     def load_column(topic: str, name: str) -> np.ndarray:
         if name not in loaded_values:
-            load_topic(topic, name)
+            load_topic(topic, [name])
         values = loaded_values[name]
         return values if topic == main else np.interp(load_seconds(main), load_seconds(topic), values)
 
     count = counts[main]
     columns = Columns(t=Column(lambda: load_seconds(main), count))
-    for name, (topic, _) in places.items():
+    for name, topic in places.items():
         columns[name] = Column(partial(load_column, topic, name), count)
-    if interpolated_topics := sorted(selected_topics - {main}):
+    if interpolated_topics := sorted({*selected_topics} - {main}):
         columns.notes.append(
             f"{', '.join(interpolated_topics)} is interpolated to the times of {main}, which has the most messages."
         )
     return columns
 
 
-def _find_numbers(message: Any, path: list[ColumnName]) -> Iterator[tuple[str, list[ColumnName]]]:
-    """Yield the names of all numbers in a message, as `pose.position.x` or `position[0]`, and the path to each."""
+def _list_members(message: Any) -> dict[str, Any]:
+    return message if isinstance(message, dict) else getattr(message, "__dict__", {})
+
+
+def _find_numbers(message: Any, name: str, labels: dict[int, list[str]]) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers in a message by name, as `pose.position.x` or `position[0]`; `position[arm]` beside a list of names.
+
+    `labels` are such lists of what the message is in, by their length.
+    """
     if isinstance(message, bool | int | float | np.number):
-        yield "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip("."), path
+        yield name, message
     elif isinstance(message, list | tuple | np.ndarray):
-        for i in range(len(message) if len(message) <= _MAX_LIST_LENGTH else 0):
-            yield from _find_numbers(message[i], [*path, i])
-    elif not isinstance(message, str | bytes) and message is not None:
-        fields = message if isinstance(message, dict) else vars(message)
-        for name in fields:
-            if not name.startswith("__"):
-                yield from _find_numbers(fields[name], [*path, name])
+        keys = labels.get(len(message), range(len(message)))
+        for key, member in zip(keys, message, strict=True) if len(message) <= _MAX_LIST_LENGTH else ():
+            yield from _find_numbers(member, f"{name}[{key}]", labels)
+    else:
+        members = _list_members(message)
+        lists = [x for x in members.values() if isinstance(x, list) and {str} == {*map(type, x)} and len({*x}) == len(x)]
+        labels = labels | {len(x): x for x in lists}
+        for key, member in members.items():
+            if not key.startswith("__"):
+                yield from _find_numbers(member, f"{name}.{key}", labels)
 
 
-def _number_at(message: Any, path: list[ColumnName]) -> Any:
-    """Return a number in a message; NaN if it has none there."""
-    try:
-        for key in path:
-            message = message[key] if isinstance(key, int) or isinstance(message, dict) else getattr(message, key)
-    except (IndexError, KeyError, AttributeError):
-        return np.nan
-    return message
+def _find_stamp(message: Any) -> int:
+    """Return the stamp of a message, ns; 0 if it has none."""
 
+    def find_member(message: Any, *names: str) -> Any:
+        members = _list_members(message)
+        return next((members[name] for name in names if name in members), 0)
 
-def _header_time(message: Any) -> int:
-    """Return the time in the header of a message, ns; 0 if it has none."""
-    seconds, nanoseconds = (_number_at(message, ["header", "stamp", key]) for key in ("sec", "nanosec"))
-    return 0 if np.isnan(seconds) else int(seconds) * 1_000_000_000 + (0 if np.isnan(nanoseconds) else int(nanoseconds))
+    stamp = find_member(find_member(message, "header") or message, "stamp", "timestamp")
+    if isinstance(stamp, str):
+        return pd.Timestamp(stamp).as_unit("ns").value
+    seconds = find_member(stamp, "sec", "secs", "seconds")
+    return int(seconds) * 1_000_000_000 + int(find_member(stamp, "nanosec", "nsec", "nsecs", "nanos", "nanoseconds"))

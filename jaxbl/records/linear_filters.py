@@ -26,19 +26,10 @@ def savitzky_golay_slopes(values: np.ndarray, half_width: int) -> np.ndarray:
 
     The slopes within `half_width` samples of an end are wrong.
     """
-    offsets = np.arange(-half_width, half_width + 1)
-    taps = np.linalg.pinv(np.vander(offsets / half_width, 4, increasing=True))[1] / half_width
-    size = 1 << (len(values) + 2 * half_width).bit_length()
+    from scipy.signal import savgol_filter
+
     # a cubic's slope does not change with a constant, which would cost digits
-    product = np.fft.rfft(values - values[0], size) * np.fft.rfft(taps[::-1], size)
-    return np.fft.irfft(product, size)[half_width : half_width + len(values)]
-
-
-def low_pass_taps(count: int, cutoff: float) -> np.ndarray:
-    """Return `count` symmetric low-pass taps by a Hamming window; cutoff in half sampling rates. A steady value is kept."""
-    from scipy.signal import firwin
-
-    return np.asarray(firwin(count, cutoff))
+    return np.asarray(savgol_filter(values - values[0], 2 * half_width + 1, 3, deriv=1, mode="nearest"))
 
 
 def parzen_window(count: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from .gearing import UNRELATED, Gearing, twist_noise
 from .least_squares import rms
 from .resampling import Grid
 from .rigid_body import RigidFit
-from .signal_quality import ChannelStatistics, find_resolution
+from .signal_quality import ChannelStatistics, find_resolution, find_runs
 from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import SegmentedStamps, fit_even_stamps
 
@@ -65,10 +65,9 @@ def note_standstill(file: LogFile, segmented: SegmentedStamps, channels: Mapping
 
 def _find_standstills(values: np.ndarray, segment: slice) -> Iterator[slice]:
     """Yield the rows of a segment in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
-    edges = np.flatnonzero(np.diff(values[segment], prepend=np.nan, append=np.nan) != 0.0) + segment.start
-    yield from (
-        slice(start, stop) for start, stop in itertools.pairwise(edges.tolist()) if stop - start >= _STANDSTILL_SAMPLES
-    )
+    for start, stop in zip(*find_runs(np.diff(values[segment]) == 0.0), strict=True):
+        if stop - start >= _STANDSTILL_SAMPLES - 1:
+            yield slice(segment.start + start, segment.start + stop + 1)
 
 
 GEAR_TOLERANCE = 0.25

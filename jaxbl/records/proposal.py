@@ -36,13 +36,13 @@ _NAME_PATTERNS = {
     "setpoint": r"(goal|target|set|ref|command|cmd|desired|soll|demand)",
 }
 """Kind of a column -> its usual names."""
-_UNIT_NAMES = {
-    "rad": "rad", "deg": "deg", "°": "deg", "degrees": "deg", "turn": "turn", "rev": "turn", "m": "m", "mm": "mm",
-    "counts": "counts", "inc": "counts", "s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns", "nm": "N m",
-    "n m": "N m", "n·m": "N m", "n": "N", "a": "A", "v": "V", "rpm": "rpm", "1/min": "rpm", "rad/s": "rad/s",
-    "deg/s": "deg/s", "°/s": "deg/s", "rev/s": "turn/s", "m/s": "m/s", "mm/s": "mm/s", "mnm": "mN m", "mn m": "mN m",
-    "%": "%", "ma": "mA",
+_SPELLINGS = {
+    "rad": "rad", "deg": "deg|°|degrees", "turn": "turn|rev", "m": "m", "mm": "mm", "counts": "counts|inc|tick|ticks",
+    "s": "s|sec", "ms": "ms", "us": "us|µs", "ns": "ns", "N m": "nm|n m|n·m", "N": "n", "A": "a", "V": "v",
+    "rpm": "rpm|1/min", "rad/s": "rad/s", "deg/s": "deg/s|°/s", "turn/s": "rev/s", "m/s": "m/s", "mm/s": "mm/s",
+    "mN m": "mnm|mn m", "%": "%", "mA": "ma",
 }  # fmt: skip
+_UNIT_NAMES = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split("|")}
 """Spelling of a unit -> its name in `[log]`."""
 _SPEED_UNITS, _POSITION_UNITS = [*SPEED_FACTORS], [*POSITION_FACTORS]
 _TORQUE_UNITS = {

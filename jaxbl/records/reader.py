@@ -1,7 +1,7 @@
 """Read measured logs: from a file to evenly spaced channels in SI units, with statistics and remarks on its quality."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -484,8 +484,8 @@ def join_records(records: Sequence[Record]) -> Record:
                 f"{record.path}: is sampled every {record.sample_period:.6g} s, {first.path} every {period:.6g} s; "
                 f"set [log] resample = {period:.6g} to read both at the same period"
             )
-        _require_channels(record, _channel_names(first), first)
-        _require_channels(first, _channel_names(record), record)
+        _require_channels(record, _list_channels(first), first)
+        _require_channels(first, _list_channels(record), record)
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE_PERIODS * period
         segments += [slice(segment.start + count, segment.stop + count) for segment in record.segments]
@@ -494,12 +494,13 @@ def join_records(records: Sequence[Record]) -> Record:
         notes += [f"{record.path.name}: {note}" for note in record.notes]
         warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
     notes.insert(0, f"{len(records)} logs, one after the other: {', '.join(record.path.name for record in records)}.")
+    joined = {name: np.concatenate([_list_channels(record)[name] for record in records]) for name in _list_channels(first)}
     return replace(
         first,
         time=np.concatenate(times),
-        torque=_concatenate([record.torque for record in records]),
-        positions={side: _concatenate([record.positions[side] for record in records]) for side in first.positions},
-        transmitted=_concatenate([record.transmitted for record in records]),
+        torque=joined.get("torque"),
+        positions={side: joined[f"{side} position"] for side in first.positions},
+        transmitted=joined.get("transmitted torque"),
         segments=tuple(segments),
         notes=tuple(notes),
         warnings=tuple(warnings),
@@ -508,19 +509,14 @@ def join_records(records: Sequence[Record]) -> Record:
     )
 
 
-def _require_channels(record: Record, names: set[str], other: Record) -> None:
-    if missing := names - _channel_names(record):
+def _require_channels(record: Record, names: Iterable[str], other: Record) -> None:
+    if missing := {*names} - {*_list_channels(record)}:
         raise InputError(
             f"{record.path}: has no {min(missing)}, which {other.path} has; logs of one machine should be alike"
         )
 
 
-def _channel_names(record: Record) -> set[str]:
+def _list_channels(record: Record) -> dict[str, np.ndarray]:
     torques = {"torque": record.torque, "transmitted torque": record.transmitted}
-    return {f"{side} position" for side in record.positions} | {
-        name for name, values in torques.items() if values is not None
-    }
-
-
-def _concatenate(parts):
-    return None if parts[0] is None else np.concatenate(parts)
+    positions = {f"{side} position": values for side, values in record.positions.items()}
+    return positions | {name: values for name, values in torques.items() if values is not None}

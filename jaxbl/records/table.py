@@ -1,5 +1,6 @@
 """The `[log]` table of a study: which columns a measured log has, and how they become SI units."""
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -10,33 +11,25 @@ from jaxbl.validation import Positive, StrictTable, table_error
 from .libraries import ColumnName
 
 
-def _check_column(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, str | int) or (isinstance(value, int) and value < 0):
-        raise PydanticCustomError("column", "should be a column's name, or its number counted from 0")
-    return value
+def _require(is_valid: Callable[[Any], Any], text: str) -> BeforeValidator:
+    """Return a validator that refuses other values with a text."""
+
+    def check(value: Any) -> Any:
+        if not is_valid(value):
+            raise PydanticCustomError("kind", "{text}", {"text": text})
+        return value
+
+    return BeforeValidator(check)
 
 
-def _check_skew(value: Any) -> Any:
-    if isinstance(value, bool) or not (isinstance(value, int | float) or value == "estimate"):
-        raise PydanticCustomError("skew", "should be a number of seconds or 'estimate'")
-    return value
-
-
-def _check_scalar(value: Any) -> Any:
-    if not isinstance(value, bool | int | float | str):
-        raise PydanticCustomError("where", "should be a number, text, true or false")
-    return value
-
-
-def _check_sign(value: Any) -> Any:
-    if isinstance(value, bool) or value not in (1, -1):
-        raise PydanticCustomError("sign", "should be 1 or -1")
-    return int(value)
-
-
-_Column = Annotated[ColumnName, BeforeValidator(_check_column)]
-_Skew = Annotated[float | Literal["estimate"], BeforeValidator(_check_skew)]
-_Sign = Annotated[int, BeforeValidator(_check_sign)]
+_NUMBERS = int, float
+_COLUMN_TEXT = "should be a column's name, or its number counted from 0"
+_Column = Annotated[ColumnName, _require(lambda v: type(v) is str or (type(v) is int and v >= 0), _COLUMN_TEXT)]
+_Skew = Annotated[
+    float | Literal["estimate"],
+    _require(lambda v: type(v) in _NUMBERS or v == "estimate", "should be a number of seconds or 'estimate'"),
+]
+_Sign = Annotated[int, _require(lambda v: type(v) in _NUMBERS and v in (1, -1), "should be 1 or -1")]
 
 _SECONDS: Any = {"unit": "s"}
 
@@ -183,7 +176,9 @@ SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
 ELEMENT_NEEDS = "an element is found from its displacement theta_e and the torque u; both are needed"
 """Message that refuses an incomplete log of a transmission on a test rig."""
 
-_Scalar = Annotated[bool | int | float | str, BeforeValidator(_check_scalar)]
+_Scalar = Annotated[
+    bool | int | float | str, _require(lambda v: isinstance(v, (*_NUMBERS, str)), "should be a number, text, true or false")
+]
 
 
 class LogTable(StrictTable):

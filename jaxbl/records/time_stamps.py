@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from jaxbl.lines import DOUBT
 
@@ -92,8 +93,9 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     stamps = _read_stamps(file, table)
     start = float(stamps[0])
     stamps = stamps - start
-    rows = _select_rows(file, table, stamps)
-    intervals = np.diff(stamps)
+    is_full = _find_full_rows(file, table, len(stamps))
+    rows = _select_rows(file, table, stamps, is_full)
+    intervals = np.diff(stamps[is_full])
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups
     group_interval = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
@@ -122,14 +124,29 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
         fault = f" is {stamps[0]:g} s in all rows"
         if goes_back.any():
             row = int(np.argmax(goes_back)) + 1
-            fault = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
+            fault = f", data row {row + 1}: time goes back from {stamps[row - 1]:.16g} s to {stamps[row]:.16g} s"
         raise file.error(f"column {file.find_column(time_table.column_or('t'))!r}{fault}; stamps should increase")
     return stamps
 
 
-def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarray:
+def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
+    """Return True for rows that have a value of all channels; one with a longer period has none in most."""
+    is_full = np.ones(count, dtype=bool)
+    for column in table.list_columns() - {*(table.absent or ())}:
+        if column in file.columns and file.count_values(column) == count:
+            has_value = pd.notna(file.load_values(column))
+            if has_value.sum() >= MIN_SAMPLES and not has_value.all():
+                is_full &= has_value
+                empty = np.flatnonzero(~has_value)
+                file.notes.append(
+                    f"{len(empty)} rows without a value of '{column}' are left out (data row {empty[0] + 1} first)."
+                )
+    return is_full
+
+
+def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np.ndarray) -> np.ndarray:
     """Return the numbers of the rows that `where`, `start` and `stop` select; `stamps` are s from the first one."""
-    is_selected = np.ones(len(stamps), dtype=bool)
+    is_selected = is_full.copy()
     for column, required in (table.where or {}).items():
         file.check_length(file.find_column(column), len(stamps))
         column_values = file.load_values(file.find_column(column))
@@ -147,7 +164,7 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarr
         raise file.error(
             f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
         )
-    if len(rows) < len(stamps):
+    if len(rows) < is_full.sum():
         file.notes.append(f"{len(rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
     return rows
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxbl.records.linear_filters import filter_forwards, low_pass_taps, parzen_window, savitzky_golay_slopes
+from jaxbl.records.linear_filters import filter_forwards, parzen_window, savitzky_golay_slopes
 
 RANDOM = np.random.default_rng(0)
 WALK = np.cumsum(RANDOM.standard_normal((3001, 2)), axis=0)
@@ -17,7 +17,6 @@ def test_one_way_begins_as_if_the_first_value_had_lasted():
 
 
 def test_windows_are_those_of_scipy():
-    assert low_pass_taps(161, 1.0 / 8.0) == pytest.approx(signal.firwin(161, 1.0 / 8.0), rel=1e-12, abs=1e-15)
     assert parzen_window(40) == pytest.approx(signal.windows.parzen(79)[39:], rel=1e-12)
 
 

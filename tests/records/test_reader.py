@@ -352,7 +352,11 @@ BAD = {
     ),
     "no time": (lambda f: f.rename(columns={"t": "time"}), {}, r"no column 't'; .*; \[log\] t.column can name another"),
     "text": (replace_cell("u", 17, "on"), {}, "column 'u', data row 18 is 'on'; it should be a finite number"),
-    "nan": (replace_cell("theta_s", 4, np.nan), {}, "column 'theta_s', data row 5 is empty or not a number"),
+    "nan": (
+        lambda f: f.assign(theta_s=f["theta_s"].where(f.index < 50)),
+        {},
+        "column 'theta_s', data row 51 is empty or not a number",
+    ),
     "text in time": (replace_cell("t", 0, "start"), {}, "column 't', data row 1 is 'start'"),
     "back in time": (replace_cell("t", 100, 0.05), {}, "column 't', data row 101: time goes back from 0.099 s to 0.05 s"),
     "no time passes": (
@@ -771,3 +775,24 @@ def test_an_export_of_drive_software_is_read_as_it_is():
     assert record.sample_period == pytest.approx(0.04, rel=1e-7) and len(record.time) == 500
     speed = np.diff(record.positions["motor"]) / 0.04 * 30.0 / math.pi
     assert np.abs(speed).max() == pytest.approx(53.0, abs=3.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_without_a_value_are_left_out(tmp_path, seed):
+    """Single rows without a value, and a channel with a longer period."""
+    random = np.random.default_rng(seed)
+    truth = simulate_log(count=4000)
+    every = int(random.integers(1, 5))
+    is_empty = (random.random(4000) < 0.01) | (np.arange(4000) % every > 0)
+    frame = truth.assign(theta_s=truth["theta_s"].mask(is_empty), unused=truth["u"].mask(np.arange(4000) % 7 > 0))
+    record = read_record(write_frame(tmp_path, frame, f"log.{['csv', 'parquet'][seed % 2]}"))
+    expected = np.interp(record.time + record.start, truth["t"], truth["theta_s"])
+    assert np.isclose(record.sample_period, every * truth["t"][1])
+    np.testing.assert_allclose(record.positions["load"], expected, atol=2e-3 * np.ptp(expected))
+    assert any(f"{is_empty.sum()} rows without a value of 'theta_s'" in note for note in record.notes)
+
+
+def test_stamps_that_go_back_are_told_to_the_digit(tmp_path):
+    frame = simulate_log().assign(t=lambda f: 1_700_000_000.0 + f["t"].where(f.index != 70, 0.0685))
+    with pytest.raises(InputError, match=r"goes back from 1700000000\.069\d* s to 1700000000\.0685\d* s"):
+        read_record(write_frame(tmp_path, frame))
