@@ -10,10 +10,10 @@ from size import ROOT, Size, measure_file, measure_folders
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
 CEILINGS = {
-    "all": (393932, 0.04, 0.27, 0.0),
+    "all": (393963, 0.04, 0.27, 0.0),
     "report": (60535, 0.2, 1.17, 0.0),
     "diagnosis": (59526, 0.0, 0.0, 0.0),
-    "records": (48406, 0.0, 0.0, 0.0),
+    "records": (48437, 0.0, 0.0, 0.0),
     "gains": (39308, 0.0, 0.0, 0.0),
     "estimation": (34348, 0.0, 0.0, 0.0),
     "sweeps": (28654, 0.07, 0.0, 0.0),

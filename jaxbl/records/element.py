@@ -395,7 +395,7 @@ def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
     """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
     columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
     # rounding, for a log without noise
-    return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * float(np.mean(torque**2))
+    return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
 
 
 def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:

@@ -177,8 +177,13 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     """
     times, rows = stamps.times, stamps.rows
     pieces = _split_at_intervals(times, stamps.max_interval)
-    fits = [fit_even_stamps(times[piece]) for piece in pieces if _is_long_enough(piece)]
-    is_even = bool(fits) and all(fit.is_even for fit in fits)
+    segments = list(filter(_is_long_enough, pieces))
+    fits = [fit_even_stamps(times[segment]) for segment in segments]
+    # of parts with different periods none can be read with that of another; stamps may be rounded to a period
+    is_even = all(
+        fit.is_even and abs(fit.period / fits[0].period - 1.0) < 1e-3 + 1.0 / _count_samples(segment)
+        for fit, segment in zip(fits, segments, strict=True)
+    )
     distinct = np.ones(len(times), dtype=bool)
     if not is_even:
         # a spline needs increasing stamps
@@ -189,7 +194,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
         times, rows = times[distinct], rows[distinct]
         pieces = _split_at_intervals(times, stamps.max_interval)
-    segments = [piece for piece in pieces if _is_long_enough(piece)]
+        segments = list(filter(_is_long_enough, pieces))
     samples = sum(map(_count_samples, segments))
     if samples < MIN_SAMPLES:
         longest_piece = max(map(_count_samples, pieces))

@@ -796,3 +796,17 @@ def test_stamps_that_go_back_are_told_to_the_digit(tmp_path):
     frame = simulate_log().assign(t=lambda f: 1_700_000_000.0 + f["t"].where(f.index != 70, 0.0685))
     with pytest.raises(InputError, match=r"goes back from 1700000000\.069\d* s to 1700000000\.0685\d* s"):
         read_record(write_frame(tmp_path, frame))
+
+
+@pytest.mark.parametrize("change", [0.5, 0.9, 0.95, 0.99, 0.995, 1.005, 1.01, 1.05, 1.2, 2.0])
+def test_parts_with_different_periods_are_resampled(tmp_path, change):
+    """The period changes at a gap: all parts are read at their own times."""
+    intervals = np.repeat([1e-3, 5e-2, change * 1e-3], [1500, 1, 1000])
+    time = np.concatenate([[0.0], np.cumsum(intervals)])
+    frame = pd.DataFrame({"t": time, "u": np.cos(20.0 * time), "theta_e": np.sin(15.0 * time) + 0.1 * np.sin(71.0 * time)})
+    record = read_record(write_frame(tmp_path, frame), {"absent": ["theta_s"]})
+    expected = np.sin(15.0 * record.time) + 0.1 * np.sin(71.0 * record.time)
+    assert len(record.segments) == 2 and any("Resampled" in note for note in record.notes)
+    np.testing.assert_allclose(record.positions["motor"], expected, atol=1e-6)
+    for segment in record.segments:
+        np.testing.assert_allclose(np.diff(record.time[segment]), record.sample_period, rtol=1e-9)
