@@ -39,9 +39,8 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; --batch needs one with logs")
     logs = sorted(file for file in source.iterdir() if is_log(file))
-    known_names = {"holdout", *(file.name for file in logs)}
-    file_names = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
-    skipped = sorted({*file_names} - known_names)
+    file_names = {file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith(".")}
+    skipped = sorted(file_names - {"holdout", *(file.name for file in logs)})
     if not logs:
         raise InputError(f"{source}: holds no log ({', '.join(log_suffixes())}, or a folder of a ROS 2 bag)")
     stems = [file.stem for file in logs]
@@ -51,9 +50,10 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     holdouts = {file.stem: file for file in (source / "holdout").glob("*") if is_log(file)}
     jobs = []
     for file in logs:
-        log_model = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
+        beside = file.with_suffix(".toml")
+        log_model = beside if beside.exists() else model
         if log_model is None:
-            raise InputError(f"{file}: no model; give --model TOML, or {file.with_suffix('.toml').name} beside it")
+            raise InputError(f"{file}: no model; give --model TOML, or {beside.name} beside it")
         jobs.append(LogJob(file, log_model, holdouts.get(file.stem), out / file.stem, overwrite))
     return jobs, skipped
 
@@ -66,17 +66,18 @@ def run_batch(
     Returns its rows.
     """
     make_folder(out)
-    progress(0, len(jobs))
+    count = len(jobs)
+    progress(0, count)
     rows = []
-    processes = useful_processes(len(jobs)) if processes is None else min(processes, len(jobs))
+    processes = useful_processes(count) if processes is None else min(processes, count)
     with connect(scheduler) as cluster:
-        if cluster is None:
-            batch_rows = map_jobs(_diagnose_log, jobs, processes)
-        else:
-            batch_rows = cluster.map_jobs(_diagnose_log, [job.absolute() for job in jobs])
-        for row in batch_rows:
+        for row in (
+            map_jobs(_diagnose_log, jobs, processes)
+            if cluster is None
+            else cluster.map_jobs(_diagnose_log, [job.absolute() for job in jobs])
+        ):
             rows.append(row)
-            progress(len(rows), len(jobs))
+            progress(len(rows), count)
     pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
     return rows
 
@@ -100,9 +101,12 @@ def make_batch_row(log: Path, summary: JsonObject | None, refused: str = "") -> 
     row: JsonObject = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
     if summary is None:
         return row
-    row["verdict"] = summary["verdict"]
-    row["findings"] = "; ".join(finding["effect"] for finding in summary["findings"])
-    row["confidence"] = min((finding["confidence"] for finding in summary["findings"]), default=None)
+    findings = summary["findings"]
+    row |= {
+        "verdict": summary["verdict"],
+        "findings": "; ".join(finding["effect"] for finding in findings),
+        "confidence": min((finding["confidence"] for finding in findings), default=None),
+    }
     for name in summary["gap"]["holdout_rmse_before"]:
         for key, column in (("holdout_rmse_before", "before"), ("holdout_rmse_after", "after"), ("noise_floor", "floor")):
             row[f"{name}_{column}"] = summary["gap"][key][name]

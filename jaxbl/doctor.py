@@ -16,7 +16,7 @@ from .errors import InputError, NoResult
 from .fused import Unsupported
 from .sweeps.sweep import sweep
 from .sweeps.trial import run
-from .workers import PROGRAMS_VARIABLE, announce, count_cores
+from .workers import PROGRAMS_VARIABLE, announce, count_cores, count_memory
 
 
 class Finding(NamedTuple):
@@ -67,8 +67,7 @@ def _check_packages() -> list[Finding]:
         missing = [name for name, version_text in versions.items() if not version_text]
         state = ", ".join(f"{name} {version_text}" for name, version_text in versions.items())
         if missing:
-            package = f"'jaxbl[{extra}]'" if extra else "jaxbl"
-            state = f"lacks {', '.join(missing)}; for it: pip install {package}"
+            state = f"lacks {', '.join(missing)}; for it: pip install 'jaxbl[{extra}]'".replace("[]", "")
         findings.append(Finding(f"extra {extra}" if extra else "packages", state, bool(extra) or not missing))
     return findings
 
@@ -83,7 +82,7 @@ def _version(package: str) -> str:
 def _describe_devices() -> str:
     devices = jax.devices()
     kinds = sorted({device.device_kind for device in devices})
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    memory = count_memory() / 2**30
     return f"{len(devices)} {jax.default_backend()} ({', '.join(kinds)}); {count_cores()} cores, {memory:.0f} GiB"
 
 
@@ -100,9 +99,9 @@ def _check_cache() -> Finding:
 def _check_results_folder(folder: Path) -> Finding:
     """Check the folder for results."""
     where = folder.absolute()
-    good = os.access(where, os.W_OK)
-    fault = f"{where} cannot be written to; go to another folder, or give --out"
-    return Finding("results", f"{where / 'results'}" if good else fault, good)
+    if os.access(where, os.W_OK):
+        return Finding("results", f"{where / 'results'}")
+    return Finding("results", f"{where} cannot be written to; go to another folder, or give --out", False)
 
 
 _GAINS = {"lambda": 4.0, "alpha": 9.0}

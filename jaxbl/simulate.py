@@ -197,11 +197,10 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
 
 def initial_observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
     """Return the state of a side's observer that predicts a position (rad) and a velocity (rad/s) for the first sample."""
-
-    def nominal_acceleration(velocity: Number) -> Number:
-        return experiment.drive.acceleration(side, velocity, jnp.zeros_like(velocity))
-
-    return getattr(experiment.observer, side).start(position, velocity, nominal_acceleration, experiment.run.sample_period)
+    return getattr(experiment.observer, side).start(
+        position, velocity, lambda speed: experiment.drive.acceleration(side, speed, jnp.zeros_like(speed)),
+        experiment.run.sample_period,
+    )  # fmt: skip
 
 
 def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, Signals]:
@@ -404,10 +403,10 @@ def scan(
         >>> _, velocity = scan(experiment, 0, record=lambda state, signals: signals.motor.velocity_estimate)
     """
 
-    def draw_noise(indices: Int[Array, " samples"]) -> tuple[TracedArrays, ...]:
-        return (unit_noise(seed, indices, experiment.sides),)
-
-    return _scan(experiment, initial_carry(experiment, reducers), experiment.run.steps, draw_noise, reducers, record, stride)
+    return _scan(
+        experiment, initial_carry(experiment, reducers), experiment.run.steps,
+        lambda indices: (unit_noise(seed, indices, experiment.sides),), reducers, record, stride,
+    )  # fmt: skip
 
 
 def replay(
@@ -438,12 +437,11 @@ def replay(
         state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
     state = State(None, state.observer, state.equivalent_control, state.identifier)
 
-    def take_samples(indices: Int[Array, " samples"]) -> tuple[Any, ...]:
-        columns = torque, {side: measured[side] for side in experiment.sides}, added_accelerations
-        return None, *jax.tree.map(lambda column: column[indices], columns)
-
-    carry = initial_carry(experiment, reducers, state)
-    return _scan(experiment, carry, len(torque), take_samples, reducers, record, stride)
+    columns = torque, {side: measured[side] for side in experiment.sides}, added_accelerations
+    return _scan(
+        experiment, initial_carry(experiment, reducers, state), len(torque),
+        lambda indices: (None, *jax.tree.map(lambda column: column[indices], columns)), reducers, record, stride,
+    )  # fmt: skip
 
 
 def _scan(

@@ -65,14 +65,18 @@ def count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def count_memory() -> int:
+    """Count the bytes of this machine's memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def useful_processes(jobs: int) -> int:
     """Return how many processes to start for some jobs: one a core, as memory allows, but one in all on an accelerator."""
     import jax
 
     if jax.default_backend() != "cpu":
         return 1
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(min(count_cores(), memory // _PROCESS_MEMORY, jobs), 1)
+    return max(min(count_cores(), count_memory() // _PROCESS_MEMORY, jobs), 1)
 
 
 def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:
