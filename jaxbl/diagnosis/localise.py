@@ -376,7 +376,7 @@ def _find_peaks(residual: Residual, speed: np.ndarray | None, low: Residual) -> 
             continue
         here = np.sum(np.maximum(beyond[near], 0.0))
         share = here / max(total, here)
-        moved = motion is not None and np.sum(motion[near]) / np.sum(motion) > _MOVED * share
+        moved = motion is not None and bool(np.sum(motion[near]) / np.sum(motion) > _MOVED * share)
         peaks.append(SpectralPeak(float(frequency[peak]), np.sqrt(2.0 * here / count), share, z, moved))
     return tuple(peaks)
 

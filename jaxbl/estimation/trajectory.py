@@ -213,14 +213,16 @@ def _without(basis: Array, values: Array) -> Array:
     return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
 
 
-def projected_residual(experiment: Experiment, windows: Windows) -> tuple[Residuals, PlantState]:
+def projected_residual(
+    experiment: Experiment, windows: Windows, passes: int = _OUTER, at_rest: bool = True
+) -> tuple[Residuals, PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
-    Standstill is among the initial states that are tried.
+    Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
     """
 
     def project(window: Windows) -> tuple[Array, PlantState]:
-        start = _eliminate(experiment, window, _OUTER, True)
+        start = _eliminate(experiment, window, passes, at_rest)
         return _without(start.basis, start.residual), start.start
 
     return jax.vmap(project, in_axes=(_MAPPED,))(windows)
@@ -363,9 +365,9 @@ def fit(
     free: Sequence[FreeParameter],
     windows: Windows,
     theta: Theta,
-    most_steps: Int[Array, ""],
-    held: Bool[Array, " parameters"],
-    rounds: Int[Array, ""],
+    most_steps: int | Int[Array, ""] = 100,
+    held: Bool[Array, " parameters"] | None = None,
+    rounds: int | Int[Array, ""] = 3,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -377,12 +379,12 @@ def fit(
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
         most_steps: of the solver, each time.
-        held: which numbers stay at the start.
+        held: which numbers stay at the start; none if left out.
         rounds: how often at most the solver is started, again where initial states sought anew are better ones.
     """
 
     nominal = theta
-    moving = jnp.where(held, 0.0, 1.0)
+    moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
 
     def reduce_at(theta: Array, guess: PlantState) -> _Point:
         numbers = jnp.where(moving > 0.0, theta, nominal)

@@ -342,7 +342,7 @@ def test_bad_logs_are_one_line(logs, tmp_path):
     broken = {
         "no column 'u'": rows.drop(columns="u"),
         "time goes back": rows.iloc[[*range(500), 100, *range(500, 9000)]],
-        "data row 301 is empty or not a number": rows.assign(theta_e=rows["theta_e"].where(rows.index != 300)),
+        "data row 301 is 'off'": rows.assign(theta_e=rows["theta_e"].astype(object).where(rows.index != 300, "off")),
         "has no load position": rows.drop(columns="theta_s"),
     }
     for message, log in broken.items():

@@ -178,7 +178,7 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     result = make_identification(CASES["linear"][0], tmp_path, unit="m")
     described = write_report(result, tmp_path)
     assert ("0.0500 ± 0.0010 kg", "drive.motor_inertia") in described.key_figures
-    assert ("0.15 ± 0.001 N s/m", "drive.motor_viscous") in described.key_figures
+    assert ("0.1500 ± 0.0010 N s/m", "drive.motor_viscous") in described.key_figures
     assert "motor: 0.0001 m rms" in described.headline
     figures = {drawing.name: drawing.figure for drawing in draw_identification(result)}
     assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
