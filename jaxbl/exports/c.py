@@ -239,8 +239,8 @@ class _C(Writer):
         if name == "convert":
             if logical:
                 yes, no = (self.literal(Constant(np.asarray(value, operation.out.dtype))) for value in (1, 0))
-                # small literals would have a narrower type
-                cast = "" if operation.out.dtype.kind == "f" else f"({c_type(operation.out.dtype)})"
+                # small whole literals would have a narrower type
+                cast = f"({c_type(operation.out.dtype)})"
                 return f"{texts[0]} ? {cast}{yes} : {cast}{no}"
             if (operands[0].dtype, operation.out.dtype) == (self.program.block.dtype, np.int32):
                 return self._call_helper(operation, texts)
