@@ -199,7 +199,7 @@ def initial_observer_state(experiment: Experiment, side: str, position: Scalar, 
     """Return the state of a side's observer that predicts a position (rad) and a velocity (rad/s) for the first sample."""
     return getattr(experiment.observer, side).start(
         position, velocity, lambda speed: experiment.drive.acceleration(side, speed, jnp.zeros_like(speed)),
-        experiment.run.sample_period,
+        experiment.run.sample_period
     )  # fmt: skip
 
 
@@ -230,7 +230,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
 
     missed, readings = {}, measured
     if sample.noise is None or experiment.encoders.missed is not None:
-        missed = {side: ~jnp.isfinite(reading + torque_in) for side, reading in measured.items()}
+        missed = find_missed(measured, torque_in)
         readings = {side: jnp.where(lost, state.observer[side].position, measured[side]) for side, lost in missed.items()}
         torque_in = jnp.where(jnp.isfinite(torque_in), torque_in, 0.0)
 
@@ -260,7 +260,9 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     if identifier is not None:
         assert experiment.identifier is not None and experiment.transmission is not None and twist is not None
         # no sample counts before the start
-        time = functools.reduce(lambda time, side: jnp.where(side, -period, time), missed.values(), sample.time)
+        time = sample.time
+        for lost in missed.values():
+            time = jnp.where(lost, -period, time)
         identifier = experiment.identifier.step(
             identifier, experiment.transmission, experiment.equivalent_control, twist, torques, time, period
         )
@@ -269,10 +271,16 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     if after is not None and experiment.transmission is not None:
         torque, _ = plant.transmitted_torque(before.position, before.velocity, before.effects)
     elif after is not None:
-        nominal = drive.acceleration("motor", before.velocity["motor"], torque_in)
-        torque = drive.inertia("motor") * (nominal - sides["motor"].true.acceleration)
-    signals = Signals(sample.time, torque_in, twist, torque, sides["motor"], sides.get("load"))
-    return State(after, observers, filtered, identifier), signals
+        missing = drive.acceleration("motor", before.velocity["motor"], torque_in) - sides["motor"].true.acceleration
+        torque = drive.inertia("motor") * missing
+    return State(after, observers, filtered, identifier), Signals(
+        sample.time, torque_in, twist, torque, sides["motor"], sides.get("load")
+    )
+
+
+def find_missed(measured: TracedArrays, torque: Number) -> TracedArrays:
+    """Tell which sides miss a sample: its reading (rad), or the input torque (N m), is not finite."""
+    return {side: ~jnp.isfinite(reading + torque) for side, reading in measured.items()}
 
 
 def move_plant(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
@@ -405,7 +413,7 @@ def scan(
 
     return _scan(
         experiment, initial_carry(experiment, reducers), experiment.run.steps,
-        lambda indices: (unit_noise(seed, indices, experiment.sides),), reducers, record, stride,
+        lambda indices: (unit_noise(seed, indices, experiment.sides),), reducers, record, stride
     )  # fmt: skip
 
 
@@ -435,12 +443,12 @@ def replay(
     """
     if state is None:
         state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
-    state = State(None, state.observer, state.equivalent_control, state.identifier)
+    state = dataclasses.replace(state, plant=None)
 
     columns = torque, {side: measured[side] for side in experiment.sides}, added_accelerations
     return _scan(
         experiment, initial_carry(experiment, reducers, state), len(torque),
-        lambda indices: (None, *jax.tree.map(lambda column: column[indices], columns)), reducers, record, stride,
+        lambda indices: (None, *jax.tree.map(lambda column: column[indices], columns)), reducers, record, stride
     )  # fmt: skip
 
 
@@ -466,8 +474,9 @@ def _scan(
 
     length = block_length(steps) if record is None or stride == 1 else stride
     blocks, remaining = divmod(steps, length)
-    starts = jnp.arange(blocks, dtype=jnp.int32)
-    carry, trace = jax.lax.scan(lambda carry, i: run_block(carry, i * length, length), carry, starts)
+    carry, trace = jax.lax.scan(
+        lambda carry, i: run_block(carry, i * length, length), carry, jnp.arange(blocks, dtype=jnp.int32)
+    )
     trace = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), trace)
     if remaining:
         carry, end = run_block(carry, jnp.asarray(blocks * length, jnp.int32), remaining)
@@ -513,6 +522,5 @@ def plant_trajectory(
         return move_plant(plant, run, correct_by_readings(state, readings, gain or {}), torque, t), state
 
     readings = measured if measured and gain else {}
-    indices = jnp.arange(len(torque), dtype=jnp.int32)
-    _, states = jax.lax.scan(predict_sample, start, (indices, torque, readings))
+    _, states = jax.lax.scan(predict_sample, start, (jnp.arange(len(torque), dtype=jnp.int32), torque, readings))
     return states

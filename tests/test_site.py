@@ -87,6 +87,7 @@ def test_what_the_log_tutorial_announces_is_what_its_machine_does(pages):
         value, error = map(float, re.search(rf"(\S+) ± (\S+) .*  (?:drive|effects\.motor)\.{name}\n", outputs).groups())
         assert abs(value - truth) < 2.0 * error, name
     assert re.search(r" 0\.1 ± \S+ N m  motor\.cogging: amplitude\n", outputs)
+    assert re.search(r"kind='motor\.cogging' .*harmonic=7\.0 ", outputs)
     announced, achieved = map(float, re.search(r"announced ([\d.]+) rad/s, achieved ([\d.]+) rad/s", outputs).groups())
     assert 1 / 1.3 <= announced / achieved <= 1.3
     # a search on the machine itself, under the same constraints

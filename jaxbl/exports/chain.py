@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
-from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, initial_state, step
+from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, find_missed, initial_state, step
 
 from .block import Block, Outputs, Port, StudyNumber, Values, trace_block
 from .lowering import default_precision
@@ -61,7 +61,7 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         time = state.samples.astype(dtype) * lane.run.sample_period
         new, signals = step(lane, state, Sample(time, input=inputs["input"], measured=measured))
         out: Outputs = {}
-        missed = {side: ~jnp.isfinite(reading + inputs["input"]) for side, reading in measured.items()}
+        missed = find_missed(measured, inputs["input"])
         counts = jax.tree.map(lambda count, more: jnp.minimum(count, LAST_SAMPLE - 1) + more, state.missed, missed)
         for side in sides:
             estimates = signals.side(side)

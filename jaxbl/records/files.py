@@ -280,7 +280,7 @@ _REMEDIES = {
     b"SQLite format 3": "is a database, perhaps of a ROS 2 bag; give the bag's folder, the one with metadata.yaml",
     b"\x93NUMPY": "is an array of NumPy; save it by numpy.savetxt",
     b"\x1f\x8b": "is compressed; unpack it first, as by gunzip",
-    b"PK": "is a workbook or an archive; save its sheet or arrays as CSV",
+    b"PK\x03\x04": "is a workbook or an archive; save its sheet or arrays as CSV",
     b"\xd0\xcf\x11\xe0": "is a workbook; save the sheet as CSV",
 }
 """First bytes of a kind that is not read -> fault and remedy."""

@@ -130,7 +130,7 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
 
 
 def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
-    """Return True for rows that have a value of all channels; one with a longer period has none in most."""
+    """Tell which rows have a value in every channel: one that is logged less often has none in most rows."""
     is_full = np.ones(count, dtype=bool)
     for column in table.list_columns() - {*(table.absent or ())}:
         if column in file.columns and file.count_values(column) == count:

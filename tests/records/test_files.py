@@ -258,6 +258,11 @@ def test_unreadable_files_are_named_in_one_line(name, tmp_path):
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
+def test_a_column_named_like_an_archive_is_text(tmp_path):
+    (tmp_path / "log.csv").write_text("PK,u\n1,2\n3,4\n")
+    assert list(read_log_file(tmp_path / "log.csv").columns) == ["PK", "u"]
+
+
 def test_a_folder_and_a_file_without_vectors(tmp_path):
     with pytest.raises(InputError, match="is a folder; a log file is needed"):
         read_log_file(tmp_path)
