@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, Reducer, Run
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
 from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Experiment, Reducer, Run
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 PATH, SANE = "transmission.stiffness", 60.0

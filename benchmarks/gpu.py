@@ -25,11 +25,11 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jax.extend.core import jaxpr_as_fun
 
+from jaxbl.chain import scan
 from jaxbl.drive import set_leaves
 from jaxbl.fused.jaxprs import join_multiply_add, trace_inlined
 from jaxbl.fused.lane_simulator import DeviceSimulator
 from jaxbl.fused.pallas import multiply_add
-from jaxbl.simulate import scan
 from jaxbl.throughput.workload import CHAIN_METRICS, METRIC_NAMES, RANGES, SEED, Workload, chain_constants, metrics_from_sums
 
 _THREADS = 128

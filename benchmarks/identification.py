@@ -30,6 +30,7 @@ from filtered_derivatives import differentiate  # noqa: E402
 from scipy.linalg import expm  # noqa: E402
 from scipy.optimize import brentq  # noqa: E402
 
+from jaxbl.chain import plant_trajectory  # noqa: E402
 from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
 from jaxbl.estimation import identify as identify_module, log_columns  # noqa: E402
@@ -40,7 +41,6 @@ from jaxbl.estimation.regression import errors, regress  # noqa: E402
 from jaxbl.estimation.search import ParameterSearch  # noqa: E402
 from jaxbl.estimation.segments import segments_of  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
-from jaxbl.simulate import plant_trajectory  # noqa: E402
 
 PERIOD = 1e-3
 NOISE = {"motor": 1e-4, "load": 2e-5}

@@ -27,7 +27,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
-from jaxbl import simulate  # noqa: E402
+from jaxbl import chain  # noqa: E402
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays, set_leaves  # noqa: E402
 from jaxbl.drive.excitation import Sine  # noqa: E402
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers  # noqa: E402
@@ -50,7 +50,7 @@ def compile_variant(variant: Variant, steps: int):
     """The compiled sweep of one block, and its arguments."""
     dtype = {32: jnp.float32, 64: jnp.float64}[variant.precision]
     observer = DISCRETISATIONS[variant.observer]
-    experiment = simulate.Experiment(
+    experiment = chain.Experiment(
         drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
         transmission=SigmoidBacklash(1.0, 0.02, 20.0),
         effects=(),
@@ -60,7 +60,7 @@ def compile_variant(variant: Variant, steps: int):
         observer=Observers(observer(4.0, 9.0, velocity_error=0.5), observer(0.5, 0.2)),
         equivalent_control=EquivalentControl(0.01),
         identifier=Identifier(0.1),
-        run=simulate.Run(1e-3, steps, variant.substeps),
+        run=chain.Run(1e-3, steps, variant.substeps),
     )
     experiment = as_arrays(experiment, dtype)
     n = variant.lanes * variant.devices
@@ -72,7 +72,7 @@ def compile_variant(variant: Variant, steps: int):
         values["transmission.dead_zone"] = jnp.linspace(0.001, 0.03, n, dtype=dtype)
 
     def lane(values, seed):
-        return simulate.scan(set_leaves(experiment, values), seed, (ALL_METRICS,))[0]
+        return chain.scan(set_leaves(experiment, values), seed, (ALL_METRICS,))[0]
 
     sweep = jax.vmap(jax.vmap(lane, (0, None)), (None, 0))
     if variant.devices > 1:
@@ -82,9 +82,9 @@ def compile_variant(variant: Variant, steps: int):
             sweep, mesh=mesh, in_specs=(lanes, PartitionSpec()), out_specs=PartitionSpec(None, "lanes"), check_vma=False
         )
     arguments = (values, jnp.arange(1, dtype=jnp.int32))
-    unroll, simulate.UNROLL_SUBSTEPS = simulate.UNROLL_SUBSTEPS, variant.loop == "unrolled"
+    unroll, chain.UNROLL_SUBSTEPS = chain.UNROLL_SUBSTEPS, variant.loop == "unrolled"
     compiled = jax.jit(sweep).lower(*arguments).compile()
-    simulate.UNROLL_SUBSTEPS = unroll
+    chain.UNROLL_SUBSTEPS = unroll
     return compiled, arguments
 
 

@@ -22,9 +22,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from effect_values import VALUES
 from small_study import small_study
 
+from jaxbl.chain import Experiment, plant_trajectory
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.exports.mjcf import write_mjcf
-from jaxbl.simulate import Experiment, plant_trajectory
 
 DURATION = 10.0
 DETERMINED = 2e-3

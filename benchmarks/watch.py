@@ -8,7 +8,7 @@ whose gap stays or grows; and how many samples a second it takes.
     taskset -c 0 python benchmarks/watch.py speed      # samples a second on one core, from memory and by UDP
 
 Drives: `sweeps/geared_axis.toml` (hard gap, dry friction on the load that the observers do not know) and
-`sweeps/dead_zone_noise.toml` (the paper's law). The plant is `jaxbl.simulate.step` with another gap at each sample.
+`sweeps/dead_zone_noise.toml` (the paper's law). The plant is `jaxbl.chain.step` with another gap at each sample.
 """
 
 import argparse
@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Sample, initial_state, replay, step, unit_noise
 from jaxbl.config import Config, prepare, read_config, with_values
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.monitoring.watch import INTERVAL, Watcher, read_watch_task, run_watch
 from jaxbl.records.live import Rows
-from jaxbl.simulate import Sample, initial_state, replay, step, unit_noise
 
 SWEEPS = Path(__file__).parent.parent / "sweeps"
 STUDIES = {"hard gap": "geared_axis.toml", "law (3)": "dead_zone_noise.toml"}

@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
+from jaxbl.chain import Experiment, Run
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
-from jaxbl.simulate import Experiment, Run
 
 DRIVE = TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
 LAW = SigmoidBacklash(1.0, 0.02, 20.0)

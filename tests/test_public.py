@@ -37,7 +37,7 @@ FLOORS = [
     {"files", "validation", "workers"},
     {"cluster", "drive"},
     {"observer", "records"},
-    {"simulate"},
+    {"chain"},
     {"config", "fused"},
     {"sweeps", "estimation"},
     {"gains", "diagnosis", "exports"},

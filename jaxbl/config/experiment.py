@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, create_model, model_validator
 
+from jaxbl.chain import Run
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
@@ -20,7 +21,6 @@ from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import DISCRETISATIONS, OBSERVERS, AbstractObserver, EquivalentControl, Identifier, Observers
 from jaxbl.records.files import read_log_file
-from jaxbl.simulate import Run
 from jaxbl.validation import table_error
 
 from .tables import Table, declare_key, table_for, tagged_union

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import tomli_w
 from pydantic import Field, model_validator
 
+from jaxbl.chain import Experiment, Run
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
 from jaxbl.drive.parameters import Parameter, as_arrays, config_key, parameters
@@ -23,7 +24,6 @@ from jaxbl.errors import InputError
 from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
-from jaxbl.simulate import Experiment, Run
 from jaxbl.validation import table_error
 
 from .experiment import (

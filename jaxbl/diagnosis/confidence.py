@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf
-from jaxbl.simulate import Experiment
 
 from .effect_search import Explanation
 from .expected_errors import Expected

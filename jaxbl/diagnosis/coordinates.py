@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from jaxbl.chain import Experiment
 from jaxbl.estimation.regression import Kinematics, find_transmitted
 from jaxbl.estimation.segments import Segment
 from jaxbl.records.least_squares import rms
-from jaxbl.simulate import Experiment
 
 from .residuals import Residual, SideResiduals
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
@@ -19,7 +20,6 @@ from jaxbl.estimation.segments import at_period
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
 from .blocks import standard_errors_better

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
@@ -19,7 +20,6 @@ from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment
 
 from .candidates import EffectNumbers, are_possible
 from .choice import Chosen, Rival

@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.records.least_squares import column_rms
-from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .blocks import mean_squares, standard_errors_better, standard_errors_between

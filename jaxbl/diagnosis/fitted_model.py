@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.estimation.logs import arrays
 from jaxbl.fused import Arrays
-from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear
 

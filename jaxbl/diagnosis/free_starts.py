@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
-from jaxbl.simulate import Experiment
 
 from .neutral_effects import lean
 

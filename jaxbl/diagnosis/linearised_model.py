@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
 from jaxbl.drive.effects.loads import TRIAL_ARC
 from jaxbl.drive.parameters import get_leaf
@@ -38,7 +39,6 @@ from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
-from jaxbl.simulate import Experiment
 from jaxbl.workers import map_in_threads
 
 from .candidates import SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of

@@ -14,11 +14,11 @@ from functools import cached_property
 import jax
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Kinematics, balance
 from jaxbl.estimation.segments import Segment
 from jaxbl.records.least_squares import rms
-from jaxbl.simulate import Experiment
 
 from .coordinates import CoordinateValues
 from .residuals import Residual, SideResiduals, narrow, noise_spectrum

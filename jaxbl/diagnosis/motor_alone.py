@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import expit
 
+from jaxbl.chain import Experiment, with_effects
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters, units_of
@@ -26,7 +27,6 @@ from jaxbl.estimation.segments import segments_of, signal_sizes
 from jaxbl.estimation.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment, with_effects
 from jaxbl.workers import announce
 
 from .confidence import Finding

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, ConstantTorque, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, with_effects
 
 Effect = TypeVar("Effect")
 

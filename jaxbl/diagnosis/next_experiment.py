@@ -15,6 +15,7 @@ import pandas as pd
 from jaxtyping import Array, Float
 from scipy.signal import max_len_seq
 
+from jaxbl.chain import Experiment, plant_trajectory
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import Backlash
 from jaxbl.drive.plant import PlantState
@@ -25,7 +26,6 @@ from jaxbl.estimation.segments import reading_noise, segments_of
 from jaxbl.estimation.unseen_load import GAPS
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment, plant_trajectory
 
 from .diagnosis_summary import find_tie
 from .neutral_effects import with_added

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.estimation.logs import FIRST_FIFTH
@@ -18,7 +19,6 @@ from jaxbl.estimation.segments import segments_of
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
-from jaxbl.simulate import Experiment
 
 from .blocks import standard_errors_better
 from .candidates import ZERO_SPREAD

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.segments import Segment, at_period, reading_noise, windows_of
@@ -21,7 +22,6 @@ from jaxbl.fused.single_plant import simulate_plants
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment, NamedArrays
 
 from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, Numbers, make_effect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
@@ -25,7 +26,6 @@ from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.records.least_squares import BlockRegression
-from jaxbl.simulate import Experiment
 
 from .blocks import QUARTERS
 from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law

@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Array, Bool
 from scipy.ndimage import gaussian_filter1d
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import Motion
 from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Kinematics, Samples, SideSamples, effect_path
 from jaxbl.estimation.segments import Segment
 from jaxbl.estimation.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
 
 _REACH = 60.0
 """Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""

@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.errors import InputError
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.segments import Segment, segments_of, signal_sizes
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
 
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_task import DiagnosisTask, input_rms

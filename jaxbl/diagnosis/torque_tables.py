@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.estimation.segments import Segment
 from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression
-from jaxbl.simulate import Experiment, with_effects
 
 from .blocks import QUARTERS, standard_errors_better
 from .reference_log import BLOCKS, Comparison, Errors, ReferenceLog, parts_of_blocks

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
-from jaxbl.simulate import Experiment
 
 PLANT_TABLES = ("drive", "transmission", "effects")
 """Tables of the config whose numbers move the plant."""

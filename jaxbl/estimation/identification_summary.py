@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config
 from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment
 
 from .compilation import jit
 from .free_parameters import FreeParameter, set_free_parameters

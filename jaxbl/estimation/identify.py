@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config, ConfigSource, read_model, with_values
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
@@ -19,7 +20,6 @@ from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
 from .free_parameters import FreeParameter, free_values, make_free_parameters

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
-from jaxbl.simulate import Experiment
+from jaxbl.chain import Experiment
 
 from .free_parameters import FreeParameter
 from .trajectory import Fit, Windows, fits

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays, Signals, State, TracedArrays, replay
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment, NamedArrays, Signals, State, TracedArrays, replay
 
 from .compilation import jit
 from .regression import model_torques

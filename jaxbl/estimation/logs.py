@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS, EncoderEffect
 from jaxbl.drive.excitation import Sine
@@ -22,7 +23,6 @@ from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
 from jaxbl.records.signal_quality import segments_before
 from jaxbl.records.table import TorqueTable
-from jaxbl.simulate import Experiment
 
 from .free_parameters import PLANT_TABLES
 from .observer_gains import ChosenGains, choose_gains

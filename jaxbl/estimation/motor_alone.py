@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, PlantState
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
-from jaxbl.simulate import Experiment, PlantState
 
 from .free_parameters import FreeParameter
 from .identification_summary import describe_position

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbl.chain import Experiment, Signals, State, TracedArrays, replay
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import Experiment, Signals, State, TracedArrays, replay
 
 from .compilation import jit
 from .regression import Kinematics

@@ -15,9 +15,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.fused.single_plant import simulate_plants
-from jaxbl.simulate import Experiment
 
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
 from .intervals import spread

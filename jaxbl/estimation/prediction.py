@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import solve_discrete_are
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import Numbers
-from jaxbl.simulate import Experiment
 
 from .compilation import jit
 from .trajectory import Windows, projected_residual

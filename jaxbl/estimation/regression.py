@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
 from jaxbl.records.least_squares import BlockRegression
-from jaxbl.simulate import Experiment, with_effects
 
 from .compilation import jit
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
-from jaxbl.simulate import Experiment
 
 from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import Refusal, Spread, refusals, spread

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import DELAY_SAMPLES, AbstractEffect, Motion
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
-from jaxbl.simulate import Experiment
 
 from .compilation import jit
 from .free_parameters import SignalSizes

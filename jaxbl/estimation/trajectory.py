@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbl.simulate import Experiment, PlantState, plant_trajectory
+from jaxbl.chain import Experiment, PlantState, plant_trajectory
 
 from .compilation import jit
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
@@ -61,7 +61,7 @@ class Windows(eqx.Module):
         at_rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
         finer: what finer plant steps than the experiment's add to the simulated positions, over the noise
             (:mod:`.plant_steps`).
-        gain: of the predictor (:func:`jaxbl.simulate.plant_trajectory`) of each side, shape (2,);
+        gain: of the predictor (:func:`jaxbl.chain.plant_trajectory`) of each side, shape (2,);
             None: free runs, output error.
     """
 
@@ -469,7 +469,7 @@ def cut(
 ) -> Windows:
     """Cut part of a record into as many windows of so many samples as fit into it, shapes and units as of :class:`Windows`.
 
-    `start` are the states at all samples, :class:`jaxbl.simulate.PlantState` with leaves of shape (samples,); `first` is the
+    `start` are the states at all samples, :class:`jaxbl.chain.PlantState` with leaves of shape (samples,); `first` is the
     time of the first sample, s; `at_rest` says whether the part begins at rest.
     """
     count = len(torque) // samples

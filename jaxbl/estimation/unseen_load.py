@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtri
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
-from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
 
 from .free_parameters import PRIOR_DEVIATION, FreeParameter

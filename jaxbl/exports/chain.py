@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, find_missed, initial_state, step
 from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
-from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, find_missed, initial_state, step
 
 from .block import Block, Outputs, Port, StudyNumber, Values, trace_block
 from .lowering import default_precision
@@ -31,10 +31,10 @@ class _ChainState(State):
 
 
 def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
-    """Trace what `jaxbl.simulate.step` does with a recorded input and measured positions.
+    """Trace what `jaxbl.chain.step` does with a recorded input and measured positions.
 
     The identifier counts samples from `identifier.start` on; its sums are compensated every `LONGEST_BLOCK` samples, as in
-    :func:`jaxbl.simulate.replay`.
+    :func:`jaxbl.chain.replay`.
 
     Args:
         config: the study.

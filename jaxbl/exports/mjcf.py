@@ -9,10 +9,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from typing import Any
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config
 from jaxbl.drive.parameters import parameters
 from jaxbl.errors import InputError
-from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
 
 from .mujoco_parts import IMPEDANCE, RESOLUTION, Answer, MujocoParts, SideParts, Spring, exactly, unsaid

@@ -1,4 +1,4 @@
-"""The drive as it moves, as one block: plant and integrator of :func:`jaxbl.simulate.move_plant`, from sample to sample."""
+"""The drive as it moves, as one block: plant and integrator of :func:`jaxbl.chain.move_plant`, from sample to sample."""
 
 import re
 from collections.abc import Mapping
@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, move_plant
 from jaxbl.config import Config
 from jaxbl.drive.parameters import Parameter, as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
-from jaxbl.simulate import Experiment, move_plant
 
 from .block import Block, Outputs, Port, Program, Values, lower_block, trace_block
 from .chain import LAST_SAMPLE, PERIOD, read_study_numbers
@@ -138,7 +138,7 @@ def _trace_plant(
 
 
 def _read_outputs(experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any) -> Outputs:
-    """Value, unit and description: those of :func:`jaxbl.simulate.step`, but for means over a sample, which are over the one
+    """Value, unit and description: those of :func:`jaxbl.chain.step`, but for means over a sample, which are over the one
     that ends here, and 0 where none has."""
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
     out: Outputs = {}

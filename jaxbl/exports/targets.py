@@ -175,7 +175,7 @@ def export(
     linear: Sequence[str] = (),
     fmi: int | None = None,
 ) -> Export:
-    """Write a study for another system: as code what `jaxbl.simulate.step` does with a recorded input and measured
+    """Write a study for another system: as code what `jaxbl.chain.step` does with a recorded input and measured
     positions, or the drive as a model for simulators.
 
     Args:

@@ -1,4 +1,4 @@
-"""Simulate many lanes at once by a compiled loop; the numbers are those of :func:`jaxbl.simulate.scan`."""
+"""Simulate many lanes at once by a compiled loop; the numbers are those of :func:`jaxbl.chain.scan`."""
 
 import abc
 from collections import deque
@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import (
+from jaxbl.chain import (
     Experiment,
     NamedArrays,
     Reducers,
@@ -24,6 +23,7 @@ from jaxbl.simulate import (
     end_block,
     initial_carry,
 )
+from jaxbl.drive.parameters import set_leaves
 
 from . import Arrays, Leaves
 from .dependence import Dependence, LoopHooks, find_carry_dependences, split_by_lane
@@ -69,7 +69,7 @@ class LaneSimulator(abc.ABC):
     """Simulates lanes of an experiment. It is made and called in the experiment's precision (`jax.enable_x64`).
 
     Args:
-        experiment, reducers: as for :func:`jaxbl.simulate.scan`.
+        experiment, reducers: as for :func:`jaxbl.chain.scan`.
         paths: paths of the leaves that differ from lane to lane.
         lanes: number of lanes that the code is compiled for.
         multiple: the lanes are padded to a multiple of this number.

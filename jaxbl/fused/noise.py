@@ -1,4 +1,4 @@
-"""The encoders' unit noise of many samples; the numbers are those of :func:`jaxbl.simulate.unit_noise`.
+"""The encoders' unit noise of many samples; the numbers are those of :func:`jaxbl.chain.unit_noise`.
 
 Its random bits come from a loop with samples side by side: XLA takes four times as long for them as for all the rest, and
 half a second less to compile what is left. JAX's own code makes normal numbers of them.
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import define_prng_impl
 
-from jaxbl.simulate import LONGEST_BLOCK, NamedArrays, unit_noise
+from jaxbl.chain import LONGEST_BLOCK, NamedArrays, unit_noise
 
 from . import Unsupported, raising_unsupported
 from .jaxprs import trace

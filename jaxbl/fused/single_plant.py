@@ -1,6 +1,6 @@
 """A single plant under a recorded input: its trajectory, and the derivatives of its steps, by compiled loops.
 
-The numbers are those of :func:`jaxbl.simulate.plant_trajectory` and of `jax.jvp` of :func:`jaxbl.simulate.move_plant`,
+The numbers are those of :func:`jaxbl.chain.plant_trajectory` and of `jax.jvp` of :func:`jaxbl.chain.move_plant`,
 many times as fast: XLA starts some twenty kernels for a step of a single plant, and passes what they compute through memory.
 What the loops do not support (effects that read tables) is left to XLA. All is in float64, under `jax.enable_x64`.
 """
@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays, TracedArrays, correct_by_readings, move_plant
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, NamedArrays, TracedArrays, correct_by_readings, move_plant
 from jaxbl.workers import map_in_threads
 
 from . import Leaves, Unsupported, program_cache
@@ -47,7 +47,7 @@ def simulate_plant(
     measured: NamedArrays | None = None,
     gain: NamedArrays | None = None,
 ) -> PlantState:
-    """Simulate one plant; arguments as for :func:`jaxbl.simulate.plant_trajectory`.
+    """Simulate one plant; arguments as for :func:`jaxbl.chain.plant_trajectory`.
 
     Returns:
         Its states at the samples, leaves `(samples,)`.
@@ -73,7 +73,7 @@ def simulate_plants(
         torque: input (N m), `(runs, samples)`.
         time: of the first samples (s), `(runs,)`.
         measured: readings of each side (rad), `(runs, samples)`.
-        gain: by which readings correct the state, as for :func:`jaxbl.simulate.plant_trajectory`.
+        gain: by which readings correct the state, as for :func:`jaxbl.chain.plant_trajectory`.
 
     Returns:
         States at the samples, leaves `(runs, samples)`.

@@ -1,6 +1,6 @@
 """One run with a record of its samples, by loops for this machine's processor.
 
-The numbers are those of :func:`jaxbl.simulate.scan` with a record. XLA starts some kernels for each sample of a single lane,
+The numbers are those of :func:`jaxbl.chain.scan` with a record. XLA starts some kernels for each sample of a single lane,
 and takes longer to compile them than a study of that size takes to run.
 """
 
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.simulate import (
+from jaxbl.chain import (
     Experiment,
     NamedArrays,
     Reducers,
@@ -39,7 +39,7 @@ def record_run(
     record: Callable[[State, Signals], TracedArrays],
     stride: int = 1,
 ) -> tuple[NamedArrays, NamedArrays]:
-    """Simulate one experiment, in its precision; arguments as for :func:`jaxbl.simulate.scan`.
+    """Simulate one experiment, in its precision; arguments as for :func:`jaxbl.chain.scan`.
 
     Returns:
         The reducers' metrics `()` and the record `(samples,)`, both by name.

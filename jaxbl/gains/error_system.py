@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.config import Config
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
-from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.elementwise import apply_elementwise
 
 from .stages import Stages

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.config import TUNE_NAMES, TuneTable
 from jaxbl.errors import NoResult
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
-from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import no_disturbance_error
 

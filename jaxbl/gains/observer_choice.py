@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer import OBSERVERS, OperatingConditions
-from jaxbl.simulate import NamedArrays
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points, draw_sobol
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, Reducer, Signals, scan
 from jaxbl.config import Config, TuneTable, precision, prepare, read_config
 from jaxbl.drive.effects import correction_of
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError, NoResult
 from jaxbl.json_types import JsonObject
-from jaxbl.simulate import Experiment, Reducer, Signals, scan
 from jaxbl.sweeps.metrics import ROUNDING
 
 

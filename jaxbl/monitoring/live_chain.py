@@ -1,4 +1,4 @@
-"""The observers over rows as they come: `jaxbl.simulate.step` with recorded input and positions, in blocks of one size."""
+"""The observers over rows as they come: `jaxbl.chain.step` with recorded input and positions, in blocks of one size."""
 
 import dataclasses
 from typing import Any
@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays, Sample, State, TracedArrays, initial_state, step
 from jaxbl.estimation.compilation import jit
-from jaxbl.simulate import Experiment, NamedArrays, Sample, State, TracedArrays, initial_state, step
 
 BLOCKS = (256, 2048, 16_384)
 """Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""

@@ -13,6 +13,7 @@ import jax
 import pandas as pd
 from scipy.special import stdtrit
 
+from jaxbl.chain import Experiment
 from jaxbl.config import Config, ConfigSource, prepare, read_model
 from jaxbl.errors import InputError
 from jaxbl.estimation.logs import on_record, read_logs
@@ -30,7 +31,6 @@ from jaxbl.records.live import (
     period_error,
     stream_columns,
 )
-from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
 from jaxbl.workers import limit_blas_threads
 

@@ -25,12 +25,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.estimation.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.quantity import Quantity
 from jaxbl.records.linear_filters import savitzky_golay_slopes
-from jaxbl.simulate import Experiment, NamedArrays
 
 BLOCKS = 10
 """Blocks of a window, of which the jackknife leaves out one at a time."""

@@ -125,7 +125,7 @@ class Identifier(eqx.Module):
         return new._replace(most=jnp.maximum(state.most, _determinant(_sum_values(new, information))))
 
     def settle(self, state: IdentifierState) -> IdentifierState:
-        """Settle all sums, so that further samples lose no digits; :func:`jaxbl.simulate.scan` does so block by block."""
+        """Settle all sums, so that further samples lose no digits; :func:`jaxbl.chain.scan` does so block by block."""
         information, moments = jax.tree.map(
             lambda total: total.settle(state.weight),
             (state.information, state.right),

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, TracedArrays, scan
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.fused import program_cache
-from jaxbl.simulate import Experiment, TracedArrays, scan
 from jaxbl.workers import announce
 
 from .metrics import MetricNames, metrics_reducer

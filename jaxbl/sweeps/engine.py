@@ -18,8 +18,8 @@ import jax
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
-from jaxbl.simulate import NamedArrays
 
 from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
 from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics

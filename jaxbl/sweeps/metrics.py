@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxbl.chain import Experiment, NamedArrays, Number, Reducer, Signals, State, TracedArrays, TrueSide
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import AbstractSuperTwisting, conditions
 from jaxbl.registry import Registry, check_subclass, check_text
-from jaxbl.simulate import Experiment, NamedArrays, Number, Reducer, Signals, State, TracedArrays, TrueSide
 from jaxbl.validation import suggest_word
 
 from .elementwise import apply_elementwise

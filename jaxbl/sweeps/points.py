@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.config import KIND, TOLERANCE, AxisTable, Config, numeric_paths, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
-from jaxbl.simulate import Experiment
 
 from .metrics import explain_missing_metric, metric_columns
 from .refine import CellGrid, Criterion

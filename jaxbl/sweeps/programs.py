@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxbl.chain import Experiment, NamedArrays, TracedArrays, scan
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, raising_unsupported
-from jaxbl.simulate import Experiment, NamedArrays, TracedArrays, scan
 
 from .metrics import ALL_METRICS, MetricNames, ObserverGains, metric_columns, metrics_reducer, observer_gains
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
@@ -39,7 +40,6 @@ from jaxbl.files import (
     write_atomic,
 )
 from jaxbl.json_types import JsonObject
-from jaxbl.simulate import NamedArrays
 
 from . import parts
 from .parts import Damaged, PartHeader

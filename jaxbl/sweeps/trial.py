@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from jaxbl.chain import Experiment, Reducer, Signals, State, TracedArrays, scan
 from jaxbl.config import Config, ConfigSource, precision, prepare, read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
@@ -16,7 +17,6 @@ from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment, Reducer, Signals, State, TracedArrays, scan
 
 from .metrics import ALL_METRICS, add_gain_metrics, identified_parameters, observer_gains
 from .programs import Backend

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxbl.chain import TracedArrays, scan
 from jaxbl.drive import set_leaves
 from jaxbl.fused.lane_simulator import HostSimulator
-from jaxbl.simulate import TracedArrays, scan
 
 from .workload import CHAIN_METRICS, RANGES, SEED, ChunkedProgram, Metrics, Workload
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.json_types import JsonObject
-from jaxbl.simulate import Experiment, NamedArrays
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Layout, Program, compile_program
 

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import Experiment, NamedArrays, Reducer, Run, State, TracedArrays, unit_noise
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
 from jaxbl.observer import EquivalentControl, ExplicitSuperTwisting, Identifier, Observers
-from jaxbl.simulate import Experiment, NamedArrays, Reducer, Run, State, TracedArrays, unit_noise
 from jaxbl.sweeps.metrics import window_start
 
 SEED = 0

@@ -17,10 +17,10 @@ from hidden.scoring import calibration, calibration_error, confusion, markdown, 
 from hidden.simulator import Machine
 from hidden_effects import read_outcomes
 
+from jaxbl.chain import Run, move_plant
 from jaxbl.config import read_model
 from jaxbl.drive import Initial, Plant, as_arrays, effects
 from jaxbl.records import read_record
-from jaxbl.simulate import Run, move_plant
 
 DURATION = 0.6
 GAP = {

@@ -8,6 +8,7 @@ import pytest
 from hidden_log import record_study
 from small_study import multisine_study
 
+from jaxbl.chain import with_effects
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.free_starts import best_runs, count_seen
 from jaxbl.diagnosis.neutral_effects import with_torques
@@ -16,7 +17,6 @@ from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.segments import segments_of, windows_of
 from jaxbl.estimation.trajectory import projected_residual
-from jaxbl.simulate import with_effects
 
 STUDY = multisine_study(
     2.0,

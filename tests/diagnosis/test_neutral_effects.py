@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from small_study import rigid_study, small_study
 
+from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.estimation.compilation import jit
-from jaxbl.simulate import plant_trajectory
 
 NEVER_ADDED = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
     name for name in EFFECTS if name.startswith("encoder.")

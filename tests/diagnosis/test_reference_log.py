@@ -6,12 +6,12 @@ import pytest
 from hidden_log import record_study
 from small_study import multisine_study
 
+from jaxbl.chain import with_effects
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.estimation.segments import segments_of
-from jaxbl.simulate import with_effects
 
 STUDY = multisine_study(
     3.0,

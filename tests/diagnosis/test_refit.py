@@ -6,6 +6,7 @@ import pytest
 from hidden_log import FRICTION, nominal_study, simulate_multisine_log
 from scipy.optimize import minimize
 
+from jaxbl.chain import plant_trajectory, with_effects
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.refit import ModelFits, _Fit, leave_quarters_out
@@ -15,7 +16,6 @@ from jaxbl.estimation.free_parameters import make_free_parameters, set_free_para
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.regression import settle_states
 from jaxbl.estimation.segments import segments_of
-from jaxbl.simulate import plant_trajectory, with_effects
 
 NAME = "motor.coulomb_friction"
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from jaxbl.chain import unit_noise
 from jaxbl.drive import Encoders, as_arrays
-from jaxbl.simulate import unit_noise
 
 RATIO = 5.0
 SIDES = st.sampled_from(["motor", "load"])

@@ -137,7 +137,7 @@ def test_every_signal_scales_with_its_amplitude_as_a_grid_axis(dtype):
 def test_steps_are_independent_of_encoder_noise():
     from scipy.stats import norm
 
-    from jaxbl.simulate import unit_noise
+    from jaxbl.chain import unit_noise
 
     steps = Steps(1.0, 1.0, seed=3)
     levels = sample(steps, np.arange(40) + 0.5)

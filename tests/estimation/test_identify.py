@@ -10,6 +10,7 @@ from measured import EMPS, XL330, find_recording, read_stretch
 from small_study import rigid_study, small_study
 from trace_segment import make_segment
 
+from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.errors import InputError
 from jaxbl.estimation import observer_gains
@@ -21,7 +22,6 @@ from jaxbl.estimation.search import ParameterSearch
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.report.identify import describe_identification
 from jaxbl.report.results import write_report
-from jaxbl.simulate import plant_trajectory
 
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
 FRICTION = [{"kind": "load.coulomb_friction", "torque": 0.4}]

@@ -13,6 +13,7 @@ from hidden_log import GAP, GEARED
 from scipy.optimize import least_squares
 from small_study import rigid_study, small_study
 
+from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
@@ -21,7 +22,6 @@ from jaxbl.estimation.free_parameters import SignalSizes, make_free_parameters, 
 from jaxbl.estimation.intervals import refusals, spread
 from jaxbl.estimation.smoother import smooth
 from jaxbl.estimation.trajectory import Fit, _Point, _solve, cut, fit
-from jaxbl.simulate import plant_trajectory
 
 TRUE = {
     "drive.motor_inertia": 0.05,

@@ -11,13 +11,13 @@ from small_study import small_study
 from strict import Strict
 
 import jaxbl
+from jaxbl.chain import replay
 from jaxbl.config import read_config
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.errors import InputError
 from jaxbl.exports.chain import build_observer_chain
 from jaxbl.exports.targets import TARGETS
 from jaxbl.observer import OBSERVERS
-from jaxbl.simulate import replay
 
 GAINS = {
     "lambda": 4.0, "alpha": 9.0, "bandwidth": 150.0, "damping": 0.8, "position_noise": 1e-4, "disturbance_noise": 100.0,

@@ -11,6 +11,7 @@ from effect_values import ENCODERS, VALUES
 from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
+from jaxbl.chain import Experiment, Reducer, Run, scan
 from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
 from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Chirp, Sine
@@ -22,7 +23,6 @@ from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator, LaneSimul
 from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.shared_part import SharedPartLoop
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
-from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import ALL_METRICS, metrics_reducer
 from jaxbl.throughput.workload import CHAIN_METRICS, RANGES, SEED, Workload
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxbl.chain import unit_noise
 from jaxbl.fused import noise as module
 from jaxbl.fused.noise import LONGEST_SPAN, SIDES, draw_noise
-from jaxbl.simulate import unit_noise
 
 
 @pytest.mark.parametrize(("seed", "first", "count"), [(0, 0, 500), (7, 1_000_003, 37), (2**32 - 1, 64, LONGEST_SPAN)])

@@ -4,13 +4,13 @@ import jax
 import numpy as np
 import pytest
 
+from jaxbl.chain import Experiment, Run
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Multisine
 from jaxbl.fused import shared_part as module
 from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.fused.shared_part import SharedPartLoop, SharedPartScan
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Experiment, Run
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 

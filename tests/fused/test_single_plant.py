@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from effect_values import VALUES
 
+from jaxbl.chain import Experiment, Run, move_plant, plant_trajectory
 from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, leaf_paths, set_leaves
 from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
 from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
-from jaxbl.simulate import Experiment, Run, move_plant, plant_trajectory
 
 STEPS = 250
 OTHER_EFFECTS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]

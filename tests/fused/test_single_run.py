@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from effect_values import VALUES
 
+from jaxbl.chain import Experiment, Reducer, Run, scan
 from jaxbl.drive import Encoders, Initial, TwoInertia, as_arrays
 from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Multisine, Prbs
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.single_run import record_run
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 NAMES = ["motor.stribeck_friction", "load.gravity", "motor.cogging", "actuator.lag"]

@@ -1,4 +1,4 @@
-"""A drive whose gap changes as it runs, simulated by `jaxbl.simulate.step` with another gap at each sample."""
+"""A drive whose gap changes as it runs, simulated by `jaxbl.chain.step` with another gap at each sample."""
 
 import equinox as eqx
 import jax
@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 from small_study import multisine_study
 
+from jaxbl.chain import Sample, initial_state, step, unit_noise
 from jaxbl.config import prepare, read_config
-from jaxbl.simulate import Sample, initial_state, step, unit_noise
 
 HALF_GAP, STIFFNESS = 0.08, 60.0
 LAW = {"law": "dead_zone", "stiffness": STIFFNESS, "half_gap": HALF_GAP}

@@ -8,10 +8,10 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from small_study import small_study
 
+from jaxbl.chain import replay
 from jaxbl.config import prepare, read_config
 from jaxbl.monitoring.live_chain import BLOCKS, LiveChain
 from jaxbl.monitoring.window import Window
-from jaxbl.simulate import replay
 
 PERIOD, CONSTANT, RATIO = 1e-3, 0.01, 5.0
 LOAD = {"coulomb": 0.4, "viscous": 15.0}

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from paper_drive import paper_experiment
 
+from jaxbl.chain import Sample, initial_state, scan, step
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, ObserverState
-from jaxbl.simulate import Sample, initial_state, scan, step
 
 
 def no_acceleration(velocity):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from paper_drive import paper_experiment
 
+from jaxbl.chain import scan
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
 from jaxbl.errors import InputError
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
-from jaxbl.simulate import scan
 from jaxbl.sweeps import metrics as under_test
 from jaxbl.sweeps.metrics import (
     ALL_METRICS,

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.chain import block_length, unit_noise
 from jaxbl.config import precision
 from jaxbl.drive import get_leaf
-from jaxbl.simulate import block_length, unit_noise
 from jaxbl.sweeps.metrics import window_start
 
 from ..studies import BenchStudy

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxbl.chain import TracedArrays, advance_sample, compute_metrics, initial_carry
 from jaxbl.drive import set_leaves
-from jaxbl.simulate import TracedArrays, advance_sample, compute_metrics, initial_carry
 
 from ..jaxbl_chain import LANES
 from ..workload import CHAIN_METRICS, ChunkedProgram, Workload

@@ -11,11 +11,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.signal import lfilter
 
+from jaxbl.chain import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
 from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
 from jaxbl.estimation.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
 from jaxbl.sweeps.metrics import ALL_METRICS
 
 SEED = jnp.asarray(3)
