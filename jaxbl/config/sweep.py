@@ -25,8 +25,9 @@ class SweepTable(Table):
         "noise seeds first_seed, first_seed + 1, ..., each run at every point", 1, ge=1, le=1_000_000_000
     )
     first_seed: int = declare_key("first of the noise seeds", 0, ge=0, le=2**31 - 1)
-    design: Literal["grid", "sobol", "latin_hypercube"] = declare_key(
-        "grid: all combinations; else quasi-random points over the axes without num or values", "grid"
+    design: Literal["grid", "sobol", "latin_hypercube", "saltelli"] = declare_key(
+        "grid: all combinations; else quasi-random points over the axes without num or values (saltelli: for total indices)",
+        "grid",
     )
     points: int | None = declare_key("number of quasi-random points", None, ge=1, le=100_000_000)
     design_seed: int = declare_key("seed of the quasi-random design", 0, ge=0)

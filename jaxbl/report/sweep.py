@@ -18,6 +18,7 @@ from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
 from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
+from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -45,6 +46,7 @@ def describe_sweep(result: StudyResult) -> Result:
         for path, values in survey.values.items()
     ]
     tables = [_law_table(laws)] * bool(laws)
+    tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
     tables += [ResultTable("Axes", ["path", "values", "least", "largest"], axes), _metric_table(result)]
     answer = answer_sweep(result, survey)
     return replace(answer, remarks=[*answer.remarks, *_law_lines(laws)], tables=tables)
@@ -63,6 +65,7 @@ def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result
     works = works and all(best is not None for best, _ in survey.best.values())
     verdict = "doubtful" if not finished else "good" if works else "failed"
     figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
+    figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
     details = [_describe_study(config, survey), *config.notes]
     return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, details)
 
@@ -75,6 +78,22 @@ def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iter
         yield KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})")
         as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
         yield KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}")
+
+
+def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
+    """The axis that matters most for a side's velocity error."""
+    share, way = (axis.alone, "") if axis.total is None else (axis.total, " and what it does together with others")
+    text = f"of the {side} observer's velocity error goes with {axis.path}{way} (share of the variance of its logarithm)"
+    return KeyFigure(_share(share), text)
+
+
+def _importance_table(side: str, ranked: list[AxisImportance]) -> ResultTable:
+    rows = [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked]
+    return ResultTable(f"{side}: which axis matters for the velocity error", ["axis", "by itself", "with others"], rows)
+
+
+def _share(share: tuple[float, float] | None) -> str:
+    return "–" if share is None else f"{100 * share[0]:.0f} ± {100 * share[1]:.0f} %"
 
 
 _DRIVES = {"two_inertia": "a drive of two inertias", "rigid": "a rigid drive"}
@@ -102,6 +121,7 @@ class _Survey:
         runs: their number; `even` those on points that are always simulated; `diverged`.
         converged: how many of the even ones converged, by side; none where the study does not say.
         best: the best gains, by side, and the worst runs with each pair of gains; none where the study does not say.
+        importance: axes by what they explain of the velocity error, by side; of random designs alone.
         values: all values of each axis.
     """
 
@@ -126,6 +146,8 @@ class _Survey:
                 distinct[path].add(frame[[path]])
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
+        ranked = {side: rank_axes(result, f"{side}.velocity_rmse") for side in SIDES if f"{side}.velocity_rmse" in metrics}
+        self.importance = {side: axes for side, axes in ranked.items() if axes}
         self.values = {path: values.frame()[path] for path, values in distinct.items()}
         for side in self.sides if config.sweep.design == "grid" else []:
             gains = [path for path in paths if path.startswith(f"observer.{side}.") and len(self.values[path]) > 1]
