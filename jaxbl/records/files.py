@@ -81,6 +81,7 @@ class LogFile:
         notes: sentences on changes to the log, and on its oddities.
         warnings: sentences to be said first.
         corrections, contradiction: the attributes of a record with these names.
+        date: that times are counted from, ns, where stamps are dates or times.
     """
 
     def __init__(self, path: Path, columns: Columns):
@@ -89,6 +90,7 @@ class LogFile:
         self.warnings: list[str] = []
         self.corrections: dict[str, float] = {}
         self.contradiction = ""
+        self.date: int | None = None
 
     def error(self, text: str) -> InputError:
         """Return the error to be raised for a fault of the file."""
@@ -153,8 +155,10 @@ class LogFile:
             raise self.error(f"column {name!r}, data row {row} is no time, or empty")
         if stamps.dtype.kind == "M" and len(stamps):
             self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
-        # of whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
-        return 1e-9 * (stamps - stamps[:1]).astype("timedelta64[ns]").astype(np.int64)
+        # whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
+        nanoseconds = stamps.astype(f"{stamps.dtype.kind}8[ns]").astype(np.int64)
+        self.date = int(nanoseconds[0]) if len(stamps) else None
+        return 1e-9 * (nanoseconds - nanoseconds[:1])
 
     def load_numbers(self, column: ColumnName, channel: str = "", rows: np.ndarray | None = None) -> np.ndarray:
         """Load a column of finite numbers, or some `rows` of it, shape (rows,).

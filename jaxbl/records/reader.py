@@ -44,7 +44,7 @@ from .signal_quality import (
     saturated_share,
 )
 from .table import ELEMENT_NEEDS, POSITION_CHANNELS, LogTable
-from .time_stamps import Sampling, SegmentedStamps, read_time_stamps, split_at_gaps
+from .time_stamps import Sampling, SegmentedStamps, join_files, read_time_stamps, split_at_gaps
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,7 @@ def read_record(
     """
     table = read_log_table(log)
     file = read_log_file(Path(path), table.list_columns())
+    join_files(file, table)
     # columns become SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)

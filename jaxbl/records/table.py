@@ -205,6 +205,10 @@ class LogTable(StrictTable):
     omega_s: SpeedTable | None = _optional("load speed, in place of theta_s; left out: none")
     transmitted: TorqueTable | None = _optional("measured transmitted torque; left out: none")
     absent: list[_ChannelName] | None = _optional("channels that were not recorded, of u, theta_e, theta_s; left out: none")
+    join: list[str] | None = _optional(
+        "files beside the log with more columns, which are then named FILE/COLUMN (FILE without its ending); each has times "
+        "of its own, as `t` says; left out: none"
+    )
     where: dict[str, _Scalar] | None = _optional(
         "column -> value: only rows that have it (a switch, a mode); left out: all rows"
     )

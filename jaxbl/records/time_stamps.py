@@ -2,6 +2,8 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +11,8 @@ import pandas as pd
 
 from jaxbl.lines import DOUBT
 
-from .files import LogFile
+from .files import LogFile, read_log_file
+from .libraries import Column, ColumnName
 from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
 from .table import LogTable, TimeTable
 
@@ -105,6 +108,53 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
         file.warnings.append(f"{DOUBT}the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
     return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group_interval))
+
+
+def join_files(file: LogFile, table: LogTable) -> None:
+    """Add the columns of the files that `[log] join` names, at the stamps of the log.
+
+    Columns with times of their own are interpolated to these, and have no value outside of them; columns that start again
+    (`wrap`) have their readings at the nearest times.
+
+    Raises:
+        InputError: a file is missing or unfit, or its times are not those of the log.
+    """
+    counters = {encoder.column for encoder in (table.theta_e, table.theta_s) if encoder is not None and encoder.wrap}
+    for name in table.join or ():
+        stem = Path(name).stem + "/"
+        if any(str(column).startswith(stem) for column in file.columns):
+            raise file.error(f"[log] join: two files are named {stem[:-1]}; rename one of them")
+        columns = [column.removeprefix(stem) for column in map(str, table.list_columns()) if column.startswith(stem)]
+        stamps = _read_stamps(file, table)
+        other = read_log_file(file.path.parent / name, {*columns, (table.t or TimeTable()).column_or("t")})
+        other_stamps = _read_stamps(other, table)
+        if (file.date is None) != (other.date is None):
+            raise other.error(f"has {'numbers' if file.date else 'dates'} as stamps, and {file.path} has not")
+        if file.date is not None and other.date is not None:
+            other_stamps = other_stamps + 1e-9 * (other.date - file.date)
+        if max(stamps[0], other_stamps[0]) >= min(stamps[-1], other_stamps[-1]):
+            raise other.error(
+                f"its times, {other_stamps[0]:g} to {other_stamps[-1]:g} s, and those of {file.path}, {stamps[0]:g} to "
+                f"{stamps[-1]:g} s, do not overlap"
+            )
+        if not np.array_equal(stamps, other_stamps):
+            file.notes.append(f"{name} has times of its own; its columns are read at those of the log.")
+        for column in other.columns:
+            load = partial(_load_at, stamps, other, other_stamps, column, is_counter=f"{stem}{column}" in counters)
+            file.columns[f"{stem}{column}"] = Column(load, len(stamps))
+
+
+def _load_at(
+    stamps: np.ndarray, other: LogFile, other_stamps: np.ndarray, column: ColumnName, *, is_counter: bool
+) -> np.ndarray:
+    """Load a column of another file at the stamps of a log, shape (stamps,); NaN outside of its own."""
+    other.check_length(column, len(other_stamps))
+    values = other.load_numbers(column)
+    if is_counter:
+        middles = 0.5 * (other_stamps[1:] + other_stamps[:-1])
+        is_outside = (stamps < other_stamps[0]) | (stamps > other_stamps[-1])
+        return np.where(is_outside, np.nan, values[np.searchsorted(middles, stamps)])
+    return np.interp(stamps, other_stamps, values, left=np.nan, right=np.nan)
 
 
 def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:

@@ -810,3 +810,77 @@ def test_parts_with_different_periods_are_resampled(tmp_path, change):
     np.testing.assert_allclose(record.positions["motor"], expected, atol=1e-6)
     for segment in record.segments:
         np.testing.assert_allclose(np.diff(record.time[segment]), record.sample_period, rtol=1e-9)
+
+
+def split_log(tmp_path, every=1, shift=0.0):
+    """A log whose positions are in a file of their own, with every n-th sample and stamps that are shifted."""
+    frame = simulate_log()
+    write_frame(tmp_path, frame[["t", "u"]], "drive.csv")
+    encoders = frame[["t", "theta_e", "theta_s"]].iloc[::every].rename(columns={"theta_e": "position"})
+    write_frame(tmp_path, encoders.assign(t=encoders["t"] + shift), "enc.csv")
+    return frame, {"join": ["enc.csv"], "theta_e": "enc/position", "theta_s": "enc/theta_s"}
+
+
+def test_files_of_one_log_are_joined(tmp_path):
+    frame, log = split_log(tmp_path)
+    record = read_record(tmp_path / "drive.csv", log, gear_ratio=GEAR_RATIO)
+    np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
+    np.testing.assert_array_equal(record.positions["load"], frame["theta_s"])
+    assert not any("times of its own" in note for note in record.notes)
+
+
+@pytest.mark.parametrize(("every", "shift"), [(2, 0.0), (1, 0.3e-3), (3, -0.2e-3)])
+def test_a_joined_file_has_times_of_its_own(tmp_path, every, shift):
+    frame, log = split_log(tmp_path, every, shift)
+    record = read_record(tmp_path / "drive.csv", log, gear_ratio=GEAR_RATIO)
+    assert "enc.csv has times of its own; its columns are read at those of the log." in record.notes
+    expected = np.interp(frame["t"] - shift, frame["t"], frame["theta_e"])
+    part = slice(10, len(record.time) - 10)
+    motor = np.interp(frame["t"], record.start + record.time, record.positions["motor"])
+    scale = np.ptp(frame["theta_e"])
+    np.testing.assert_allclose(motor[part], expected[part], atol=1e-4 * every**2 * scale)
+
+
+def test_a_joined_counter_that_wraps_is_never_between_its_ends(tmp_path):
+    frame, log = split_log(tmp_path)
+    counter = pd.DataFrame({"t": frame["t"] + 0.4e-3, "position": np.mod(np.round(frame["theta_e"] / 1e-4), 4096)})
+    write_frame(tmp_path, counter, "enc.csv")
+    log |= {"theta_e": {"column": "enc/position", "factor": 1e-4, "wrap": 4096}, "absent": ["theta_s"]}
+    record = read_record(tmp_path / "drive.csv", {key: log[key] for key in log if key != "theta_s"})
+    motion, truth = record.positions["motor"], frame["theta_e"].to_numpy()
+    count = min(len(motion), len(truth)) - 2
+    speed = np.abs(np.diff(truth)).max()
+    moved = (motion - motion[5])[5:count] - (truth - truth[5])[5:count]
+    assert np.abs(moved).max() < 2 * speed + 3e-4
+
+
+def test_dates_of_joined_files_are_of_one_clock(tmp_path):
+    frame, log = split_log(tmp_path)
+    start = np.datetime64("2026-03-01T10:00:00")
+    for name, first in (("drive.csv", 0), ("enc.csv", 1000)):
+        part = pd.read_csv(tmp_path / name).iloc[first:]
+        stamps = start + np.round(1e6 * part["t"]).astype(int).to_numpy().astype("timedelta64[us]")
+        write_frame(tmp_path, part.assign(t=np.datetime_as_string(stamps)), name)
+    record = read_record(tmp_path / "drive.csv", log, gear_ratio=GEAR_RATIO)
+    assert any("1000 rows without a value of 'enc/" in note for note in record.notes)
+    np.testing.assert_allclose(record.positions["motor"], frame["theta_e"][1000:], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"join": ["missing.csv"]}, "missing.csv: no such file"),
+        ({"join": ["enc.csv", "enc.csv"]}, "join: two files are named enc"),
+        ({"theta_e": "enc/positoin"}, "no column 'enc/positoin'.*enc/position"),
+    ],
+)
+def test_files_that_do_not_join_are_refused(tmp_path, changes, fault):
+    _, log = split_log(tmp_path)
+    with pytest.raises(InputError, match=fault):
+        read_record(tmp_path / "drive.csv", log | changes)
+
+
+def test_files_of_other_times_are_refused(tmp_path):
+    _, log = split_log(tmp_path, shift=100.0)
+    with pytest.raises(InputError, match=r"enc.csv: its times, 100 to .* do not overlap"):
+        read_record(tmp_path / "drive.csv", log)
