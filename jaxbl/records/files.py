@@ -13,7 +13,7 @@ import math
 import re
 import warnings
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from pandas.api.types import is_numeric_dtype
 
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.registry import Registry
@@ -144,7 +145,7 @@ class LogFile:
         if stamps.dtype.kind not in "biufcMm":
             # a decimal comma; hours, minutes and seconds are those of any day
             texts = pd.Series(stamps).astype(str).str.replace(",", ".")
-            if pd.to_numeric(texts, errors="coerce").isna().all():
+            if pd.to_numeric(texts, errors="coerce").isna().all() and texts.str.contains(r"\d[:/-]\d").any():
                 stamps = pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).dt.tz_convert(None).to_numpy()
         if stamps.dtype.kind not in "Mm":
             return self.load_numbers(column, channel) * unit
@@ -376,7 +377,7 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
     lines = head.splitlines()
     if (columns := _read_after_remarks(lines, load_text)) is not None:
         return columns
-    text_format = detect_text_format(lines)
+    text_format, headers = detect_text_format(lines), list[int]()
 
     def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
@@ -394,12 +395,20 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
         count = 0
         with chunks:
             for frame in chunks:
-                count += len(frame)
                 names = [name if isinstance(name, str) else int(name) for name in frame.columns]
+                texts = [name for name in names if not is_numeric_dtype(frame[name])]
+                if len(texts) == len(names) and text_format.names is not None:
+                    is_header = (frame.fillna("") == names).all(axis=1)
+                    headers.extend(frame.index[is_header])
+                    frame = frame[~is_header]
+                count += len(frame)
                 for i, name in enumerate(names):
                     if not selection or name in selection or i in selection:
+                        column = frame[name]
+                        if name in texts and text_format.decimal == ",":
+                            column = column.str.replace(_DECIMAL_COMMA, ".", regex=True)
                         # a copy: a view would keep the whole chunk
-                        pieces.setdefault(name, []).append(np.array(frame[name].to_numpy()))
+                        pieces.setdefault(name, []).append(np.array(column.to_numpy()))
         return names, {name: np.concatenate(values) for name, values in pieces.items()}, count
 
     with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
@@ -411,12 +420,20 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
             raise InputError(f"rows have more columns than the header; they should have {text_format.count}") from None
     if not count:
         raise InputError(_NO_ROWS)
-    return Columns(
+    columns = Columns(
         {
             name: values[name] if name in values else Column(lambda name=name: load_rows([name])[1][name], count)
             for name in names
         }
     )
+    if headers:
+        columns.notes.append(f"{len(headers)} rows that repeat the header are left out (data row {headers[0] + 1} first).")
+    _note_units(columns, text_format.units)
+    return columns
+
+
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d+([eE][+-]?\d+)?$)")
+"""That of a number beside which the column has other text."""
 
 
 class TextFormat(NamedTuple):
@@ -425,16 +442,20 @@ class TextFormat(NamedTuple):
     Attributes:
         separator: between cells; a pattern for white space.
         decimal: decimal sign of numbers.
+        thousands: sign between thousands, or None.
         names: of the columns; None if there is no header.
         count: of the columns.
         first_row: line in which the rows begin, counted from 0.
+        units: in a row below the header, if there is one.
     """
 
     separator: str
     decimal: str
+    thousands: str | None
     names: list[str] | None
     count: int
     first_row: int
+    units: Sequence[str] = ()
 
     def pandas_options(self) -> Any:
         """Return the keywords for `pandas.read_csv`."""
@@ -445,6 +466,7 @@ class TextFormat(NamedTuple):
             "comment": "#",
             "skipinitialspace": True,
             "decimal": self.decimal,
+            "thousands": self.thousands,
             "index_col": False,
         }
 
@@ -472,35 +494,55 @@ def detect_text_format(lines: list[str]) -> TextFormat:
     Raises:
         InputError: only remarks, too many columns, or two with the same name; the message is without the path.
     """
-    start = next((i for i, line in enumerate(lines) if has_cells(line)), None)
-    if start is None:
+    places = [i for i, line in enumerate(lines) if has_cells(line)]
+    if not places:
         raise InputError("holds only remarks; rows of numbers are needed")
-    separator = _find_separator(lines[start])
-    cells = _split_cells(lines[start], separator)
+    separator = _find_separator([lines[i] for i in places[:_FORMAT_ROWS]])
+    cells, *rows = (_split_cells(lines[i], separator) for i in places[:3])
     if len(cells) > _MAX_COLUMNS:
         raise InputError(f"has {len(cells)} columns; at most {_MAX_COLUMNS} can be read")
-    has_header = not any(_NUMBER.fullmatch(cell) for cell in cells)
-    second_line = next((line for line in lines[start + 1 :] if line.strip()), "")
-    second_cells = _split_cells(second_line, separator)
-    if has_header and len(second_cells) == len(cells) + 1 and second_line.rstrip(" ").endswith(separator):
+    has_header = not any(map(_VALUE.fullmatch, cells))
+    if has_header and rows and len(rows[0]) == len(cells) + 1 and not rows[0][-1]:
         cells = [*cells, ""]  # a separator at the end of the rows
-    decimal = _find_decimal_sign(lines[start + has_header :], separator)
+    has_units = has_header and len(rows) == 2 and [any(map(_VALUE.fullmatch, row)) for row in rows] == [False, True]
+    first_row = places[has_units] + has_header
+    decimal, thousands = _find_number_signs(lines[first_row:], separator)
     names = _check_names(cells) if has_header else None
-    return TextFormat(separator, decimal, names, len(cells), start + has_header)
+    return TextFormat(separator, decimal, thousands, names, len(cells), first_row, rows[0] if has_units else ())
 
 
+_FORMAT_ROWS = 40
+"""Rows that show which separator there is."""
 _WHITE_SPACE = r"\s+"
 
 
-def _find_separator(line: str) -> str:
-    """Return the separator between the cells of a line."""
-    return next((c for c in ";\t," if c in line), _WHITE_SPACE)
+def _find_separator(rows: Sequence[str]) -> str:
+    """Return the separator between cells: one that makes about as many of most rows as of the first one."""
+    candidates = [c for c in ";\t," if c in rows[0]]
+    for separator in candidates:
+        first, *others = (len(_split_cells(row, separator)) for row in rows)
+        if 2 * sum(first <= count <= first + 1 for count in others) >= len(others):
+            return separator
+    return candidates[0] if candidates else _WHITE_SPACE
 
 
-def _find_decimal_sign(rows: list[str], separator: str) -> str:
-    """Return the decimal sign: a comma if it stands between digits, does not separate cells, and no number has a point."""
+_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*)")
+"""A number with signs between thousands, and a decimal sign."""
+
+
+def _find_number_signs(rows: Sequence[str], separator: str) -> tuple[str, str | None]:
+    """Return the decimal sign and that between thousands, if there is one.
+
+    A comma is decimal if it stands between digits, does not separate cells, and no number has a point.
+    """
+    cells = (cell for row in rows for cell in _split_cells(row, separator))
+    if grouped := next(filter(_GROUPED.fullmatch, cells), ""):
+        decimal = max(",.", key=grouped.rfind)
+        return decimal, ",.".replace(decimal, "")
     text = "\n".join(rows)
-    return "," if separator != "," and re.search(r"\d,\d", text) and not re.search(r"\d\.\d", text) else "."
+    # points of dates and of times aside
+    has_point = re.search(r"(?<![\d:.])\d+\.\d+(?![\d.])", text)
+    return "," if separator != "," and re.search(r"\d,\d", text) and not has_point else ".", None
 
 
 _MAX_REMARK_LINES = 100
@@ -524,21 +566,18 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     remarks = [line for line in lines[:start] if has_cells(line)]
     if len(remarks) < 2:
         return None
-    separator = _find_separator(lines[start])
+    separator = _find_separator(lines[start : start + 1])
     if separator == _WHITE_SPACE:
         return None
     count = len(_split_cells(lines[start], separator))
     is_known_program = any(title in line for line in remarks for title in ("EPOS Studio", "Starttime of export"))
     titles = [_split_cells(line, separator) for line in remarks]
-    # a row of units has no number
-    is_row = len(titles[0]) == count and any(map(_VALUE.fullmatch, titles[-1]))
-    if is_row and not is_known_program:
+    if len(titles[0]) == count and not is_known_program:
         return None
     rows = [line for line in load_text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
-    decimal = _find_decimal_sign(rows, separator)
-    frame = pd.read_csv(
-        io.StringIO("\n".join(rows)), sep=separator, header=None, decimal=decimal, skipinitialspace=True, index_col=False
-    )
+    decimal, thousands = _find_number_signs(rows, separator)
+    signs: Any = {"sep": separator, "decimal": decimal, "thousands": thousands}
+    frame = pd.read_csv(io.StringIO("\n".join(rows)), header=None, skipinitialspace=True, index_col=False, **signs)
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope_names = [cells for cells in titles if cells[0] == "Name"]
     if scope_names:
@@ -552,7 +591,7 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
 
 def _is_number_row(line: str) -> bool:
     """Return True if a line holds two numbers or more, and nothing else."""
-    separator = _find_separator(line)
+    separator = _find_separator([line])
     cells = [] if separator == _WHITE_SPACE else _split_cells(line, separator)
     cells = cells[:-1] if cells and not cells[-1] else cells
     return len(cells) > 1 and all(map(_VALUE.fullmatch, cells))
@@ -575,12 +614,17 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
             columns.notes.append(f"'{name}' was sampled at other times: it is interpolated to those of the first column.")
         name = name or f"column {i}"
         columns[name] = column
-        if i < len(units) and units[i]:
-            columns.units[name] = units[i].strip("[]()")
+    _note_units(columns, units)
+    return columns
+
+
+def _note_units(columns: Columns, units: Sequence[str]) -> None:
+    """Keep the units that a file gives for its columns, with a remark."""
+    given = {name: unit.strip("[]()") for name, unit in zip(columns, units, strict=False)}
+    columns.units |= {name: unit for name, unit in given.items() if unit}
     if columns.units:
         units_text = ", ".join(f"{name} {unit}" for name, unit in columns.units.items())
         columns.notes.append(f"The file gives these units, which [log] should repeat: {units_text}.")
-    return columns
 
 
 def _split_cells(line: str, separator: str) -> list[str]:

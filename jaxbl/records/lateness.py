@@ -80,6 +80,8 @@ def _fit_lateness(
     grid: Grid, encoders: Sequence[str], segments: Sequence[slice], cutoff: float
 ) -> tuple[float, float, float] | None:
     """Return lateness and its error, s, and the share of the torque that accelerates; None if they are not determined."""
+    from scipy.ndimage import maximum_filter1d
+
     period, encoder_count = grid.period, len(encoders)
     columns, moving_rows, torques = [], [], []
     for segment in segments:
@@ -95,7 +97,7 @@ def _fit_lateness(
             is_moving &= np.abs(velocity) > _SLOW_SHARE * rms(velocity)
         # the low-pass smears a reversal over half a period of its cutoff
         reach = math.ceil(0.5 / (cutoff * period))
-        near_reversal = np.convolve(~is_moving, np.ones(2 * reach + 1), "same") > 0.5
+        near_reversal = maximum_filter1d(~is_moving, 2 * reach + 1, mode="constant")
         # a soft shaft shows in the second derivative of the acceleration
         snap = _differentiate(_differentiate(accelerations[0], period), period)
         columns.append(np.stack([*accelerations, snap, *other_columns], axis=1))

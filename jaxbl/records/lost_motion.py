@@ -169,7 +169,7 @@ def _shift_between_states(
     start = int(np.argmin(widths))
     location = float(ordered[start : start + half + 1].mean())
     # half of a normal distribution lies within 0.674 standard deviations
-    scale = float(widths[start]) / 1.349 + 1e-300
+    scale = float(widths[start]) / 1.349 + 1e-120
     for _ in range(30):
         size = weights * np.clip(1.0 - ((shifts - location) / (3.44 * scale)) ** 2, 0.0, None) ** 2
         location = float(size @ shifts / size.sum())

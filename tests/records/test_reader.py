@@ -884,3 +884,20 @@ def test_files_of_other_times_are_refused(tmp_path):
     _, log = split_log(tmp_path, shift=100.0)
     with pytest.raises(InputError, match=r"enc.csv: its times, 100 to .* do not overlap"):
         read_record(tmp_path / "drive.csv", log)
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 2, 2], [0, 1, 3], [0, 1, 1, 3]], ids=["repeated", "lost", "both"])
+def test_a_row_that_is_lost_or_repeated_does_not_change_the_period(tmp_path, rows):
+    frame = simulate_log(count=400)
+    order = [*range(200), *(200 + row for row in rows), *range(204, 400)]
+    record = read_record(write_frame(tmp_path, frame.iloc[order]), gear_ratio=GEAR_RATIO)
+    assert record.sample_period == pytest.approx(1e-3, rel=1e-6)
+    motion = np.interp(record.start + record.time, frame["t"], frame["theta_e"])
+    np.testing.assert_allclose(record.positions["motor"], motion, atol=2e-4 * np.ptp(motion))
+
+
+def test_stamps_rounded_to_a_period_are_even(tmp_path):
+    frame = simulate_log(count=2000, period=0.99e-3)
+    record = read_record(write_frame(tmp_path, frame.assign(t=np.round(frame["t"], 3))), gear_ratio=GEAR_RATIO)
+    assert record.sample_period == pytest.approx(0.99e-3, rel=1e-4)
+    assert record.statistics.sampling.even
