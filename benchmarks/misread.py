@@ -2,9 +2,9 @@
 
     python benchmarks/misread.py --seed 1 --count 300
 
-A log is drawn, written in one of many forms (separators, decimal commas, encodings, units, stamps, gaps, containers), and
-read by `read_record`. Allowed are: the same numbers; other numbers with a remark; a refusal of one line. Counted are: numbers
-that differ without a remark, tracebacks, readings of more than 20 s or 3 GB.
+A log is drawn, written in one of many forms (separators, decimal commas, encodings, units, stamps, gaps, containers),
+and read by `read_record`. Allowed are: the same numbers; other numbers with a remark; a refusal of one line. Counted are:
+numbers that differ without a remark, tracebacks, readings of more than 20 s or 3 GB.
 """
 
 import argparse

@@ -397,8 +397,8 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
             for frame in chunks:
                 names = [name if isinstance(name, str) else int(name) for name in frame.columns]
                 texts = [name for name in names if not is_numeric_dtype(frame[name])]
-                if len(texts) == len(names) and text_format.names is not None:
-                    is_header = (frame.fillna("") == names).all(axis=1)
+                if texts and text_format.names is not None:
+                    is_header = (frame[texts] == texts).all(axis=1)
                     headers.extend(frame.index[is_header])
                     frame = frame[~is_header]
                 count += len(frame)
