@@ -7,16 +7,65 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .chain import (
+        Experiment as Experiment,
+        Run as Run,
+        Sample as Sample,
+        Signals as Signals,
+        State as State,
+        initial_state as initial_state,
+        step as step,
+    )
     from .config import Config as Config, read_config as read_config
     from .diagnosis.diagnose import Diagnosis as Diagnosis, diagnose as diagnose
+    from .drive import (
+        AbstractDrive as AbstractDrive,
+        DeadZone as DeadZone,
+        Encoders as Encoders,
+        Initial as Initial,
+        LinearShaft as LinearShaft,
+        Rigid as Rigid,
+        SigmoidBacklash as SigmoidBacklash,
+        TwoInertia as TwoInertia,
+    )
+    from .drive.excitation import (
+        Chirp as Chirp,
+        Multisine as Multisine,
+        Prbs as Prbs,
+        Recorded as Recorded,
+        Sine as Sine,
+        Steps as Steps,
+    )
     from .errors import InputError as InputError, NoResult as NoResult
     from .estimation.element import ElementIdentification as ElementIdentification, identify_element as identify_element
     from .estimation.identify import Identification as Identification, identify as identify
     from .exports import Export as Export, export as export
+    from .functions import (
+        Grid as Grid,
+        experiment as experiment,
+        metrics as metrics,
+        observe as observe,
+        samples as samples,
+        simulate as simulate,
+        sweep_arrays as sweep_arrays,
+        with_values as with_values,
+    )
     from .gains.accuracy_laws import Law as Law, accuracy_laws as accuracy_laws
     from .gains.tune import Tuning as Tuning, tune as tune
     from .gains.verify import Verdict as Verdict, verify as verify
     from .monitoring.watch import Watch as Watch, watch as watch
+    from .observer import (
+        AbstractObserver as AbstractObserver,
+        DirtyDerivative as DirtyDerivative,
+        Estimate as Estimate,
+        ExplicitSuperTwisting as ExplicitSuperTwisting,
+        ExtendedState as ExtendedState,
+        ImplicitSuperTwisting as ImplicitSuperTwisting,
+        Kalman as Kalman,
+        Luenberger as Luenberger,
+        Observers as Observers,
+        ObserverState as ObserverState,
+    )
     from .quantity import Quantity as Quantity
     from .records import (
         Inspection as Inspection,
@@ -42,16 +91,24 @@ if TYPE_CHECKING:
 
 # the same for loading; a test compares the two
 _NAMES = {
+    "chain": "Experiment Run Sample Signals State initial_state step",
     "config": "Config read_config",
     "diagnosis.diagnose": "Diagnosis diagnose",
+    "drive": "AbstractDrive DeadZone Encoders Initial LinearShaft Rigid SigmoidBacklash TwoInertia",
+    "drive.excitation": "Chirp Multisine Prbs Recorded Sine Steps",
     "errors": "InputError NoResult",
     "exports": "Export export",
+    "functions": "Grid experiment metrics observe samples simulate sweep_arrays with_values",
     "gains.accuracy_laws": "Law accuracy_laws",
     "gains.tune": "Tuning tune",
     "gains.verify": "Verdict verify",
     "estimation.element": "ElementIdentification identify_element",
     "estimation.identify": "Identification identify",
     "monitoring.watch": "Watch watch",
+    "observer": (
+        "AbstractObserver DirtyDerivative Estimate ExplicitSuperTwisting ExtendedState ImplicitSuperTwisting Kalman "
+        "Luenberger Observers ObserverState"
+    ),
     "quantity": "Quantity",
     "records": "Inspection LogTable Record inspect read_record",
     "report.results": "describe draw write_report",

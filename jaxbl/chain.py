@@ -56,16 +56,17 @@ class Run(eqx.Module):
 class Experiment(eqx.Module):
     """A drive with its input, encoders, observers and identifier. Every number is a leaf, named by its config path."""
 
+    _: dataclasses.KW_ONLY
     drive: AbstractDrive
-    transmission: AbstractTransmission | None
-    effects: tuple[AbstractEffect, ...]
-    initial: Initial
-    excitation: AbstractExcitation
-    encoders: Encoders
+    transmission: AbstractTransmission | None = None
+    effects: tuple[AbstractEffect, ...] = ()
+    initial: Initial = Initial()
+    excitation: AbstractExcitation | Callable[[Any], Any]
+    encoders: Encoders = Encoders()
     observer: Observers
-    equivalent_control: EquivalentControl
-    identifier: Identifier | None
-    run: Run
+    equivalent_control: EquivalentControl = EquivalentControl()
+    identifier: Identifier | None = None
+    run: Run = Run()
 
     @property
     def plant(self) -> Plant:
@@ -161,6 +162,7 @@ class Signals(NamedTuple):
         twist: z = theta_e - N_0 theta_s of the readings, rad; None on a rigid drive.
         torque: transmitted torque C, N m; on a rigid drive, all that resists beyond the nominal model. None in a replay.
         motor, load: signals of the sides; `load` is None on a rigid drive.
+        further: signals of further sides that a drive of one's own has, by side.
     """
 
     time: Number
@@ -169,9 +171,10 @@ class Signals(NamedTuple):
     torque: Number | None
     motor: SideSignals
     load: SideSignals | None
+    further: dict[str, SideSignals] = {}  # noqa: RUF012
 
     def side(self, side: str) -> SideSignals:
-        return getattr(self, side)
+        return self.further[side] if side in self.further else getattr(self, side)
 
 
 def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
@@ -256,7 +259,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
         sides[side] = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side], true)
 
     identifier = state.identifier
-    twist = plant.twist(readings) if len(drive.sides) == 2 else None
+    twist = plant.twist(readings) if "load" in drive.sides else None
     if identifier is not None:
         assert experiment.identifier is not None and experiment.transmission is not None and twist is not None
         # no sample counts before the start
@@ -274,7 +277,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
         missing = drive.acceleration("motor", before.velocity["motor"], torque_in) - sides["motor"].true.acceleration
         torque = drive.inertia("motor") * missing
     return State(after, observers, filtered, identifier), Signals(
-        sample.time, torque_in, twist, torque, sides["motor"], sides.get("load")
+        sample.time, torque_in, twist, torque, sides.pop("motor"), sides.pop("load", None), sides
     )
 
 
@@ -323,8 +326,8 @@ def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tup
     Runs with the same seed have common random numbers. The draws are float32 in all runs, so that both precisions see the
     same noise.
     """
-    key = jax.random.key(seed)
-    draws = jax.vmap(lambda index: jax.random.normal(jax.random.fold_in(key, index), (2,), jnp.float32))(indices)
+    key, count = jax.random.key(seed), max(2, len(sides))
+    draws = jax.vmap(lambda index: jax.random.normal(jax.random.fold_in(key, index), (count,), jnp.float32))(indices)
     return {side: draws[:, i] for i, side in enumerate(sides)}
 
 

@@ -17,13 +17,15 @@ sys.path.append(str(Path(__file__).parents[1] / "docs"))
 
 from command_line import run_commands
 
+_NAMES = {"__name__": "__main__"}  # of all Python blocks of the page
+
 
 def run_block(language, text):
     """Run a block and return what it prints; a block whose language is a file's name is appended to that file."""
     lines = [shlex.split(line, comments=True) for line in text.splitlines()]
     with contextlib.redirect_stdout(io.StringIO()) as output:
         if language == "python":
-            exec(compile(text, "page", "exec"), {"__name__": "__main__"})
+            exec(compile(text, "page", "exec"), _NAMES)
         elif language == "sh" and all(words[:1] in ([], ["jaxbl"]) for words in lines):
             run_commands(text)
         elif language == "sh":

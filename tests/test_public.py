@@ -40,6 +40,7 @@ FLOORS = [
     {"chain"},
     {"config", "fused"},
     {"sweeps", "estimation"},
+    {"functions"},
     {"gains", "diagnosis", "exports"},
     {"monitoring"},
     {"throughput"},

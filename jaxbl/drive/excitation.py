@@ -5,7 +5,7 @@ excitation's.
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, ClassVar
 
@@ -47,6 +47,16 @@ def _aliasing_fault(name: str, frequency: float, period: float) -> str:
     if frequency * period < 0.5:
         return ""
     return f"{name} {frequency:g} Hz has to be below half the sampling rate, {0.5 / period:g} Hz; run.sample_period sets it"
+
+
+class FunctionInput(AbstractExcitation):
+    """Input by a plain function of time (s) that returns the torque (N m); JAX traces it."""
+
+    name = "function"
+    function: Callable[[ScalarArray], Any] = eqx.field(static=True)
+
+    def __call__(self, time):
+        return jnp.asarray(self.function(time), jnp.result_type(time))
 
 
 EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractExcitation))

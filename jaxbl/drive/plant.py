@@ -37,11 +37,26 @@ class AbstractDrive(eqx.Module):
 
     Attributes:
         name: key `kind` of the config.
-        sides: "motor" and, on two inertias, "load".
+        sides: those with an encoder and an observer: "motor" and, on two inertias, "load".
+        hidden: further bodies of a drive of one's own, which no encoder sees.
     """
 
     name: ClassVar[str]
     sides: ClassVar[tuple[str, ...]]
+    hidden: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """All that moves."""
+        return self.sides + self.hidden
+
+    def body_torques(self, position: SideValues, velocity: SideValues) -> SideValues:
+        """Torques by which the bodies act on each other beside a transmission, N m, by body; none on drives of two inertias.
+
+        Args:
+            position, velocity: of the bodies, rad and rad/s.
+        """
+        return {}
 
     def inertia(self, side: str) -> Scalar:
         """Nominal inertia, kg m^2."""
@@ -114,6 +129,11 @@ class Initial(eqx.Module):
     load_position: Scalar = parameter("rad", "load position at t = 0", default=0.0)
     load_velocity: Scalar = parameter("rad/s", "load velocity at t = 0", default=0.0)
 
+    def of(self, body: str, quantity: str) -> Any:
+        """Return the position (rad) or velocity (rad/s) of a body; further bodies of a drive of one's own begin at 0."""
+        name = f"{body}_{quantity}"
+        return getattr(self, name) if hasattr(self, name) else 0.0 * self.motor_position
+
 
 class PlantState(eqx.Module):
     """Positions (rad) and velocities (rad/s) of the sides, and the states of the effects."""
@@ -132,10 +152,10 @@ class Plant(eqx.Module):
 
     def init(self, initial: Initial) -> PlantState:
         """Return the state at t = 0."""
-        sides = self.drive.sides
+        bodies = self.drive.bodies
         return PlantState(
-            position={side: getattr(initial, f"{side}_position") for side in sides},
-            velocity={side: getattr(initial, f"{side}_velocity") for side in sides},
+            position={body: initial.of(body, "position") for body in bodies},
+            velocity={body: initial.of(body, "velocity") for body in bodies},
             effects=tuple(effect.init() for effect in self.effects),
         )
 
@@ -208,13 +228,13 @@ class Plant(eqx.Module):
         """
         states, torque = self.actuate(state.effects, torque, step)
         states = self.advance_effects(states, state.position, state.velocity, time, 0.5 * step)
-        middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.sides}
+        middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.bodies}
         middle_time = time + 0.5 * step
         velocity = self._kick(state.velocity, middle, state.velocity, states, torque, middle_time, step)
         if any(effect.velocity_dependent for effect in self.effects):
-            mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.sides}
+            mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.bodies}
             velocity = self._kick(state.velocity, middle, mean, states, torque, middle_time, step)
-        position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
+        position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.bodies}
         return PlantState(position, velocity, self.advance_effects(states, middle, velocity, middle_time, 0.5 * step))
 
     def receive(
@@ -265,11 +285,11 @@ class Plant(eqx.Module):
         """Advance the effects' states by `step` seconds at steady velocities (rad/s), from positions (rad) at `time` (s)."""
         if not self.has_memory:
             return states
-        motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.sides}
+        motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.bodies}
         motions["actuator"] = motions["encoder"] = motions["motor"]
         if self.transmission is not None:
             # the rate of deflection changes with the position: in the middle of the step it is its mean
-            middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
+            middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.bodies}
             motions["transmission"] = Motion(time, *self._elastic_motion(middle, velocity, states)[:2])
         return tuple(
             effect.advance(state, motions[self.drive.resolve_place(effect.place)], step)
@@ -304,12 +324,13 @@ class Plant(eqx.Module):
             law_torque, gains["load"] = self.transmitted_torque(position, velocity, states)
         if transmitted is None:
             transmitted = law_torque
-        torques = {}
-        for side in self.drive.sides:
+        torques, mutual = {}, self.drive.body_torques(position, velocity)
+        for side in self.drive.bodies:
             driving = torque if side == "motor" else 0.0
             for effect, state in self._effects_at("actuator", states) if side == "motor" else ():
                 driving = driving - effect.resist(state, Motion(time, position[side], velocity[side], torque))
-            total = gains[side] * transmitted + driving
+            total = gains[side] * transmitted + driving if side in gains else driving
+            total = total + mutual[side] if side in mutual else total
             level: Scalar = self.gear_friction(states, transmitted) if side == "motor" else 0.0
             motion = Motion(time, position[side], velocity[side], driving)
             for effect, state in self._effects_at(side, states):

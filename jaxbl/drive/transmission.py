@@ -38,6 +38,10 @@ class AbstractTransmission(eqx.Module):
         """Elastic deflection (rad) at a twist z (rad): the part of z beyond the free play."""
         return z
 
+    def __call__(self, z: ScalarArray) -> ScalarArray:
+        """Transmitted torque C (N m) at a twist z (rad)."""
+        return self.torque(self.deflection(z))
+
     @abc.abstractmethod
     def torque(self, deflection: ScalarArray) -> ScalarArray:
         """Transmitted torque C (N m) on the motor shaft, at a deflection (rad)."""

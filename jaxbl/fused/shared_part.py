@@ -51,6 +51,8 @@ class SharedPart(NamedTuple):
 
     def input_shapes(self, *shape: int) -> tuple[Any, Any]:
         """Shapes and types of `sample_inputs`."""
+        if not {"motor", "load"}.issuperset(self.sides):
+            raise Unsupported("sides other than motor and load")
         noise = jax.ShapeDtypeStruct(shape, jnp.float32)
         return jax.ShapeDtypeStruct(shape, jnp.int32), dict.fromkeys(self.sides, noise)
 

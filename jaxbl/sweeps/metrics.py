@@ -524,7 +524,7 @@ def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]
         # lanes share the numbers that no axis varies
         unique, row_index = _unique_rows(rows)
         # the program that the study's chunks have compiled, however few of the rows differ
-        results = apply_elementwise(_compute_gain_metrics, list(unique.T), largest=f_plus[0].size)
+        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus[0].size)
         columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape[1:]) for name, result in results.items()}
     return columns
 
@@ -538,13 +538,14 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def compile_gain_metrics(dtype: str, lanes: int) -> None:
     """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision; all studies share it."""
-    apply_elementwise(_compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
+    apply_elementwise(compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit
-def _compute_gain_metrics(
+def compute_gain_metrics(
     lambda_: Array, alpha: Array, position_error: Array, velocity_error: Array, f_plus: Array
 ) -> dict[str, Array]:
+    """Compute the metrics of a side that follow from its gains and f_plus, by name."""
     gains = ObserverGains(lambda_, alpha, position_error, velocity_error)
     results = {name: metric.judge(gains, f_plus) for name, metric in _select_metrics(GainMetric).items()}
     # a lane that overflowed has no bound

@@ -1,0 +1,204 @@
+"""The engine as functions: the page that shows them, beside SciPy and differences; and what they refuse."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from markdown_blocks import read_blocks
+from scipy.integrate import solve_ivp
+
+import jaxbl
+from jaxbl.sweeps.engine import Engine
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The names that the page's blocks define."""
+    names = {"__name__": "page"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        for block in read_blocks(ROOT / "docs" / "functions.md"):
+            if block.language == "python":
+                exec(compile(block.text, "functions.md", "exec"), names)
+    return names
+
+
+def integrate(derivative, state, steps, period=1e-3):
+    """States at the samples, by SciPy at tight tolerance; `derivative(k, state)` holds the input of sample k."""
+    states = [state]
+    for k in range(steps - 1):
+        solution = solve_ivp(
+            lambda _, y, k=k: derivative(k, y), (0.0, period), states[-1], rtol=1e-10, atol=1e-13, method="DOP853"
+        )
+        states.append(solution.y[:, -1])
+    return np.array(states)
+
+
+def dead_zone(twist, stiffness, half_gap):
+    return stiffness * (twist - np.clip(twist, -half_gap, half_gap))
+
+
+def test_observers_on_a_record_see_what_they_saw(page):
+    # a record begins at its first reading, a run at the true position
+    again, before = (page[name].load.velocity_estimate[500:] for name in ("again", "signals"))
+    np.testing.assert_allclose(again, before, rtol=1e-12)
+
+
+def test_grid_is_that_of_a_sweep(page):
+    study = jaxbl.read_config(ROOT / "sweeps" / "geared_axis.toml").to_dict()
+    study["run"]["duration"] = 2.0
+    study["sweep"]["seeds"], study["sweep"]["metrics"] = 3, ["velocity_rmse"]
+    study["axes"] = [{"path": "transmission.half_gap", "start": 0.0, "stop": 0.1, "num": 6}]
+    config = jaxbl.read_config(study)
+    engine = Engine(config, backend="fused")
+    frame = engine.run(engine.chunk(0))
+    grid = page["grid"]
+    assert repr(grid) == "Grid(transmission.half_gap: 6, seed: 3; 3 metrics)"
+    found = grid.to_frame().reset_index().sort_values(["seed", "transmission.half_gap"])
+    for column in ("motor.velocity_rmse", "load.velocity_rmse"):
+        np.testing.assert_array_equal(found[column], frame[column])
+
+
+def test_closed_loop_against_scipy(page):
+    drive, closed = page["slow"].drive, page["closed"]
+    torque = np.asarray(closed.input)
+    friction = float(page["slow"].effects[0].torque)
+
+    def derivative(k, y):
+        theta_m, theta_l, v_m, v_l = y
+        c = dead_zone(theta_m - drive.gear_ratio * theta_l, 60.0, 0.05)
+        driving = drive.gear_ratio * c
+        # the load rests until the gear's torque exceeds dry friction, and turns one way from then on
+        dry = np.clip(driving, -friction, friction) if v_l <= 1e-9 else friction
+        return [v_m, v_l, (torque[k] - drive.motor_viscous * v_m - c) / drive.motor_inertia,
+                (driving - drive.load_viscous * v_l - dry) / drive.load_inertia]  # fmt: skip
+
+    states = integrate(derivative, np.zeros(4), 1000)
+    np.testing.assert_allclose(closed.motor.true.position[:1000], states[:, 0], atol=2e-4 * np.ptp(states[:, 0]))
+    np.testing.assert_allclose(closed.load.true.position[:1000], states[:, 1], atol=2e-4 * np.ptp(states[:, 1]))
+    # the law itself: proportional, one sample later
+    expected = 2.0 * (1.0 - closed.motor.velocity_estimate[:-1])
+    np.testing.assert_allclose(torque[1:], expected, rtol=1e-12)
+
+
+def test_ten_thousand_drives_are_single_drives(page):
+    gaps, speeds = np.linspace(0.0, 0.1, 10_000), page["speeds"]
+    for i in (0, 4321, 9999):
+        np.testing.assert_allclose(speeds[i], page["final_speed"](gaps[i]), rtol=1e-9)
+
+
+def test_gradient_through_a_linear_observer_to_eight_digits(page):
+    error = jax.jit(page["velocity_error"])
+    # five-point differences
+    step = 0.5
+    points = [error(300.0 + k * step) for k in (-2, -1, 1, 2)]
+    difference = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * step)
+    np.testing.assert_allclose(page["slope"], difference, rtol=1e-8)
+
+
+def test_own_observer_beside_its_recursion(page):
+    measured = np.asarray(jaxbl.simulate(page["own"]).motor.measured)
+    speed, last, expected = 0.0, 0.0, []
+    for reading in measured:
+        speed += 0.2 * ((reading - last) / 1e-3 - speed)
+        last = reading
+        expected.append(speed)
+    np.testing.assert_allclose(page["estimate"], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_own_plant_against_scipy(page):
+    def derivative(k, y):
+        before, behind = 50.0 * (y[0] - y[1]), dead_zone(y[1] - y[2], 30.0, 0.02)
+        return [*y[3:], (np.sin(5.0 * k * 1e-3) - before - 0.02 * y[3]) / 0.01,
+                (before - behind - 0.05 * y[4]) / 0.02, (behind - 0.1 * y[5]) / 0.05]  # fmt: skip
+
+    states, motion = integrate(derivative, np.zeros(6), 2000), page["motion"]
+    for side, column in (("motor", 0), ("load", 2)):
+        true = motion.side(side).true
+        np.testing.assert_allclose(true.position, states[:, column], atol=1e-6)
+        np.testing.assert_allclose(true.velocity, states[:, column + 3], atol=1e-4)
+
+
+def test_own_plant_in_the_fused_loop_and_the_scan(page):
+    values = {"drive.gear.half_gap": np.linspace(0.0, 0.05, 4)}
+    by_scan = jaxbl.sweep_arrays(page["arm"], values, names=("velocity_rmse",), backend="scan")
+    for column in by_scan.metrics:
+        np.testing.assert_allclose(page["gaps"][column], by_scan[column], rtol=1e-9)
+
+
+def test_a_side_of_any_name(page):
+    class WithMiddle(page["ThreeInertia"]):
+        sides = ("motor", "middle", "load")
+        hidden = ()
+
+    class ThreeObservers(jaxbl.Observers):
+        middle: jaxbl.AbstractObserver = jaxbl.ExtendedState(100.0)
+
+    old = page["arm"]
+    drive = WithMiddle(*(getattr(old.drive, field.name) for field in dataclasses.fields(old.drive)))
+    experiment = jaxbl.with_values(old, {"drive": drive, "observer": ThreeObservers(old.observer.motor, old.observer.load)})
+    signals = jaxbl.simulate(experiment)
+    np.testing.assert_allclose(signals.motor.true.position, page["motion"].motor.true.position, rtol=1e-12)
+    error = signals.side("middle").true.velocity - signals.side("middle").velocity_estimate
+    assert np.sqrt(np.mean(np.square(error[500:]))) < 0.05 * np.ptp(signals.side("middle").true.velocity)
+    assert {"motor.velocity_rmse", "middle.velocity_rmse"} <= set(jaxbl.metrics(experiment, names=("velocity_rmse",)))
+    gaps = {"drive.gear.half_gap": [0.0, 0.02]}
+    assert jaxbl.sweep_arrays(experiment, gaps, names=("velocity_rmse",))["middle.velocity_rmse"].shape == (2, 1)
+
+
+def test_metrics_are_those_of_a_run():
+    study = ROOT / "sweeps" / "direct_drive.toml"
+    config = jaxbl.read_config(study)
+    found = jaxbl.metrics(jaxbl.experiment(config), 3)
+    expected = jaxbl.run(config, seed=3, backend="scan").summary["metrics"]
+    assert set(found) == set(expected)
+    for name, value in expected.items():
+        # JSON has null for what is not finite
+        assert np.isfinite(found[name]) == (value is not None), name
+        if value is not None:
+            np.testing.assert_allclose(found[name], value, rtol=1e-9, err_msg=name)
+
+
+def test_sharding_over_devices_changes_nothing(page):
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
+    count = 4 * len(jax.devices())
+    gaps = jax.device_put(
+        jnp.linspace(0.0, 0.1, count), jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))
+    )
+    speeds = jax.jit(jax.vmap(page["final_speed"]))(gaps)
+    np.testing.assert_allclose(speeds, [page["final_speed"](gap) for gap in np.asarray(gaps)], rtol=1e-9)
+
+
+def test_never_float32_unasked():
+    with jax.enable_x64(False):
+        with pytest.raises(
+            jaxbl.InputError, match=r'add jax\.config\.update\("jax_enable_x64", True\), or ask for precision'
+        ):
+            jaxbl.experiment(ROOT / "sweeps" / "geared_axis.toml")
+        axis = jaxbl.experiment(ROOT / "sweeps" / "geared_axis.toml", precision="float32")
+    assert {leaf.dtype for leaf in jax.tree.leaves(axis)} == {np.dtype("float32")}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda axis: jaxbl.with_values(axis, {"observer.motor.alhpa": 1.0}),
+            "unknown path 'observer.motor.alhpa'; nearest valid path: 'observer.motor.alpha'",
+        ),
+        (
+            lambda axis: jaxbl.sweep_arrays(axis, {"run.sample_period": [1e-3]}),
+            "'run.sample_period' is no number that may differ between lanes",
+        ),
+        (lambda axis: jaxbl.metrics(axis, names=("speed",)), "'speed' is no metric"),
+    ],
+)
+def test_wrong_calls_are_told_in_one_line(call, message):
+    with pytest.raises(jaxbl.InputError, match=message) as caught:
+        call(jaxbl.experiment(ROOT / "sweeps" / "geared_axis.toml"))
+    assert "\n" not in str(caught.value)
