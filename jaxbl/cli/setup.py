@@ -222,7 +222,7 @@ def bench(
     quick: Annotated[bool, flag("--quick", "take less than a minute: shorter runs, the others in one precision")] = False,
     out: Annotated[Path, option("DIR", "folder for the results")] = Path("results/bench"),
 ) -> Outcome:
-    """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json.
+    """Time the same work by jaxbl, C++, numba, diffrax and NumPy: table, chart, bench.json.
 
     Example: jaxbl bench --quick
 

@@ -97,7 +97,7 @@ def _fit_lateness(
             is_moving &= np.abs(velocity) > _SLOW_SHARE * rms(velocity)
         # the low-pass smears a reversal over half a period of its cutoff
         reach = math.ceil(0.5 / (cutoff * period))
-        near_reversal = maximum_filter1d(~is_moving, 2 * reach + 1, mode="constant")
+        near_reversal = np.asarray(maximum_filter1d(~is_moving, 2 * reach + 1, mode="constant"), bool)
         # a soft shaft shows in the second derivative of the acceleration
         snap = _differentiate(_differentiate(accelerations[0], period), period)
         columns.append(np.stack([*accelerations, snap, *other_columns], axis=1))

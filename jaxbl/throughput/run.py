@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ from .jaxbl_chain import FusedChain, ScanChain
 from .rivals.cpp_chain import CppChain, NoCompiler, compile_library, find_compiler
 from .rivals.cpp_studies import CppStudy
 from .rivals.diffrax_chain import DiffraxChain
-from .rivals.numba_chain import NumbaChain, clear_compiled
+from .rivals.numba_chain import NumbaChain, compile_block_loop
 from .rivals.python_chain import PythonChain
 from .studies import STUDIES, FusedStudy, prepare_study
 from .workload import Metrics, Workload
@@ -51,7 +51,6 @@ class Entry(NamedTuple):
     make: Callable[[Workload], Runner]
     lanes: int  # that it is given, as many as it can bear
     module: str | None = None  # a module it cannot do without
-    tolerance: float = 0.0  # of its own method, where it does not take the reference's steps
 
 
 def make_entries(folder: Path, threads: int, devices: int) -> list[Entry]:
@@ -64,15 +63,9 @@ def make_entries(folder: Path, threads: int, devices: int) -> list[Entry]:
         Entry("jaxbl fused, one core", lambda w: FusedChain(w, 1), many_lanes),
         Entry(SCAN_NAME, lambda w: ScanChain(w, devices), few_lanes),
         Entry("jaxbl scan, one device", lambda w: ScanChain(w, 1), few_lanes),
-        Entry("numba, blocks of lanes", lambda w: NumbaChain(w, threads, blocked=True), many_lanes, "numba"),
-        Entry("numba, prange", lambda w: NumbaChain(w, threads, blocked=False), few_lanes, "numba"),
+        Entry("numba, blocks of lanes", lambda w: NumbaChain(w, threads), many_lanes, "numba"),
         Entry("diffrax, Euler, one device", DiffraxChain, few_lanes, "diffrax"),
         Entry("NumPy, lane arrays", PythonChain, 2**12),
-        Entry("NumPy, one lane", PythonChain, 1),
-        Entry("Python numbers, one lane", partial(PythonChain, scalar=True), 1),
-        Entry("OpenSMC, one lane", partial(PythonChain, scalar=True, uses_opensmc=True), 1, "opensmc"),
-        Entry("SciPy RK45, one lane", partial(PythonChain, scalar=True, solver="RK45"), 1, tolerance=1e-3),
-        Entry("SciPy LSODA, one lane", partial(PythonChain, scalar=True, solver="LSODA"), 1, tolerance=1e-3),
     ]
 
 
@@ -175,7 +168,7 @@ def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None)
         with _enable_precision(precision):
             Workload(1, steps, precision).inputs()
     for entry, precision in jobs:
-        workload = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
+        workload = Workload(entry.lanes // (8 if quick else 1), steps, precision)
         with _enable_precision(precision):
             start_time = time.perf_counter()
             runner = entry.make(workload)
@@ -219,9 +212,6 @@ def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None)
 
 
 def _is_timed(entry: Entry, precision: str, quick: bool) -> bool:
-    # one lane in float32 proves nothing: rounding decides signs, and there are no others to take the median of
-    if entry.lanes == 1:
-        return precision == "float64"
     return not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
 
 
@@ -263,7 +253,7 @@ def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metr
     for name, values in metrics.items():
         sampled, expected = np.asarray(values, float)[_spread_lanes(len(values))], reference[name]
         deviation = float(np.median(np.abs(sampled / expected - 1.0)))
-        if not deviation <= max(entry.tolerance, _TOLERANCE[precision][name.partition(".")[2]]):
+        if not deviation <= _TOLERANCE[precision][name.partition(".")[2]]:
             raise NoResult(f"{entry.name}, {precision}: {name} is off by {deviation:.2g} of it; wrong results are not timed")
         largest = max(largest, deviation)
     return largest
@@ -303,7 +293,7 @@ def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -
             ):
                 continue
             jax.clear_caches()
-            clear_compiled()
+            compile_block_loop.cache_clear()
             compile_library.cache_clear()
             row = {"name": entry.name, "precision": workload.precision, "lanes": lanes, "steps": workload.steps}
             rows.append(row | {"seconds": _time_call(lambda entry=entry: entry.make(workload)())})
@@ -399,7 +389,7 @@ def check_medians(name: str, metrics: Metrics, reference: Metrics) -> None:
 
 
 def _describe_machine(threads: int) -> JsonObject:
-    packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
+    packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax"]
     lines: list[str] = []
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -30,7 +30,6 @@ ONE_PRECISION = {
     run.SCAN_NAME: "float32",
     "jaxbl scan, one device": "float64",
     "numba, blocks of lanes": "float64",
-    "numba, prange": "float32",
     "diffrax, Euler, one device": "float64",
 }
 """Entries that are compiled slowly, or that another one differs from by its cores alone."""
@@ -153,11 +152,11 @@ def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
     monkeypatch.setenv("CXX", "no-such-compiler")
     runnable, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "none")
     assert "install g++" in left_out["c++, one core"]
-    assert "jaxbl[bench]" in left_out["numba, prange"]
+    assert "jaxbl[bench]" in left_out["numba, blocks of lanes"]
     monkeypatch.setenv("CXX", "false")
     _, left_out = _select_runnable(make_entries(folder, 2, 2), folder / "broken")
     assert "cannot compile chain.cpp: exit code 1" in left_out["c++, one core"]
-    assert {"jaxbl fused, all cores", "NumPy, one lane"} <= {entry.name for entry in runnable}
+    assert {"jaxbl fused, all cores", "NumPy, lane arrays"} <= {entry.name for entry in runnable}
 
 
 def test_fewer_lanes_are_the_first_of_more():

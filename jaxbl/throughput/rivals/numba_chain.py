@@ -1,27 +1,26 @@
-"""The chain in numba: a plain scalar loop over threads, and lanes in blocks that LLVM turns into vectors."""
+"""The chain in numba: lanes in blocks that LLVM turns into vectors."""
 
 # of the extra `bench`, which need not be there
 # pyright: reportMissingImports=false
 
-import math
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 
 from ..workload import Metrics, Workload, metrics_from_sums
-from .python_chain import chain_loop, constants_as, moreau_step, super_twisting_step
+from .python_chain import constants_as
 
 BLOCK_LANES = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
 
 
 class NumbaChain:
-    """One workload; `blocked` chooses the form that vectorises."""
+    """One workload."""
 
-    def __init__(self, workload: Workload, threads: int, blocked: bool):
+    def __init__(self, workload: Workload, threads: int):
         self._workload, self._threads = workload, threads
-        self._function = _compile_block_loop(workload.precision) if blocked else _compile_lane_loop()
+        self._function = compile_block_loop(workload.precision)
         torque, noise = workload.inputs()
         self._inputs = [np.ascontiguousarray(column) for column in (torque, *noise.T)]
         padded = -(-workload.lanes // BLOCK_LANES) * BLOCK_LANES
@@ -37,37 +36,9 @@ class NumbaChain:
         return metrics_from_sums(workload, list(sums[:, : workload.lanes]))
 
 
-def clear_compiled() -> None:
-    """Compile anew next time."""
-    _compile_lane_loop.cache_clear()
-    _compile_block_loop.cache_clear()
-
-
 @cache
-def _compile_lane_loop() -> Callable[..., np.ndarray]:
-    from numba import njit, prange
-
-    compiled = njit(error_model="numpy")
-    plant, observe = compiled(moreau_step(math.tanh)), compiled(super_twisting_step(math.sqrt, np.sign))
-    run_lane = compiled(chain_loop(math.tanh, plant, observe, observe))
-
-    @njit(parallel=True, error_model="numpy")
-    def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
-        out = np.zeros((9, values.shape[1]))
-        for lane in prange(values.shape[1]):
-            v = values[:, lane]
-            sums = run_lane(
-                steps, start, window, torque, motor_noise, load_noise, c, v[0], v[1], v[2], v[3], v[4], v[5], 0.0
-            )
-            for k in range(9):
-                out[k, lane] = sums[k]
-        return out
-
-    return run
-
-
-@cache
-def _compile_block_loop(precision: str) -> Callable[..., np.ndarray]:
+def compile_block_loop(precision: str) -> Callable[..., np.ndarray]:
+    """Compile the loop over all blocks; a later call has it."""
     from numba import njit, prange
 
     tanh = _compile_tanh(precision)
