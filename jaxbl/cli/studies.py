@@ -378,7 +378,8 @@ def explore(
             typer.echo(escape_unprintable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
             # a browser in the terminal ends when it is left
-            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+            page = server.write_redirect().as_uri()
+            threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
         run_until_interrupted(server.serve_forever)
     return Outcome([])
 

@@ -1,6 +1,7 @@
 """Pages of the explorer, served to this machine's browser alone: bound to 127.0.0.1, behind a token, to no other site."""
 
 import json
+import os
 import re
 import secrets
 import shutil
@@ -20,6 +21,8 @@ from .folder import Source
 
 _MOST_ASKED = 1 << 16
 """Bytes of a question."""
+_LONGEST_SILENCE = 60.0
+"""Seconds that a connection may say nothing, or take nothing, before it is closed."""
 _MOST_VERSIONS = 3
 """Of a page that is written anew, as a study goes on; pages that are open may still read the older ones."""
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".toml": "text/plain"}
@@ -95,9 +98,17 @@ class ExplorerServer(ThreadingHTTPServer):
         self._lock.acquire()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        # a browser that leaves a page ends what it was reading
-        if not isinstance(sys.exception(), ConnectionError):
+        # a browser that leaves a page ends what it was reading, and what sends half a request is left
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
+
+    def write_redirect(self) -> Path:
+        """Write a file that only this user can read and that leads to the page: its name may be on a browser's command line,
+        which everybody on the machine can see, where the token must not be."""
+        path = self._place / "open.html"
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+            file.write(f'<!doctype html><title>jaxbl explore</title><meta http-equiv="refresh" content="0; url={self.url}">\n')
+        return path
 
     def newest(self) -> str:
         """Number of the newest version of the page, written now if the one before is out of date.
@@ -143,6 +154,7 @@ class ExplorerServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: ExplorerServer
     protocol_version = "HTTP/1.1"
+    timeout = _LONGEST_SILENCE
     # head and content of an answer go together: apart, each waits for the browser's word that the other one came
     wbufsize = -1
     disable_nagle_algorithm = True

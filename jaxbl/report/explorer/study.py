@@ -107,7 +107,8 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     paths = {*config.axis_paths}
     if not isinstance(values, dict) or set(values) != paths:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
-    if not isinstance(seed, int) or not 0 <= seed < 2**31:
+    # true is a number of Python's
+    if type(seed) is not int or not 0 <= seed < 2**31:
         raise InputError("seed: should be a whole number from 0 and below 2^31")
     return with_values(config, values).model_copy(update={"axes": [], "figures": [], "notes": []}), seed
 

@@ -265,6 +265,7 @@ VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
         ({"values": VALUES | {ALPHA: "<b>"}, "seed": 0}, "observer.motor.alpha"),
         ({"values": VALUES, "seed": -1}, r"seed: should be a whole number from 0 and below 2\^31"),
         ({"values": VALUES}, "seed: should be a whole number"),
+        *(({"values": VALUES, "seed": seed}, "seed: should be a whole number") for seed in (True, False, 1.0, "1", [1])),
     ],
 )
 def test_points_that_the_study_may_not_have_are_refused(swept_folder, question, message):
