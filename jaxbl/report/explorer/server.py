@@ -1,7 +1,6 @@
 """Pages of the explorer, served to this machine's browser alone: bound to 127.0.0.1, behind a token, to no other site."""
 
 import json
-import os
 import re
 import secrets
 import shutil
@@ -106,8 +105,9 @@ class ExplorerServer(ThreadingHTTPServer):
         """Write a file that only this user can read and that leads to the page: its name may be on a browser's command line,
         which everybody on the machine can see, where the token must not be."""
         path = self._place / "open.html"
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-            file.write(f'<!doctype html><title>jaxbl explore</title><meta http-equiv="refresh" content="0; url={self.url}">\n')
+        path.touch(0o600, exist_ok=False)
+        leads = f'<meta http-equiv="refresh" content="0; url={self.url}">'
+        path.write_text(f"<!doctype html><title>jaxbl explore</title>{leads}\n", encoding="utf-8")
         return path
 
     def newest(self) -> str:
