@@ -101,16 +101,16 @@ def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path
             write({name: values[start : start + ROW_GROUP] for name, values in columns.items()})
         x, y = _first_axes(result.config, dims)
         cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
-        at = _most_telling(cells, first)
+        telling = _most_telling(cells, first)
         # of the other dimensions, seeds together
-        place = np.insert(np.array(at, int), [min(x, y), max(x, y) - 1], 0).tolist()
+        place = np.insert(np.array(telling, int), [min(x, y), max(x, y) - 1], 0).tolist()
         return {
             "rows": rows,
             "found": runs,
             "total": rows,
             "start": {"x": x, "y": y, "at": place},
-            "overview": _overview(cells[first][at[:-1]]),
-            "stars": _stars(cells, first, dims, x, y, at),
+            "overview": _overview(cells[first][telling[:-1]]),
+            "stars": _stars(cells, first, dims, x, y, telling),
         }
 
 
@@ -134,9 +134,9 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
     """The slice (places along the other dimensions, the seed the last) with the clearest border between what works and what
     fails; where none has a border, that with the largest spread of the metric."""
     values = cells.get(f"{first.partition('.')[0]}.converged", cells[first])
-    *others, _ = values.shape[:-2]
-    best, at = (-1.0, -1.0), (0,) * (len(others) + 1)
-    for index in np.ndindex(*others):
+    *sizes_of_slices, _ = values.shape[:-2]
+    best, telling = (-1.0, -1.0), (0,) * (len(sizes_of_slices) + 1)
+    for index in np.ndindex(*sizes_of_slices):
         part = [array[(*index, 0)].reshape(-1) for array in (values, cells[first])]
         works, sizes = (one[:: max(one.size // _MOST_JUDGED, 1)] for one in part)
         works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
@@ -144,8 +144,8 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
         spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0
         # tenths: of slices with about the same border that with the larger spread
         if (score := (round(10.0 * min(share, 1.0 - share)), spread)) > best:
-            best, at = score, (*index, 0)
-    return at
+            best, telling = score, (*index, 0)
+    return telling
 
 
 _MOST_STARRED = 1 << 16
@@ -153,7 +153,7 @@ _MOST_STARRED = 1 << 16
 
 
 def _stars(
-    cells: dict[str, Array], first: str, dims: list[AxisColumns], x: int, y: int, at: tuple[int, ...]
+    cells: dict[str, Array], first: str, dims: list[AxisColumns], x: int, y: int, telling: tuple[int, ...]
 ) -> list[JsonObject]:
     """The best gains of each slice: places along all dimensions; none where the first map is not over gains."""
     side = first.partition(".")[0]
@@ -165,7 +165,7 @@ def _stars(
     values = [np.asarray(next(iter(dims[i].values()))) for i in (y, x)]
     grid = dict(zip(paths, (axis.reshape(-1) for axis in np.meshgrid(*values, indexing="ij")), strict=True))
     stars = []
-    for index in [at[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != at[:-1])][:64]:
+    for index in [telling[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != telling[:-1])][:64]:
         runs = [
             pd.DataFrame(grid | {"seed": seed} | {name: cells[name][(*index, seed)].reshape(-1) for name in needed})
             for seed in range(shape[-3])
@@ -178,15 +178,17 @@ def _stars(
             gains_there = zip((y, x), values, worst.index[best.index], strict=True)
             place = {i: int(np.flatnonzero(axis == value)[0]) for i, axis, value in gains_there}
             place |= zip([i for i in range(len(dims) - 1) if i not in place], index, strict=True)
-            stars.append({"metric": first, "first": index == at[:-1], "at": [place.get(i, 0) for i in range(len(dims))]})
+            stars.append(
+                {"metric": first, "first": index == telling[:-1], "at": [place.get(i, 0) for i in range(len(dims))]}
+            )
     return stars
 
 
 def _overview(values: Array) -> JsonObject:
     """The first picture: a map over the last two of three dimensions, median over the first, the seeds."""
     steps = [-(-size // _OVERVIEW) for size in values.shape[1:]]
-    some = np.moveaxis(np.array(values[:, :: steps[0], :: steps[1]]), 0, -1)
-    cells = pd.DataFrame(some.reshape(-1, some.shape[-1])).median(axis=1).to_numpy().reshape(some.shape[:-1])
+    samples = np.moveaxis(np.array(values[:, :: steps[0], :: steps[1]]), 0, -1)
+    cells = pd.DataFrame(samples.reshape(-1, samples.shape[-1])).median(axis=1).to_numpy().reshape(samples.shape[:-1])
     return {"shape": list(cells.shape), "values": packed(cells)}
 
 

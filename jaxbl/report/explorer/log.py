@@ -87,7 +87,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         frame = frame.assign(**_errors(frame)).rename(columns={"z": "twist"})
     coordinates = list(_coordinates(frame, units))
     if "alarm_gap" in summary:
-        groups = list(_watched(summary, frame))
+        groups = list(_watch_groups(summary, frame))
         coordinates += [group["lines"][0] | {"unit": group["unit"]} for group in groups]
     else:
         groups = [group for group in _groups(summary, frame, units) if group["lines"]]
@@ -118,22 +118,22 @@ def _is_run(summary: JsonObject) -> bool:
 
 
 def _errors(trace: DataFrame) -> dict[str, np.ndarray]:
-    """What the observers of a simulated run are off by: true less observed."""
+    """Compute what the observers of a simulated run are off by: true less observed."""
     pairs = {f"{side}.{name}_error": (f"{side}.{name}", f"{side}.{name}_estimate")
              for side in POSITION_CHANNELS for name in ("position", "velocity")}  # fmt: skip
-    known = {name: pair for name, pair in pairs.items() if {*pair} <= {*trace}}
-    return {name: trace[true].to_numpy() - trace[seen].to_numpy() for name, (true, seen) in known.items()}
+    columns = {name: pair for name, pair in pairs.items() if {*pair} <= {*trace}}
+    return {name: trace[true].to_numpy() - trace[estimate].to_numpy() for name, (true, estimate) in columns.items()}
 
 
 _WATCHED = {"half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction"}
 
 
-def _watched(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
+def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
     """The figures of a watch: each number by both observers."""
     for name, label in _WATCHED.items():
         columns = {f"{side}.{name}": f"by the {side} observer" for side in POSITION_CHANNELS}
         columns |= {f"{name}_{end}": f"{end}, with 95 %" for end in ("from", "to")}
-        lines = [{"column": column, "label": f"{label} {said}"} for column, said in columns.items() if column in frame]
+        lines = [{"column": column, "label": f"{label} {origin}"} for column, origin in columns.items() if column in frame]
         if lines:
             unit = summary["units"]["motor"][name]
             yield {"name": label, "quantity": label, "unit": unit, "bandwidth": None, "lines": lines}

@@ -31,7 +31,7 @@ def open_source(folder: str | Path) -> Source:
 def _tuning_source(file: Path) -> Source:
     """The maps of the search for gains, the widest first."""
     gains = read_json(file)["gains"].items()
-    chosen = [f"{side}: λ = {found['lambda']:.4g} √rad/s, α = {found['alpha']:.4g} rad/s²" for side, found in gains]
+    chosen = [f"{side}: λ = {pair['lambda']:.4g} √rad/s, α = {pair['alpha']:.4g} rad/s²" for side, pair in gains]
     return _stage_source(file.parent / "tune", ("wide", "coarse"), f"The search for gains chose, {'; '.join(chosen)}.")
 
 
@@ -48,9 +48,10 @@ def _stage_source(folder: Path, names: tuple[str, ...], answer: str) -> Source:
     first = next((name for name in names if name in stages), None)
     if first is None:
         raise InputError(f"{folder}: holds no runs; run the command that wrote it again")
-    others = ", ".join(name for name in stages if name != first)
-    more = [f"Shown: {first}. Others: {others}; such as jaxbl explore {folder / others.split(', ')[0]}."] if others else []
-    return study_source(folder / first, [answer, *more])
+    sentences = [answer, f"Shown: {first}."]
+    if other_stages := [name for name in stages if name != first]:
+        sentences.append(f"Others: {', '.join(other_stages)}; such as jaxbl explore {folder / other_stages[0]}.")
+    return study_source(folder / first, sentences)
 
 
 _KINDS: dict[str, Callable[[Path], Source]] = {

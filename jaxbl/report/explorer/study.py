@@ -26,12 +26,12 @@ from .folder import Source, colours_of, drawable, read_table, write_page
 from .grid import dimensions, write_grid
 
 
-def study_source(folder: str | Path, found: Sequence[str] = ()) -> Source:
+def study_source(folder: str | Path, sentences: Sequence[str] = ()) -> Source:
     """A study's folder, to be explored. Raises `InputError` where it holds no study.
 
     Args:
         folder: as `jaxbl sweep` left it.
-        found: sentences that stand before the study's own.
+        sentences: those that stand before the study's own.
     """
     result = open_study(folder)
     # single runs share the machine's cores with one another already
@@ -39,7 +39,7 @@ def study_source(folder: str | Path, found: Sequence[str] = ()) -> Source:
 
     def write(out: Path, served: bool) -> bool:
         now = open_study(folder)
-        return write_study(now, out, [*found, *_lead(now)], served=served)
+        return write_study(now, out, [*sentences, *_lead(now)], served=served)
 
     def answer(to: Callable[[Config, Any], JsonObject], asked: Any) -> JsonObject:
         with one_at_a_time:
@@ -49,7 +49,7 @@ def study_source(folder: str | Path, found: Sequence[str] = ()) -> Source:
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
     return Source(
         identity(result.config),
-        [*found, *_lead(result)],
+        [*sentences, *_lead(result)],
         write,
         answers,
         partial(answer, simulated, {"values": first, "seed": 0}),
@@ -72,7 +72,7 @@ def comparison_source(file: Path) -> Source:
 
     def write(out: Path, served: bool) -> bool:
         frame = read_table(folder / "comparison.parquet").assign(seed=config.sweep.first_seed, finite=True)
-        return write_study(StudyResult(config, frame), out, lead, said=names)
+        return write_study(StudyResult(config, frame), out, lead, studies=names)
 
     return Source(checksum(file.read_bytes()), lead, write, {}, lambda: None, lambda: None)
 
@@ -86,7 +86,7 @@ def _lead(result: StudyResult) -> list[str]:
 
 
 def write_study(
-    result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False, said: Sequence[str] = ()
+    result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False, studies: Sequence[str] = ()
 ) -> bool:
     """Write the page of a study and its data into a folder: maps of a grid, points of other studies.
 
@@ -95,13 +95,13 @@ def write_study(
         out: an empty folder.
         lead: what was found, in sentences.
         served: whether a server is to give the data, and simulates runs.
-        said: names of two studies that are compared, whose columns end with `.first`, `.second` and `.factor`.
+        studies: names of two studies that are compared, whose columns end with `.first`, `.second` and `.factor`.
 
     Returns:
         Whether runs are still to come.
     """
     config = result.config
-    content = _about(config, result.columns, said) | {"lead": list(lead), "served": served}
+    content = _about(config, result.columns, studies) | {"lead": list(lead), "served": served}
     names = [metric["name"] for metric in content["metrics"]]
     content |= (
         write_cloud(result, names, out) if dimensions(config) is None else write_grid(result, names, content["first"], out)
@@ -176,14 +176,14 @@ def nearby(config: Config, asked: Any) -> JsonObject:
     return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}
 
 
-def _about(config: Config, columns: list[str], said: Sequence[str] = ()) -> JsonObject:
+def _about(config: Config, columns: list[str], studies: Sequence[str] = ()) -> JsonObject:
     """The page's account of a study and its columns."""
     axes, experiment = {"seed", *config.axis_paths}, config.build()
     names = [name for name in columns if name not in axes]
     return {
         "title": config.title or "Study",
         "metrics": [
-            {"name": name, "label": _label(name, said), "yes": is_boolean(name), "size": is_magnitude(name)}
+            {"name": name, "label": _label(name, studies), "yes": is_boolean(name), "size": is_magnitude(name)}
             for name in names
         ],
         "first": next((name for name in names if re.search(r"\.velocity_rmse(\.factor)?$", name)), names[0]),
@@ -192,14 +192,14 @@ def _about(config: Config, columns: list[str], said: Sequence[str] = ()) -> Json
         "colours": colours_of(MAP),
         # where no axis changes them
         "gains": {side: getattr(experiment.observer, side).gains() for side in experiment.sides},
-        "effects": None if said else config.to_dict()["effects"],
+        "effects": None if studies else config.to_dict()["effects"],
     }
 
 
-def _label(name: str, said: Sequence[str]) -> str:
+def _label(name: str, studies: Sequence[str]) -> str:
     """A metric in words; of two studies that are compared, which one's."""
     metric, _, which = name.rpartition(".")
-    if not said or name == "finite":
+    if not studies or name == "finite":
         return value_label(name)
-    words = {"first": f"in {said[0]}", "second": f"in {said[1]}", "factor": f"{said[1]} over {said[0]}"}
+    words = {"first": f"in {studies[0]}", "second": f"in {studies[1]}", "factor": f"{studies[1]} over {studies[0]}"}
     return f"{value_label(metric)}, {words[which]}"

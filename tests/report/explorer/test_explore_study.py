@@ -265,6 +265,27 @@ def test_a_filter_the_points_it_leaves_and_a_link_to_them(tmp_path):
         check_figures(page, 0)
 
 
+@needs_chromium
+def test_an_address_with_anything_in_it_opens_a_page(tmp_path):
+    page_file = write_static(make_source(make_study_result()), tmp_path / "out")
+    addresses = [
+        "metric=%3Cimg%20src=x%20onerror=alert(1)%3E&x=nothing&y=seed&facet=seed&how=constructor",
+        f"at.{NOISE}=1e99&at.seed=-3&region=9~9~1~1&row=1e3&pins=9999~x",
+        f"region=0.5~1~3~NaN&at.{NOISE}=0.7&row=179&condition=none",
+        "kind=points&px=constructor&range=a~b~~&filter=%3Cb%3E",
+        "kind=parallel&metric=seed&filter=seed%20%3E%20x",
+        "kind=__proto__",
+        "%%%",
+    ]
+    with open_pages(page_file) as (page,):
+        for words in addresses:
+            page.goto(f"{page_file.as_uri()}#{words}")
+            page.reload()
+            page.wait_for_selector("body[data-drawn]:not([data-drawn='overview'])")
+            page.wait_for_selector("#state:not(:has-text('reading'))")
+            assert page.locator("#plot .uplot").count() >= 1 and "cannot be read" not in page.locator("#state").inner_text()
+
+
 def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_path):
     columns = {
         "motor__converged": lambda frame: (frame[ALPHA] > 10.0) | (frame[NOISE] < 5e-5),

@@ -25,11 +25,12 @@ class Maps {
   constructor(page) { Object.assign(this, { page, study: page.study, panels: [] }); }
   get view() {
     const { view, study } = this.page, [x, y] = ["x", "y"].map((name) => study.dims.find((dim) => dim.path === view[name]) ?? study.dims[study.start[name]]);
-    const at = study.dims.map((dim) => { const own = view[`at.${dim.path}`] ?? (dim.seed ? "all" : study.start.at[dim.i]); return own === "all" ? own : Math.min(Number(own) || 0, dim.size - 1); });
-    const parts = [...(view.region ?? "").split("~").map(Number)], whole = parts.length !== 4 || parts.some(Number.isNaN);
-    const clipped = (one, dim) => Math.min(Math.max(one, 0), dim.size);
-    return { x, y, at, how: study.metric(view.metric)?.yes ? "mean" : view.how, facet: study.dims.find((dim) => dim.path === view.facet && dim !== x && dim !== y) ?? null, most: [1024, 1024],
-      from: whole ? [0, 0] : [clipped(parts[0], x), clipped(parts[1], y)], to: whole ? [x.size, y.size] : [clipped(parts[2], x), clipped(parts[3], y)] };
+    // an address may have anything
+    const clipped = (one, most) => Math.min(Math.max(Math.trunc(one) || 0, 0), most);
+    const at = study.dims.map((dim) => { const own = view[`at.${dim.path}`] ?? (dim.seed ? "all" : study.start.at[dim.i]); return own === "all" ? own : clipped(own, dim.size - 1); });
+    const ends = (view.region ?? "").split("~").map((one, k) => clipped(one, [x, y][k % 2].size)), whole = ends.length !== 4 || ends[0] >= ends[2] || ends[1] >= ends[3];
+    return { x, y, at, how: study.metric(view.metric)?.yes ? "mean" : view.how, facet: study.dims.find((dim) => dim.path === view.facet && dim !== x && dim !== y) ?? null, most: [0, 0].fill(Math.max(200, Math.min($("plot").clientWidth, 1024))),
+      from: whole ? [0, 0] : ends.slice(0, 2), to: whole ? [x.size, y.size] : ends.slice(2) };
   }
   form(pick) {
     const { study, page } = this, { x, y, at, facet } = this.view, dims = study.dims.filter((dim) => dim.size > 1 && !dim.seed), forget = { region: "" };
@@ -336,14 +337,16 @@ class Page {
   }
   /** The points that are shown and pass the filter: the best ones as a table. */
   async table() {
-    const { study, view, mask } = this, own = view.metric.split(".")[0];
-    const names = [...new Set([...study.axes.filter((one) => one.varied).map((one) => one.name), view.metric, ...["converged", "margin_exact"].map((one) => `${own}.${one}`).filter((one) => study.metric(one))])];
+    const { study, view, mask } = this, own = view.metric.split(".")[0], large = study.rows > 1e6;
+    // of very many points other columns, too, take time to be read
+    if (large && !$("tabled").open) { $("count").textContent = "Points"; $("tabled").ontoggle = () => this.table(); $("csv").onclick = () => { $("tabled").open = true; }; return; }
+    const names = [...new Set([...study.axes.filter((one) => one.varied).map((one) => one.name), view.metric, ...["converged", "margin_exact"].map((one) => `${own}.${one}`).filter((one) => !large && study.metric(one))])];
     const columns = Object.fromEntries(await Promise.all(names.map(async (name) => { const field = study.fields.get(name), read = await field.read(); return [name, { field, read }]; })));
-    const { rows, count } = some(study, mask, study.rows > 1e6 ? 1e5 : 1e6, this.shown.shows()), key = columns[view.metric].read;
+    const { rows, count } = some(study, mask, large ? 1e5 : 1e6, this.shown.shows()), key = columns[view.metric].read;
     $("state").textContent = this.said;
     const values = Float64Array.from(rows, key), order = Uint32Array.from(rows.keys()).sort((a, b) => (values[a] - values[b]) || (values[a] === values[a] ? -1 : 1) - (values[b] === values[b] ? -1 : 1));
     const cell = ({ field, read }, row) => { const value = read(row); return field.names ? field.names[value] : field.yes ? (value ? "yes" : "no") : value; };
-    $("count").textContent = `${rows.length === 1 ? "One point" : `${rows.length} points`} shown${rows.length < count && study.rows > 1e6 ? " (of many)" : ""}, by ${study.fields.get(view.metric).label}`;
+    $("count").textContent = `${rows.length === 1 ? "One point" : `${rows.length} points`} shown${rows.length < count && large ? " (of many)" : ""}, by ${study.fields.get(view.metric).label}`;
     const draw = () => tableOf($("rows"), ["", ...names.map((one) => columns[one].field.label)], [...order.slice(0, MOST_ROWS)].map((k) => {
       const button = made("button", { type: "button", textContent: "take" });
       button.addEventListener("click", () => this.take(rows[k]));
@@ -366,7 +369,7 @@ class Page {
     this.form();
     const first = Object.keys(address.read()).every((name) => ["row", "pins", "how", "condition"].includes(name)) && study.grid;
     if (first) { $("chosen").hidden = !study.stars.length; this.shown.first(); document.body.dataset.drawn = "overview"; }
-    const { star } = study.stars?.find((one) => one.first) ? { star: study.stars.find((one) => one.first) } : {};
+    const star = study.stars?.find((one) => one.first);
     if (view.row === "" && star && first) view.row = String(study.dims.reduce((sum, dim) => sum + dim.stride * (star.at[dim.i] ?? 0), 0));
     $("chosen").hidden = view.row === "";
     await this.update();
