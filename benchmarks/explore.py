@@ -31,7 +31,7 @@ from jaxbl.sweeps.trial import run, run_perturbed  # noqa: E402
 MAP = Path(__file__).parents[1] / "sweeps" / "gain_map.toml"
 ERROR = "motor.velocity_rmse"
 HOVER = """() => {
-  const plot = document.querySelector("#plot"), box = plot.getBoundingClientRect();
+  const plot = document.querySelector("#plot .plane"), box = plot.getBoundingClientRect();
   return Math.max(...Array.from({ length: 50 }, (_, k) => {
     const at = { clientX: box.left + 100 + 10 * k, clientY: box.top + 100 + 5 * k, bubbles: true };
     const began = performance.now();
@@ -46,7 +46,7 @@ def clicks(page: Page) -> None:
     page.locator("body[data-drawn*=motor]").wait_for()
     times, before = [], None
     for k in range(13):
-        page.locator("#plot").click(position={"x": 200 + 40 * k, "y": 150 + 20 * k})
+        page.locator("#plot .plane").click(position={"x": 200 + 40 * k, "y": 150 + 20 * k})
         while (now := page.evaluate("document.body.dataset.simulated")) == before:
             time.sleep(0.02)
         times.append(int(now.split(", ")[-1].removesuffix(" ms")))

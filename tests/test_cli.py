@@ -335,7 +335,7 @@ def test_a_sweep_is_explored(call, tmp_path):
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
     assert code == 0 and lines[0].startswith("4 runs: ") and lines[-1] == "page/index.html"
-    assert {"index.html", "map.js", "plot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
+    assert {"index.html", "views.js", "uPlot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
         list_files(Path("page"))
     )
     with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
@@ -345,10 +345,19 @@ def test_a_sweep_is_explored(call, tmp_path):
 def test_explore_serves_until_it_is_interrupted(call, tmp_path):
     write_study(tmp_path, rigid_study(axes=GAINS))
     call("sweep", "study.toml", "--out", "out")
-    with start_command("explore", "out", "--json", cwd=tmp_path, TMPDIR=str(tmp_path)) as process:
+    # a browser that only writes down how it was called
+    seen = tmp_path / "called"
+    browser = f"sh -c 'echo %s > {seen}'"
+    with start_command(
+        "explore", "out", "--json", "--browser", cwd=tmp_path, TMPDIR=str(tmp_path), BROWSER=browser
+    ) as process:
         (url,) = (line.split()[1] for line in iter(process.stderr.readline, "Ctrl+C ends it.\n") if line.startswith("Open "))
         with urllib.request.urlopen(url) as answer:
             assert b"jaxbl explore" in answer.read()
+        while not seen.exists() or not seen.read_text():
+            time.sleep(0.05)
+        # its command line, which others see, has a file of this user's and not the token
+        assert url.split("/")[3] not in seen.read_text() and seen.read_text().startswith(f"file://{tmp_path}/jaxbl-explore-")
         assert any(file.startswith("jaxbl-explore-") for file in list_files(tmp_path))
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=60)

@@ -16,7 +16,7 @@ import typer
 import jaxbl
 from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
-from jaxbl.files import FolderInUse, has_file, lock_folder, make_folder, remove_if_empty_on_error, to_path
+from jaxbl.files import FolderInUse, lock_folder, make_folder, remove_if_empty_on_error, to_path
 from jaxbl.lines import NextStep, format_descriptions, format_duration
 from jaxbl.terminal import (
     is_quiet,
@@ -346,7 +346,7 @@ def explore(
     port: Annotated[int, option("N", "port to serve on; 0: one that is free", min=0, max=65535)] = 0,
     browser: Annotated[bool | None, flag("--browser/--no-browser", "open the page [default: on a terminal]")] = None,
 ) -> Outcome:
-    """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python.
+    """Explore what a command left, a sweep, a run, a diagnosis and others, in the browser; --static: a page without Python.
 
     Example: jaxbl explore results/axis_map
 
@@ -356,16 +356,9 @@ def explore(
         raise InputError("--static: writes a page and serves none; --port and --browser do not go with it; leave them out")
     workers.start_jax()
     from jaxbl.report.explorer.folder import write_static
-    from jaxbl.report.explorer.log import log_source
-    from jaxbl.report.explorer.study import study_source
+    from jaxbl.report.explorer.sources import open_source
 
-    source = log_source(folder)
-    if source is None and not has_file(to_path(folder), "manifest.json"):
-        raise InputError(
-            f"{folder}: is missing, or holds no sweep, identification or diagnosis; give a folder that 'jaxbl sweep', "
-            "'identify' or 'diagnose' wrote"
-        )
-    source = source or study_source(folder)
+    source = open_source(folder)
     if static is not None:
         with show_task(context, "writing the page"):
             page = write_static(source, static)
@@ -378,7 +371,8 @@ def explore(
             typer.echo(escape_unprintable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
             # a browser in the terminal ends when it is left
-            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+            page = server.write_redirect().as_uri()
+            threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
         run_until_interrupted(server.serve_forever)
     return Outcome([])
 

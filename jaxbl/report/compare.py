@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm, Normalize
 
 from jaxbl.config import Config, is_boolean
-from jaxbl.files import json_with_checksum, write_atomic
+from jaxbl.files import json_with_checksum, write_atomic, write_table
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
@@ -25,11 +25,32 @@ _PANELS = 3
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> str:
-    """Write `comparison.json`. Returns the first study's TOML."""
+    """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
     # of an earlier comparison
     (folder / "figures" / "comparison.png").unlink(missing_ok=True)
+    write_table(folder / "comparison.parquet", tabulate_points(comparison))
+    write_atomic(folder / "study.toml", comparison.first_config.to_toml())
     write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
     return comparison.first_config.to_toml()
+
+
+def tabulate_points(comparison: Comparison) -> pd.DataFrame:
+    """The common points with each metric that changed: `first`, `second`, and the `factor` between them (of what is true or
+    false, the difference of the shares)."""
+    columns: dict[str, Any] = {}
+    for change in comparison.metrics:
+        if change.count:
+            frame = comparison.frame(change.metric)
+            columns |= {path: frame[path] for path in comparison.axes}
+            first, second = frame["first"].astype(float), frame["second"].astype(float)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                factor = second - first if is_boolean(change.metric) else second / first
+            columns |= {
+                f"{change.metric}.factor": factor,
+                f"{change.metric}.first": first,
+                f"{change.metric}.second": second,
+            }
+    return pd.DataFrame(columns)
 
 
 def describe_comparison(comparison: Comparison) -> Result:

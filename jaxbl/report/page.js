@@ -1,4 +1,6 @@
-// Reads values off figures, zooms them, and sorts tables. Without it, the page is whole.
+"use strict";
+/* Draws lines by uPlot in place of their picture, reads values off other figures, zooms them, and sorts tables. Without it, the
+ * page is whole. */
 
 /** An axis of a panel: values at shares of its length, and back. */
 class Axis {
@@ -21,7 +23,7 @@ class Axis {
   /** A line of text for a value; none where it has neither a name nor a label. */
   line(value) {
     const text = this.text(value);
-    return this.label && text ? [`${this.label}: ${text}`] : this.names?.length && text ? [text] : [];
+    return this.label && text ? [`${this.label}: ${text}${this.key ? ` [${this.key}]` : ""}`] : this.names?.length && text ? [text] : [];
   }
 }
 
@@ -80,15 +82,63 @@ const unpack = (panels) => panels.map((panel) => ({
   },
 }));
 
-/** Zoom and values of one figure. */
-const figure = (element) => {
-  const view = element.querySelector(".view"), image = view.querySelector("img");
-  const marker = Object.assign(document.createElement("div"), { className: "marker", hidden: true });
-  const values = Object.assign(document.createElement("div"), { className: "values", hidden: true });
-  view.append(marker, values);
-  let panels = null, scale = 1, shift = [0, 0], from = null;
-  const known = () => (panels ??= unpack(JSON.parse(element.querySelector("script").textContent)));
+const DASHES = { "--": [6, 4], ":": [2, 3], "-.": [8, 4, 2, 4] };
+const charts = [];
 
+/** A panel of lines as a chart, and what the panel's lines say. */
+const charted = (element, panel, height) => {
+  const axis = ({ names, ends, ...of }) => ({ ...of, ends, names: names && new Map(names) });
+  const black = (colour) => (colour === "#000000" ? undefined : colour);
+  const chart = new Chart(element, { x: axis(panel.x), y: axis(panel.y), height, title: panel.title, named: true, zoomed: (range) => follow(chart, range) });
+  const lines = panel.lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y), colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] }));
+  // of a line with marks the marks are dots of their own
+  const dotted = lines.filter((line) => line.marker).map((line) => ({ ...line, dots: line.marker === "." ? 4 : 6 }));
+  const bands = panel.bands.map(({ x, low, high, opacity, ...band }) => ({ ...band, x: unpacked(x), low: unpacked(low), high: unpacked(high), alpha: opacity }));
+  chart.set([...lines.filter((line) => line.width !== 0), ...dotted], [...bands, ...panel.spans.map(({ opacity, dashes, colour, ...span }) => ({ ...span, colour: black(colour) ?? GREY, alpha: opacity }))]);
+  charts.push(chart);
+};
+/** Charts over the same quantity are enlarged together. */
+const follow = (from, range) => {
+  for (const chart of charts) {
+    if (chart !== from && !(chart.x.label && chart.x.label === from.x.label && chart.x.log === from.x.log)) continue;
+    if (chart !== from) chart.range = range && [range[0], null];
+    chart.build();
+  }
+};
+
+/** One figure: charts of its panels, or its picture with zoom and values. */
+const figure = (element) => {
+  const view = element.querySelector(".view"), image = view.querySelector("img"), content = element.querySelector("script");
+  const panels = JSON.parse(content.textContent), tools = made("div", { className: "tools" });
+  const tool = (label, textContent, act) => {
+    const button = made("button", { type: "button", textContent, title: label, ariaLabel: label });
+    button.addEventListener("click", act);
+    tools.append(button);
+  };
+  // signals; what is written into other figures, such as names beside their curves, is in the picture alone
+  const isSignal = (panel) => panel.bands && !panel.cells && !panel.bars.length && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
+  if (panels.length && panels.every(isSignal)) {
+    const height = Number(image.getAttribute("height"));
+    image.hidden = true;
+    view.removeAttribute("tabindex");
+    view.style.width = "";
+    for (const [, row] of Map.groupBy(panels, (panel) => Math.round(20 * panel.place[1]))) {
+      const across = made("div", { className: "row" }, ...row.map(() => made("div")));
+      view.append(across);
+      row.forEach((panel, k) => charted(across.children[k], panel, Math.max(130, panel.place[3] * height + 45)));
+    }
+    tool("whole figure", "whole", () => { for (const chart of charts) if (view.contains(chart.view)) chart.zoom(null); });
+  } else pictured(view, image, unpack(panels), tool, tools);
+  tool("save as SVG", "SVG", () => made("a", { href: image.src, download: `${element.dataset.name}.svg` }).click());
+  view.after(tools);
+};
+
+/** Zoom and values of a picture. */
+const pictured = (view, image, panels, tool, tools) => {
+  const marker = made("div", { className: "marker", hidden: true }), values = made("div", { className: "values", hidden: true });
+  view.append(marker, values);
+  let scale = 1, shift = [0, 0], from = null, cursor = null;
+  const hide = () => { marker.hidden = values.hidden = true; };
   const draw = () => {
     const { clientWidth: width, clientHeight: height } = view;
     shift = [Math.min(0, Math.max(shift[0], width * (1 - scale))), Math.min(0, Math.max(shift[1], height * (1 - scale)))];
@@ -102,33 +152,20 @@ const figure = (element) => {
     scale = next;
     draw();
   };
-  const hide = () => { marker.hidden = values.hidden = true; };
   const show = (at) => {
     const width = view.clientWidth * scale, height = view.clientHeight * scale;
     const share = [(at[0] - shift[0]) / width, (at[1] - shift[1]) / height];
-    const panel = known().find(({ place: [left, top, wide, high] }) =>
-      share[0] >= left && share[0] <= left + wide && share[1] >= top && share[1] <= top + high);
+    const panel = panels.find(({ place: [left, top, wide, high] }) => share[0] >= left && share[0] <= left + wide && share[1] >= top && share[1] <= top + high);
     if (!panel) return hide();
-    const [left, top, wide, high] = panel.place, size = [wide * width, high * height];
-    const here = found(panel, [(share[0] - left) / wide, (share[1] - top) / high], size);
-    if (!here.text.length) return hide();
-    values.textContent = here.text.join("\n");
-    values.hidden = false;
+    const [left, top, wide, high] = panel.place, here = found(panel, [(share[0] - left) / wide, (share[1] - top) / high], [wide * width, high * height]);
+    beside(values, here.text, at, view);
     marker.hidden = !here.at;
-    if (here.at) {
-      marker.style.left = `${(left + here.at[0] * wide) * width + shift[0]}px`;
-      marker.style.top = `${(top + here.at[1] * high) * height + shift[1]}px`;
-      marker.style.borderColor = here.colour;
-    }
-    const right = at[0] + 14 + values.offsetWidth > view.clientWidth;
-    values.style.left = `${Math.max(0, right ? at[0] - 14 - values.offsetWidth : at[0] + 14)}px`;
-    values.style.top = `${Math.max(0, Math.min(at[1] + 14, view.clientHeight - values.offsetHeight))}px`;
+    if (here.at) Object.assign(marker.style, { left: `${(left + here.at[0] * wide) * width + shift[0]}px`, top: `${(top + here.at[1] * high) * height + shift[1]}px`, borderColor: here.colour });
   };
   const place = (event) => {
     const box = view.getBoundingClientRect();
     return [event.clientX - box.left, event.clientY - box.top];
   };
-
   view.addEventListener("pointermove", (event) => {
     if (!from) return show(place(event));
     const at = place(event);
@@ -136,9 +173,7 @@ const figure = (element) => {
     from = at;
     draw();
   });
-  view.addEventListener("pointerdown", (event) => {
-    if (scale > 1) { from = place(event); view.setPointerCapture(event.pointerId); }
-  });
+  view.addEventListener("pointerdown", (event) => { if (scale > 1) { from = place(event); view.setPointerCapture(event.pointerId); } });
   for (const name of ["pointerup", "pointercancel"]) view.addEventListener(name, () => { from = null; });
   view.addEventListener("pointerleave", hide);
   view.addEventListener("dblclick", (event) => zoom(scale > 1 ? 1 / scale : 3, place(event)));
@@ -148,9 +183,8 @@ const figure = (element) => {
     event.preventDefault();
     zoom(Math.exp(-event.deltaY / 300), place(event));
   }, { passive: false });
-
+  const spoken = made("span", { className: "spoken", ariaLive: "polite" });
   // by keyboard: arrows move a cross-hair over the figure, or the figure where it is zoomed
-  let cursor = null;
   view.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (event.key === "+" || event.key === "-") zoom(event.key === "+" ? 1.5 : 1 / 1.5);
@@ -166,35 +200,15 @@ const figure = (element) => {
     event.preventDefault();
   });
   view.addEventListener("blur", () => { cursor = null; hide(); });
-
-  const tools = Object.assign(document.createElement("div"), { className: "tools" });
-  const spoken = Object.assign(document.createElement("span"), { className: "spoken" });
-  spoken.setAttribute("aria-live", "polite");
-  spoken.style.cssText = "position:absolute;clip-path:inset(50%);width:1px;height:1px;overflow:hidden";
-  for (const [label, text, act] of [
-    ["zoom in", "+", () => zoom(1.5)], ["zoom out", "−", () => zoom(1 / 1.5)], ["whole figure", "whole", () => zoom(1 / scale)],
-  ]) {
-    const button = Object.assign(document.createElement("button"), { type: "button", textContent: text, title: label });
-    button.setAttribute("aria-label", label);
-    button.addEventListener("click", act);
-    tools.append(button);
-  }
-  const save = Object.assign(document.createElement("button"), { type: "button", textContent: "SVG", title: "save as SVG" });
-  save.setAttribute("aria-label", "save as SVG");
-  save.addEventListener("click", () => {
-    const link = Object.assign(document.createElement("a"), { href: image.src, download: `${element.dataset.name}.svg` });
-    link.click();
-  });
-  tools.append(save, spoken);
-  view.after(tools);
+  for (const [label, sign, act] of [["zoom in", "+", () => zoom(1.5)], ["zoom out", "−", () => zoom(1 / 1.5)], ["whole figure", "whole", () => zoom(1 / scale)]]) tool(label, sign, act);
+  tools.append(spoken);
 };
 
 /** A table that sorts by the column whose head is clicked. */
 const sortable = (table) => {
   const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
-    const button = Object.assign(document.createElement("button"), { type: "button" });
-    button.append(...head.childNodes);
+    const button = made("button", { type: "button" }, ...head.childNodes);
     if (!button.textContent.trim()) return;
     head.append(button);
     button.addEventListener("click", () => {
@@ -216,3 +230,4 @@ const sortable = (table) => {
 
 document.querySelectorAll("figure").forEach(figure);
 document.querySelectorAll("table").forEach((table) => { if (table.tBodies[0].rows.length > 1) sortable(table); });
+addEventListener("resize", () => { for (const chart of charts) chart.draw(); });

@@ -1,6 +1,6 @@
 """The files of a report: one HTML page that holds everything, figures, and the results of a log, whole or not at all.
 
-The page needs nothing from elsewhere, and runs no script but its own (`shared.js`, `page.js`): a policy in its head
+The page needs nothing from elsewhere, and runs no script but its own and uPlot: a policy in its head
 forbids both.
 """
 
@@ -42,13 +42,13 @@ _SHORT = 8
 """Rows of a table that may stand above the figures."""
 _WIDE = 700
 """Pixels beyond which a figure has the whole width of the page; others stand in two columns."""
-_PARTS = "page.css", "shared.js", "page.js"
+_PARTS = "vendored/uPlot.css", "page.css", "vendored/uPlot.js", "shared.js", "chart.js", "page.js"
 
 
 def format_page(result: Result, pictures: Sequence[tuple[str, Picture]], config: str) -> str:
     """The whole page: the card with the first figure, the first table, remarks, figures, tables, and what is folded away."""
-    style, *scripts = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
-    script = "\n".join(scripts)
+    texts = [files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS]
+    style, script = "\n".join(texts[:2]), "\n".join(texts[2:])
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
     first, *more = (_figure(*named) for named in pictures) if pictures else ("",)

@@ -15,7 +15,7 @@ from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, sm
 from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
 from jaxbl.report.page import format_page
-from jaxbl.report.picture import Picture
+from jaxbl.report.picture import Picture, packed
 from jaxbl.report.results import describe, write_report
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.trial import run
@@ -176,6 +176,78 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
         numbers = [float(text.replace("–", "-inf")) for text in table.locator("td:nth-child(3)").all_inner_texts()]
         finite = [number for number in numbers if number > -float("inf")]
         assert finite == sorted(finite, reverse=True) == numbers[: len(finite)]
+
+
+def signal_panel(top, label, slope):
+    """A panel over ten seconds, with a band and a span."""
+    time = np.linspace(0.0, 10.0, 101)
+    values = np.where((time > 4.0) & (time < 4.5), np.nan, slope * time)
+    line = {
+        "name": "seen",
+        "colour": "#000000",
+        "x": packed(time),
+        "y": packed(values),
+        "sorted": True,
+        "width": 1.5,
+        "dashes": "--",
+        "marker": "",
+        "steps": False,
+        "opacity": 1.0,
+    }
+    axis = {"log": False, "key": ""}
+    return {
+        "place": [0.1, top, 0.8, 0.35],
+        "title": "",
+        "lines": [line],
+        "bars": [],
+        "x": axis | {"label": "time (s)", "ends": [0.0, 10.0]},
+        "y": axis | {"label": label, "ends": [0.0, 30.0], "key": "a.b"},
+        "bands": [
+            {
+                "name": "95 %",
+                "colour": "#0072B2",
+                "opacity": 0.2,
+                "x": packed(time),
+                "low": packed(values - 1.0),
+                "high": packed(values + 1.0),
+            }
+        ],
+        "spans": [
+            {"name": "held out", "colour": "#8a8d93", "opacity": 0.3, "along": "x", "low": 6.0, "high": 8.0, "dashes": "-"}
+        ],
+    }
+
+
+@needs_chromium
+def test_signals_are_drawn_by_uplot_and_enlarged_together(tmp_path):
+    svg = b'<svg xmlns="http://www.w3.org/2000/svg" width="500" height="400"/>'
+    picture = Picture(
+        svg,
+        (500, 400),
+        "two signals over time",
+        "two signals over time, in words",
+        [signal_panel(0.1, "position (rad)", 1.0), signal_panel(0.55, "speed (rad/s)", 2.0)],
+    )
+    other = picture._replace(panels=[signal_panel(0.1, "torque (N m)", 3.0)])
+    text = format_page(Result("title", "good", "answer"), [("two", picture), ("other", other)], "")
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    with open_pages(tmp_path / "page.html", color_scheme="dark") as (page,):
+        assert page.locator("figure .uplot").count() == 3 and not page.locator("figure img").first.is_visible()
+        check_figures(page, 2)
+        over = page.locator(".u-over").first
+        box = over.bounding_box()
+        page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.9 * box["height"])
+        lines = page.locator(".plane .values").first.inner_text().split("\n")
+        assert lines == ["seen", "time (s): 2", "position (rad): 2 [a.b]"]
+        # a drag over one enlarges all over the same quantity
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.92 * box["height"], steps=3)
+        page.mouse.up()
+        shown = "charts.map((chart) => chart.shown[0].map(Math.round))"
+        assert page.evaluate(shown) == [[2, 6]] * 3
+        page.get_by_label("whole figure").first.click()
+        assert page.evaluate(shown) == [[0, 10]] * 3
+        assert page.locator(".legend").first.inner_text().split("\n") == ["seen", "95 %", "held out"]
 
 
 def place(view, x, y):

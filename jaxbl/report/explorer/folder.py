@@ -30,8 +30,8 @@ _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
 _MARKER = "jaxbl-explorer.json"
 """Says that a folder is one of ours, which may be written anew."""
-_SHARED = ("explore.css", "hyparquet.LICENSE.txt")
-_SCRIPTS = ("hyparquet", "shared", "plot")
+_LIBRARIES = ("hyparquet.js", "hyparquet.LICENSE.txt", "uPlot.js", "uPlot.css", "uPlot.LICENSE.txt")
+_SCRIPTS = ("hyparquet", "uPlot", "shared", "chart", "common")
 
 
 @contextmanager
@@ -45,6 +45,25 @@ def points_writer(out: Path, types: Mapping[str, type]) -> Iterator[Callable[[An
             writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
 
         yield write
+
+
+def read_text(file: Path) -> str:
+    """A text. Raises `InputError` where it cannot be read."""
+    return _read(file, lambda place: place.read_text(encoding="utf-8"))
+
+
+def read_table(file: Path) -> pd.DataFrame:
+    """A table of Parquet or CSV. Raises `InputError` where it cannot be read."""
+    return _read(file, pd.read_csv if file.suffix == ".csv" else pd.read_parquet)
+
+
+def _read(file: Path, read: Callable[[Path], Any]) -> Any:
+    try:
+        return read(file)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise InputError(
+            f"{file}: cannot be read ({error}); run the command that wrote it again, with --overwrite"
+        ) from None
 
 
 class Source(NamedTuple):
@@ -99,7 +118,7 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
 
     Args:
         out: the folder.
-        parts: of the page, by name: each has elements and a script in `page/`.
+        parts: of the page, by name: each has a script in `page/`, and the first one elements.
         about: what it says, as plain data.
         scripts: whether it can be opened from disk.
     """
@@ -112,13 +131,14 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
                 text = f'jaxblBytes({number}, "{base64.b64encode(chunk).decode()}");\n'
                 (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
     report = files("jaxbl.report")
-    folder, used = report.joinpath("explorer", "page"), [*_SCRIPTS, *parts]
-    page, *elements = (folder.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in ("page", *parts))
-    loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*used, "data"])
-    page = page.replace("{parts}", "".join(elements)).replace("{scripts}", loaded)
+    folder = report.joinpath("explorer", "page")
+    page, elements = (folder.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in ("page", parts[0]))
+    loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*_SCRIPTS, *parts, "data"])
+    page = page.replace("{parts}", elements).replace("{scripts}", loaded)
     (out / "index.html").write_text(page, encoding="utf-8")
-    copied = [report.joinpath(name) for name in ("page.css", "shared.js")]
-    copied += [folder.joinpath(name) for name in (*_SHARED, *(f"{name}.js" for name in used if name != "shared"))]
+    copied = [report.joinpath("vendored", name) for name in _LIBRARIES]
+    copied += [report.joinpath(name) for name in ("page.css", "shared.js", "chart.js")]
+    copied += [folder.joinpath(name) for name in ("explore.css", "common.js", *(f"{part}.js" for part in parts))]
     for original in copied:
         (out / original.name).write_bytes(original.read_bytes())
 

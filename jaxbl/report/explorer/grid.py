@@ -6,7 +6,6 @@ Rows of `points.parquet` are in the order of the axes, which need not be stored 
 import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +14,8 @@ from jaxbl.config import Config
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.maps import least_lambdas, unit_of
+from jaxbl.report.aggregates import Groups
+from jaxbl.report.maps import axis_label, best_gains, least_lambdas, unit_of, worst_runs
 from jaxbl.report.picture import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -65,18 +65,24 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
     axes = [
         {
             "paths": [
-                {"path": path, "unit": unit_of(result.config, path), "values": to_jsonable(values)}
+                {
+                    "path": path,
+                    "label": path if path == "seed" else axis_label(result.config, path),
+                    "unit": unit_of(result.config, path),
+                    "values": to_jsonable(values),
+                }
                 for path, values in dim.items()
             ]
         }
         for dim in dims
     ]
-    return {"axes": axes, "conditions": _conditions()} | _write_points(result, metrics, first, out, dims)
+    written = _write_points(result, metrics, first, out, dims)
+    return {"grid": True, "axes": axes, "conditions": _conditions()} | written
 
 
 def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
     """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
-    Returns what the page needs to read it, and its first picture."""
+    Returns what the page needs to read it, and what it shows first."""
     shape = [_length(dim) for dim in dims]
     rows, runs = math.prod(shape), 0
     with (
@@ -93,20 +99,97 @@ def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path
                 values[places] = page_values(frame, name)
         for start in range(0, rows, ROW_GROUP):
             write({name: values[start : start + ROW_GROUP] for name, values in columns.items()})
-        overview = _overview(columns[first], shape)
-    return {"rows": rows, "found": runs, "overview": overview}
+        x, y = _first_axes(result.config, dims)
+        cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
+        telling = _most_telling(cells, first)
+        # of the other dimensions, seeds together
+        place = np.insert(np.array(telling, int), [min(x, y), max(x, y) - 1], 0).tolist()
+        return {
+            "rows": rows,
+            "found": runs,
+            "total": rows,
+            "start": {"x": x, "y": y, "at": place},
+            "overview": _overview(cells[first][telling[:-1]]),
+            "stars": _stars(cells, first, dims, x, y, telling),
+        }
 
 
-def _overview(values: Array, shape: list[int]) -> JsonObject:
-    """The first picture: the map over the last two axes that vary, at the first value of the others, median over seeds."""
-    y, x = [i for i, size in enumerate(shape[:-1]) if size > 1][-2:]
-    index: list[Any] = [0] * len(shape)
-    for i in (y, x):
-        index[i] = slice(None, None, -(-shape[i] // _OVERVIEW))
-    index[-1] = slice(None)
-    seeds = values.reshape(shape)[tuple(index)]
-    cells = pd.DataFrame(seeds.reshape(-1, shape[-1])).median(axis=1).to_numpy().reshape(seeds.shape[:-1])
-    return {"x": x, "y": y, "shape": list(cells.shape), "values": packed(cells)}
+def _first_axes(config: Config, dims: list[AxisColumns]) -> tuple[int, int]:
+    """The dimensions along x and y of the first map: those of the study's first map, gains of one side, or the last two."""
+    varied = [i for i, dim in enumerate(dims[:-1]) if _length(dim) > 1]
+    numbers = {path: i for i in varied for path in dims[i]}
+    pairs = [(figure.x, figure.y) for figure in config.figures if figure.kind == "heatmap"]
+    pairs += [(f"observer.{side}.alpha", f"observer.{side}.lambda") for side in ("motor", "load")]
+    for x, y in pairs:
+        if x in numbers and y in numbers and numbers[x] != numbers[y]:
+            return numbers[x], numbers[y]
+    return varied[-1], varied[-2]
+
+
+_MOST_JUDGED = 4096
+"""Cells of a slice by which it is judged how telling it is."""
+
+
+def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
+    """The slice (places along the other dimensions, the seed the last) with the clearest border between what works and what
+    fails; where none has a border, that with the largest spread of the metric."""
+    values = cells.get(f"{first.partition('.')[0]}.converged", cells[first])
+    *sizes_of_slices, _ = values.shape[:-2]
+    best, telling = (-1.0, -1.0), (0,) * (len(sizes_of_slices) + 1)
+    for index in np.ndindex(*sizes_of_slices):
+        part = [array[(*index, 0)].reshape(-1) for array in (values, cells[first])]
+        works, sizes = (one[:: max(one.size // _MOST_JUDGED, 1)] for one in part)
+        works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
+        share = float(np.mean(works)) if works.size and values is not cells[first] else 0.0
+        spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0
+        # tenths: of slices with about the same border that with the larger spread
+        if (score := (round(10.0 * min(share, 1.0 - share)), spread)) > best:
+            best, telling = score, (*index, 0)
+    return telling
+
+
+_MOST_STARRED = 1 << 16
+"""Runs of a slice whose best gains are looked for, and slices: more would take longer than all the rest."""
+
+
+def _stars(
+    cells: dict[str, Array], first: str, dims: list[AxisColumns], x: int, y: int, telling: tuple[int, ...]
+) -> list[JsonObject]:
+    """The best gains of each slice: places along all dimensions; none where the first map is not over gains."""
+    side = first.partition(".")[0]
+    paths, shape = [next(iter(dims[i])) for i in (y, x)], cells[first].shape
+    needed = [name for name in (first, f"{side}.converged", f"{side}.margin_alpha", "finite") if name in cells]
+    gains = {f"observer.{side}.alpha", f"observer.{side}.lambda"}
+    if {*paths} != gains or not {"finite", f"{side}.converged"} <= {*needed} or math.prod(shape[-3:]) > _MOST_STARRED:
+        return []
+    values = [np.asarray(next(iter(dims[i].values()))) for i in (y, x)]
+    grid = dict(zip(paths, (axis.reshape(-1) for axis in np.meshgrid(*values, indexing="ij")), strict=True))
+    stars = []
+    for index in [telling[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != telling[:-1])][:64]:
+        runs = [
+            pd.DataFrame(grid | {"seed": seed} | {name: cells[name][(*index, seed)].reshape(-1) for name in needed})
+            for seed in range(shape[-3])
+        ]
+        frame = pd.concat(runs, ignore_index=True).dropna(subset=["finite", f"{side}.converged"])
+        if len(frame) < math.prod(shape[-2:]):
+            continue
+        worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first, f"{side}.margin_alpha" in needed)
+        if (best := best_gains(worst)) is not None:
+            gains_there = zip((y, x), values, worst.index[best.index], strict=True)
+            place = {i: int(np.flatnonzero(axis == value)[0]) for i, axis, value in gains_there}
+            place |= zip([i for i in range(len(dims) - 1) if i not in place], index, strict=True)
+            stars.append(
+                {"metric": first, "first": index == telling[:-1], "at": [place.get(i, 0) for i in range(len(dims))]}
+            )
+    return stars
+
+
+def _overview(values: Array) -> JsonObject:
+    """The first picture: a map over the last two of three dimensions, median over the first, the seeds."""
+    steps = [-(-size // _OVERVIEW) for size in values.shape[1:]]
+    samples = np.moveaxis(np.array(values[:, :: steps[0], :: steps[1]]), 0, -1)
+    cells = pd.DataFrame(samples.reshape(-1, samples.shape[-1])).median(axis=1).to_numpy().reshape(samples.shape[:-1])
+    return {"shape": list(cells.shape), "values": packed(cells)}
 
 
 def _conditions() -> list[JsonObject]:

@@ -1,83 +1,96 @@
-"""A log and what models make of it, in a browser: results of `jaxbl identify` and `jaxbl diagnose`."""
+"""Signals over time in a browser: a log and what models make of it, a simulated run, and what a watch saw."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
-import pyarrow as pa
 from pandas import DataFrame
 
 from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
-from jaxbl.files import read_json, to_path
+from jaxbl.files import checksum, read_json
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import describe_diagnosis
 from jaxbl.report.element import describe_element
 from jaxbl.report.figures import missing_quantity
 from jaxbl.report.identify import describe_identification
+from jaxbl.result import Result
+from jaxbl.sweeps.metrics import find_metric
 
-from .folder import Source, colours_of, points_writer, write_page
+from .folder import Source, colours_of, points_writer, read_table, read_text, write_page
 
 _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
            "displacement": "displacement"}  # fmt: skip
-_RESULTS = "diagnosis.json", "identification.json"
 
 
-def _summary_file(folder: str | Path) -> Path | None:
-    """The newest summary in a folder: identify and diagnose may have written into one, the trace is of the last."""
-    files = [file for name in _RESULTS if (file := to_path(folder) / name).is_file()]
-    return max(files, key=lambda file: file.stat().st_mtime_ns, default=None)
-
-
-def log_source(folder: str | Path) -> Source | None:
-    """Results of `jaxbl identify` or `jaxbl diagnose`, to be explored; None where a folder holds none.
+def log_source(file: Path) -> Source:
+    """Results of `jaxbl identify`, `diagnose`, `simulate` or `watch`, by their summary, to be explored.
 
     Raises:
         InputError: files are damaged or missing.
     """
-    file = _summary_file(folder)
-    if file is None:
-        return None
-    summary = read_json(file)
-    describe = describe_diagnosis if file.name == "diagnosis.json" else describe_identification
-    card = (describe_element if summary.get("kind") == "element" else describe)(summary)
-    lead = card.sentences
+    summary, model = read_json(file), "model.toml"
+    if file.name == "diagnosis.json":
+        card = describe_diagnosis(summary)
+    elif file.name == "identification.json":
+        card = (describe_element if summary.get("kind") == "element" else describe_identification)(summary)
+    else:
+        # these keep no model beside their signals
+        card, model = (_describe_run if file.name == "summary.json" else _describe_values)(summary), file.name
+    table = "watch.csv" if file.name == "watch.json" else "trace.parquet"
 
     def write(out: Path, served: bool) -> bool:
-        model, frame = (_read(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
+        text, frame = read_text(file.with_name(model)), read_table(file.with_name(table))
         content = write_log(summary, frame, out)
-        content |= {"title": card.title, "lead": lead, "config": model, "file": "model.toml"}
+        content |= {"title": card.title, "lead": card.sentences, "config": text, "file": model}
         write_page(out, ("log",), content, scripts=not served)
         return False
 
-    return Source(str(summary["identity"]), lead, write, {}, lambda: None, lambda: None)
+    identity = str(summary.get("identity") or checksum(file.read_bytes()))
+    return Source(identity, card.sentences, write, {}, lambda: None, lambda: None)
 
 
-def _read(file: Path) -> Any:
-    """Text, or a table. Raises `InputError` where it cannot be read."""
-    try:
-        return pd.read_parquet(file) if file.suffix == ".parquet" else file.read_text(encoding="utf-8")
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            f"{file}: cannot be read ({error}); run the command that wrote it again, with --overwrite"
-        ) from None
+def _describe_run(summary: JsonObject) -> Result:
+    """Say how large the errors of a simulated run's observers are."""
+    metrics = summary["metrics"]
+    errors = [
+        f"the {side} observer {'converged' if metrics[f'{side}.converged'] else 'did not converge'}, with "
+        f"{metrics[f'{side}.velocity_rmse']:.3g} {find_metric(f'{side}.velocity_rmse').unit} of velocity error (rms)"
+        for side in POSITION_CHANNELS
+        if metrics.get(f"{side}.velocity_rmse") is not None
+    ]
+    answer = f"One run, seed {summary['seed']}: {'; '.join(errors) or 'it diverged'}."
+    return Result(summary["title"] or "A run", "good", answer, remarks=summary["remarks"])
+
+
+def _describe_values(summary: JsonObject) -> Result:
+    """Say what a watch saw, and when it raised the alarm."""
+    alarm = summary["alarm"]
+    answer = f"Watched: {summary['determined']} of {summary['values']} values were determined; no alarm."
+    if alarm is not None:
+        answer = f"Alarm from {alarm['t']:.1f} s on: the half gap is beyond {summary['alarm_gap']:g}."
+    return Result(summary["title"] or f"Watch of {Path(summary['file']).name}", "good", answer, remarks=summary["notes"])
 
 
 def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     """Write `points.parquet`, and return what the page says of its columns.
 
     Args:
-        summary: as in `diagnosis.json` or `identification.json`.
-        trace: as in `trace.parquet`.
+        summary: as in `diagnosis.json`, `identification.json`, `summary.json` or `watch.json`.
+        trace: as in `trace.parquet` or `watch.csv`.
         out: folder.
     """
     units = _units(summary)
     frame = trace.assign(**_turns(trace, units))
+    if _is_run(summary):
+        frame = frame.assign(**_errors(frame)).rename(columns={"z": "twist"})
     coordinates = list(_coordinates(frame, units))
-    groups = [group for group in _groups(summary, frame, units) if group["lines"]]
+    if "alarm_gap" in summary:
+        groups = list(_watch_groups(summary, frame))
+        coordinates += [group["lines"][0] | {"unit": group["unit"]} for group in groups]
+    else:
+        groups = [group for group in _groups(summary, frame, units) if group["lines"]]
     if not groups:
         raise InputError(
             "explore: trace.parquet has no column that the page could draw; run the command that wrote it again"
@@ -89,13 +102,41 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         write(frame)
     return {
         "rows": len(frame),
-        "period": summary["sample_period"],
+        "period": summary.get("every")
+        or summary.get("sample_period")
+        or float(np.median(np.diff(frame["t"].to_numpy(float)))),
         "held": "held_out" in frame and bool(frame["held_out"].any()),
         "coordinates": coordinates,
-        "over": _first(summary, frame),
+        "over": _first(summary, frame) or [line["column"] for line in coordinates[1:3]],
         "groups": groups,
         "colours": colours_of("PuOr_r"),
     }
+
+
+def _is_run(summary: JsonObject) -> bool:
+    return "single_run" in summary
+
+
+def _errors(trace: DataFrame) -> dict[str, np.ndarray]:
+    """Compute what the observers of a simulated run are off by: true less observed."""
+    pairs = {f"{side}.{name}_error": (f"{side}.{name}", f"{side}.{name}_estimate")
+             for side in POSITION_CHANNELS for name in ("position", "velocity")}  # fmt: skip
+    columns = {name: pair for name, pair in pairs.items() if {*pair} <= {*trace}}
+    return {name: trace[true].to_numpy() - trace[estimate].to_numpy() for name, (true, estimate) in columns.items()}
+
+
+_WATCHED = {"half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction"}
+
+
+def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
+    """The figures of a watch: each number by both observers."""
+    for name, label in _WATCHED.items():
+        columns = {f"{side}.{name}": f"by the {side} observer" for side in POSITION_CHANNELS}
+        columns |= {f"{name}_{end}": f"{end}, with 95 %" for end in ("from", "to")}
+        lines = [{"column": column, "label": f"{label} {origin}"} for column, origin in columns.items() if column in frame]
+        if lines:
+            unit = summary["units"]["motor"][name]
+            yield {"name": label, "quantity": label, "unit": unit, "bandwidth": None, "lines": lines}
 
 
 def _units(summary: JsonObject) -> dict[str, str]:
@@ -158,6 +199,7 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         drawn = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
         return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": drawn}
 
+    law, speed = ("true", "true") if _is_run(summary) else ("by the fitted law", "smoothed")
     bandwidths = summary.get("gap", {}).get("holdout", {}).get("bandwidth", {})
     last = summary["findings"][-1]["effect"] if summary.get("findings") else ""
     for side, unit in units.items():
@@ -174,15 +216,22 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
     for side, unit in units.items():
         lines = {f"{side}.residual": "measured less the model's"}
         yield group(f"{side}: position residual", "residual", unit, lines)
+    for side, unit in units.items():
+        for name, per in (("velocity", "/s"), ("position", "")):
+            lines = {f"{side}.{name}_error": "true less observed"}
+            yield group(f"{side}: {name} error", f"{name} error", f"{unit}{per}", lines)
     force = _force(units["motor"])
-    lines = {"transmitted": "measured", "torque": "by the fitted law", "torque_by_motor": "by the motor's side"}
+    lines = {"transmitted": "measured", "torque": law, "torque_by_motor": "by the motor's side"}
     lines |= {f"{side}.torque_estimate": f"by the {side} observer" for side in units}
     if summary.get("kind") == "element":
         lines = {"u": "measured", "torque": "by the fitted law"}
     name = "torque in the transmission" if {"transmitted", "torque"} & {*frame} else "disturbance torque"
     yield group(name, missing_quantity(force), force, lines)
     for side, unit in units.items():
-        lines = {f"{side}.velocity": "smoothed", f"{side}.velocity_estimate": "by the observer"}
+        lines = {
+            f"{side}.velocity": speed,
+            f"{side}.velocity_estimate": "by the observer",
+        }
         if f"{side}.velocity_estimate" in frame:
             yield group(f"{side}: speed", "speed", f"{unit}/s", lines)
 

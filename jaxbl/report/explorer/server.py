@@ -20,6 +20,8 @@ from .folder import Source
 
 _MOST_ASKED = 1 << 16
 """Bytes of a question."""
+_LONGEST_SILENCE = 60.0
+"""Seconds that a connection may say nothing, or take nothing, before it is closed."""
 _MOST_VERSIONS = 3
 """Of a page that is written anew, as a study goes on; pages that are open may still read the older ones."""
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".toml": "text/plain"}
@@ -95,9 +97,18 @@ class ExplorerServer(ThreadingHTTPServer):
         self._lock.acquire()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        # a browser that leaves a page ends what it was reading
-        if not isinstance(sys.exception(), ConnectionError):
+        # a browser that leaves a page ends what it was reading, and what sends half a request is left
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
+
+    def write_redirect(self) -> Path:
+        """Write a file that only this user can read and that leads to the page: its name may be on a browser's command line,
+        which everybody on the machine can see, where the token must not be."""
+        path = self._place / "open.html"
+        path.touch(0o600, exist_ok=False)
+        leads = f'<meta http-equiv="refresh" content="0; url={self.url}">'
+        path.write_text(f"<!doctype html><title>jaxbl explore</title>{leads}\n", encoding="utf-8")
+        return path
 
     def newest(self) -> str:
         """Number of the newest version of the page, written now if the one before is out of date.
@@ -143,6 +154,7 @@ class ExplorerServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: ExplorerServer
     protocol_version = "HTTP/1.1"
+    timeout = _LONGEST_SILENCE
     # head and content of an answer go together: apart, each waits for the browser's word that the other one came
     wbufsize = -1
     disable_nagle_algorithm = True

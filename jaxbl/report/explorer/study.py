@@ -1,13 +1,15 @@
 """A study in a browser: what its page needs, and single runs of it."""
 
+import re
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jaxbl.config import Config, is_boolean, with_values
+from jaxbl.config import Config, is_boolean, read_config, with_values
 from jaxbl.errors import InputError
+from jaxbl.files import checksum, read_json
 from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.figures import MAP
@@ -20,19 +22,24 @@ from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
 from .cloud import write_cloud
-from .folder import Source, colours_of, drawable, write_page
+from .folder import Source, colours_of, drawable, read_table, write_page
 from .grid import dimensions, write_grid
 
 
-def study_source(folder: str | Path) -> Source:
-    """A study's folder, to be explored. Raises `InputError` where it holds no study."""
+def study_source(folder: str | Path, sentences: Sequence[str] = ()) -> Source:
+    """A study's folder, to be explored. Raises `InputError` where it holds no study.
+
+    Args:
+        folder: as `jaxbl sweep` left it.
+        sentences: those that stand before the study's own.
+    """
     result = open_study(folder)
     # single runs share the machine's cores with one another already
     one_at_a_time = threading.Lock()
 
     def write(out: Path, served: bool) -> bool:
         now = open_study(folder)
-        return write_study(now, out, _lead(now), served=served)
+        return write_study(now, out, [*sentences, *_lead(now)], served=served)
 
     def answer(to: Callable[[Config, Any], JsonObject], asked: Any) -> JsonObject:
         with one_at_a_time:
@@ -42,12 +49,32 @@ def study_source(folder: str | Path) -> Source:
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
     return Source(
         identity(result.config),
-        _lead(result),
+        [*sentences, *_lead(result)],
         write,
         answers,
         partial(answer, simulated, {"values": first, "seed": 0}),
         one_at_a_time.acquire,
     )
+
+
+def comparison_source(file: Path) -> Source:
+    """Two sweeps at their common points, by `comparison.json`: both, and what the second one is of the first.
+
+    Raises:
+        InputError: files are damaged or missing.
+    """
+    summary, folder = read_json(file), file.parent
+    config = read_config(folder / "study.toml")
+    config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"seeds": 1})})
+    names = [Path(name).name for name in summary["names"]]
+    changed = [change["metric"] for change in summary["metrics"] if change["changed"]]
+    lead = [f"{names[0]} and {names[1]}: {len(changed)} of {len(summary['metrics'])} metrics differ."]
+
+    def write(out: Path, served: bool) -> bool:
+        frame = read_table(folder / "comparison.parquet").assign(seed=config.sweep.first_seed, finite=True)
+        return write_study(StudyResult(config, frame), out, lead, studies=names)
+
+    return Source(checksum(file.read_bytes()), lead, write, {}, lambda: None, lambda: None)
 
 
 def _lead(result: StudyResult) -> list[str]:
@@ -58,7 +85,9 @@ def _lead(result: StudyResult) -> list[str]:
     return ["This sweep is unfinished: the page shows the runs so far.", *result.config.notes]
 
 
-def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:
+def write_study(
+    result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False, studies: Sequence[str] = ()
+) -> bool:
     """Write the page of a study and its data into a folder: maps of a grid, points of other studies.
 
     Args:
@@ -66,21 +95,19 @@ def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: 
         out: an empty folder.
         lead: what was found, in sentences.
         served: whether a server is to give the data, and simulates runs.
+        studies: names of two studies that are compared, whose columns end with `.first`, `.second` and `.factor`.
 
     Returns:
         Whether runs are still to come.
     """
     config = result.config
-    content = _about(config, result.columns) | {"lead": list(lead), "served": served}
+    content = _about(config, result.columns, studies) | {"lead": list(lead), "served": served}
     names = [metric["name"] for metric in content["metrics"]]
-    if dimensions(config) is None:
-        page = "cloud"
-        content |= write_cloud(result, names, out)
-    else:
-        page = "map"
-        content |= write_grid(result, names, content["first"], out)
+    content |= (
+        write_cloud(result, names, out) if dimensions(config) is None else write_grid(result, names, content["first"], out)
+    )
     (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
-    write_page(out, (page, "runs"), content, scripts=not served)
+    write_page(out, ("study", "runs", "views"), content, scripts=not served)
     return not result.is_finished(content["found"])
 
 
@@ -107,7 +134,8 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     paths = {*config.axis_paths}
     if not isinstance(values, dict) or set(values) != paths:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
-    if not isinstance(seed, int) or not 0 <= seed < 2**31:
+    # true is a number of Python's
+    if type(seed) is not int or not 0 <= seed < 2**31:
         raise InputError("seed: should be a whole number from 0 and below 2^31")
     return with_values(config, values).model_copy(update={"axes": [], "figures": [], "notes": []}), seed
 
@@ -148,20 +176,30 @@ def nearby(config: Config, asked: Any) -> JsonObject:
     return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}
 
 
-def _about(config: Config, columns: list[str]) -> JsonObject:
+def _about(config: Config, columns: list[str], studies: Sequence[str] = ()) -> JsonObject:
     """The page's account of a study and its columns."""
     axes, experiment = {"seed", *config.axis_paths}, config.build()
     names = [name for name in columns if name not in axes]
     return {
         "title": config.title or "Study",
         "metrics": [
-            {"name": name, "label": value_label(name), "yes": is_boolean(name), "size": is_magnitude(name)} for name in names
+            {"name": name, "label": _label(name, studies), "yes": is_boolean(name), "size": is_magnitude(name)}
+            for name in names
         ],
-        "first": next((name for name in names if name.endswith(".velocity_rmse")), names[0]),
+        "first": next((name for name in names if re.search(r"\.velocity_rmse(\.factor)?$", name)), names[0]),
         "config": config.to_toml(),
         "file": "study.toml",
         "colours": colours_of(MAP),
         # where no axis changes them
         "gains": {side: getattr(experiment.observer, side).gains() for side in experiment.sides},
-        "effects": config.to_dict()["effects"],
+        "effects": None if studies else config.to_dict()["effects"],
     }
+
+
+def _label(name: str, studies: Sequence[str]) -> str:
+    """A metric in words; of two studies that are compared, which one's."""
+    metric, _, which = name.rpartition(".")
+    if not studies or name == "finite":
+        return value_label(name)
+    words = {"first": f"in {studies[0]}", "second": f"in {studies[1]}", "factor": f"{studies[1]} over {studies[0]}"}
+    return f"{value_label(metric)}, {words[which]}"

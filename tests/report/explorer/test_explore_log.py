@@ -9,8 +9,8 @@ from browser import check_figures, needs_chromium, open_pages
 from jaxbl.errors import InputError
 from jaxbl.files import json_with_checksum
 from jaxbl.report.explorer.folder import write_page, write_static
-from jaxbl.report.explorer.log import log_source, write_log
-from jaxbl.report.explorer.study import study_source
+from jaxbl.report.explorer.log import write_log
+from jaxbl.report.explorer.sources import open_source
 
 HOSTILE = "motor.<img src=x onerror=alert(1)>"
 TIME = np.arange(4000) * 1e-3 + 1e5
@@ -104,13 +104,11 @@ def write_identification(folder):
 
 
 def test_folders_without_results_and_damaged_ones(tmp_path):
-    assert log_source(tmp_path) is None
-    with pytest.raises(InputError, match="holds no study"):
-        study_source(tmp_path)
+    with pytest.raises(InputError, match="is missing, or holds no results; give a folder that 'jaxbl sweep', 'simulate'"):
+        open_source(tmp_path)
     write_identification(tmp_path)
     (tmp_path / "trace.parquet").write_bytes(b"no table")
-    source = log_source(tmp_path)
-    assert source is not None
+    source = open_source(tmp_path)
     with pytest.raises(InputError, match=r"trace\.parquet: cannot be read .*--overwrite"):
         write_static(source, tmp_path / "out")
 
@@ -147,8 +145,8 @@ def test_lines_coordinates_and_moments(tmp_path):
         page.select_option("#y", "motor.velocity")
         page.wait_for_selector("body[data-drawn^='motor: missing torque theta_e motor.velocity ']")
         plane = page.locator("#over2 figure .plane").first
-        box = plane.bounding_box()
-        plane.hover(position={"x": 82 + 0.5 * (box["width"] - 166), "y": 10 + 0.01 * (box["height"] - 58)})
+        box = plane.locator(".u-over").bounding_box()
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.01 * box["height"])
         mean, position, speed = [
             float(line.split(": ")[1].split()[0]) for line in plane.locator(".values").inner_text().split("\n")
         ]
@@ -162,6 +160,19 @@ def test_lines_coordinates_and_moments(tmp_path):
         page.mouse.move(plot_area["x"] + 400, plot_area["y"] + 102, steps=3)
         page.mouse.up()
         assert page.locator("#state").inner_text().startswith("From 10000")
+        shown = page.locator("#sizes tbody").inner_text()
         page.click("#play")
         page.locator("#play:text-is('pause')").wait_for()
         check_figures(page, 0)
+        # the link opens the same part, coordinates and lines
+        page.goto(page.url)
+        page.reload()
+        page.wait_for_selector("body[data-drawn^='motor: missing torque theta_e motor.velocity ']")
+        assert page.locator("#sizes tbody").inner_text() == shown
+        with page.expect_download() as download:
+            page.click("#csv")
+        table = pd.read_csv(download.value.path())
+        assert (
+            list(table)[:3] == ["t", "theta_e", "motor.velocity"]
+            and TIME[0] < table["t"][0] < table["t"].iloc[-1] < TIME[-1]
+        )

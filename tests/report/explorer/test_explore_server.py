@@ -3,6 +3,7 @@
 import http.client
 import json
 import socket
+import stat
 import threading
 from pathlib import Path
 
@@ -130,6 +131,26 @@ def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
         assert ended.wait(10.0)
         server.shutdown()
     assert capfd.readouterr().err == ""
+
+
+def test_a_connection_that_says_nothing_is_closed(server, capfd, monkeypatch):
+    """Before a request, within its head, and within its body."""
+    monkeypatch.setattr("jaxbl.report.explorer.server._Handler.timeout", 0.2)
+    host = f"Host: 127.0.0.1:{server.server_port}"
+    token, kind = server.url.split("/")[3], "Content-Type: application/json"
+    for start in ("", "GET / HTT", f"POST /{token}/1/run HTTP/1.1\r\n{host}\r\n{kind}\r\nContent-Length: 9\r\n\r\n{{"):
+        with socket.create_connection(("127.0.0.1", server.server_port), timeout=10.0) as connection:
+            connection.sendall(start.encode())
+            assert connection.recv(100) == b""
+    assert capfd.readouterr().err == ""
+
+
+def test_the_token_is_not_in_what_a_browser_is_started_with(server):
+    path = server.write_redirect()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600 and server.token not in str(path)
+    assert f"url={server.url}" in path.read_text()
+    # nor is the file itself served
+    assert request_path(server, "1/open.html")[0] == 404
 
 
 def test_a_page_loaded_again_is_the_newest():

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import threading
 import tomllib
 from pathlib import Path
@@ -15,9 +16,11 @@ from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_st
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
+from jaxbl.report.aggregates import Groups
 from jaxbl.report.explorer.folder import Source, write_static
 from jaxbl.report.explorer.server import served
 from jaxbl.report.explorer.study import nearby, simulated, study_source, write_study
+from jaxbl.report.maps import best_gains, worst_runs
 from jaxbl.sweeps.sweep import open_study, share, sweep
 from jaxbl.sweeps.trial import run
 
@@ -110,85 +113,201 @@ def read_pointer_values(values):
     return [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")]
 
 
+def find_place(page, x, y, chart=0, whole="#plot"):
+    """A place within the axes of a chart, as shares of their lengths, in pixels of the page."""
+    box = page.locator(f"{whole} .u-over").nth(chart).bounding_box()
+    return box["x"] + x * box["width"], box["y"] + (1.0 - y) * box["height"]
+
+
+def drag(page, start, end):
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=3)
+    page.mouse.up()
+
+
+def save_download(page, selector, path):
+    with page.expect_download() as download:
+        page.click(selector)
+    path.write_bytes(Path(download.value.path()).read_bytes())
+    return path
+
+
 @needs_chromium
 def test_values_regions_cuts_and_a_point_as_config(tmp_path):
     result = make_study_result(motor__converged=lambda frame: frame["seed"] > 0)
     page_file = write_static(make_source(result, [HOSTILE]), tmp_path / "out")
     with open_pages(page_file, color_scheme="dark") as (page,):
-        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA}']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
-        plot, values = page.locator("#plot"), page.locator("#values")
-        box = page.evaluate("[document.querySelector('#plot').clientWidth, document.querySelector('#plot').clientHeight]")
-
-        def place(x, y):
-            return {"x": 78 + x * (box[0] - 78 - 118), "y": 26 + (1 - y) * (box[1] - 26 - 52)}
-
-        # a cell: the median over seeds, at the first noise
-        plot.hover(position=place(0.5, 0.25))
+        values = page.locator("#plot .values").first
+        # a cell: the median over seeds, at the noise with the larger spread
+        page.select_option("#at-encoders-noise", "0")
+        page.mouse.move(*find_place(page, 0.25, 0.5))
         alphas, lambdas = np.geomspace(2.0, 50.0, 6), np.geomspace(1.0, 20.0, 5)
         assert read_pointer_values(values) == pytest.approx(
-            [alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3
+            [alphas[1] * lambdas[2] * 1.01 + 0.1, alphas[1], lambdas[2]], rel=1e-3
         )
         check_figures(page, 0)
         # of what is true or false, the share
         page.select_option("#metric", "motor.converged")
         page.wait_for_selector("body[data-drawn^='motor.converged ']")
-        plot.hover(position=place(0.5, 0.26))
+        page.mouse.move(*find_place(page, 0.26, 0.5))
         assert read_pointer_values(values)[0] == pytest.approx(2.0 / 3.0, rel=1e-3)
         page.select_option("#metric", "motor.velocity_rmse")
         page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
         # other noise, the largest seed
-        page.select_option("#at0", "1")
+        page.select_option("#at-encoders-noise", "1")
         page.select_option("#how", "largest")
-        plot.hover(position=place(0.5, 0.26))
-        assert float(values.inner_text().split("\n")[0].split(": ")[-1]) == pytest.approx(
-            alphas[1] * lambdas[2] * 1.1 + 0.2, rel=1e-3
-        )
-        # axes change places, and conditions can be drawn over gains
-        page.select_option("#x", "1")
-        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA}']")
-        page.select_option("#condition", "exact")
+        page.wait_for_function("page.said && page.view.how === 'largest'")
+        page.mouse.move(*find_place(page, 0.25, 0.5))
+        assert read_pointer_values(values)[0] == pytest.approx(alphas[1] * lambdas[2] * 1.1 + 0.2, rel=1e-3)
+        # the exact condition is drawn, at the median f_plus
         page.wait_for_selector("#state:has-text('f⁺ = 1 rad/s²')")
+        # axes change places
+        page.select_option("#x", LAMBDA)
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # a region by mouse, a cell by keyboard
-        bounding_box = plot.bounding_box()
-        start, end = place(0.05, 0.9), place(0.6, 0.3)
-        page.mouse.move(bounding_box["x"] + start["x"], bounding_box["y"] + start["y"])
-        page.mouse.down()
-        page.mouse.move(bounding_box["x"] + end["x"], bounding_box["y"] + end["y"], steps=3)
-        page.mouse.up()
-        plot.hover(position=place(0.01, 0.01))
-        assert read_pointer_values(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
-        plot.focus()
+        drag(page, find_place(page, 0.05, 0.9), find_place(page, 0.6, 0.3))
+        page.wait_for_function("page.shown.view.from[1] === 1")
+        page.mouse.move(*find_place(page, 0.02, 0.02))
+        assert read_pointer_values(values)[1:] == pytest.approx([lambdas[0], alphas[1]], rel=1e-3)
+        page.locator("#plot .plane").focus()
         for key in ("ArrowRight", "Enter"):
             page.keyboard.press(key)
-        assert page.locator("#chosen").is_visible()
+        page.locator("#cuts .uplot").nth(1).wait_for()
         where = page.locator("#where").inner_text()
         # what is saved stays the chosen cell, whatever is looked at then
         page.keyboard.press("ArrowLeft")
-        page.select_option("#at0", "0")
-        with page.expect_download() as download:
-            page.click("#point")
-        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
-        with page.expect_download() as gains:
-            page.click("#gains")
-        (tmp_path / "gains.toml").write_bytes(Path(gains.value.path()).read_bytes())
-        # side by side, a map of each noise
-        page.select_option("#facet", "0")
-        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA} {NOISE}']")
+        page.select_option("#at-encoders-noise", "0")
+        save_download(page, "#point", tmp_path / "out" / "point.toml")
+        save_download(page, "#gains", tmp_path / "gains.toml")
+        # side by side, a map of each noise; the chosen point stays, and is marked in both
+        page.select_option("#facet", NOISE)
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA} {NOISE}']")
+        assert page.evaluate("page.shown.panels.map(({ chart }) => chart.marks.at(-1)[2])") == ["ghost", "ring"]
         page.click("#whole")
-        plot.hover(position={"x": 78 + 5, "y": 60})
-        assert values.inner_text().endswith(f"{NOISE} = 1e-5 rad")
-        with page.expect_download() as picture:
-            page.click("#picture")
-        assert Path(picture.value.path()).read_bytes().startswith(b"\x89PNG")
+        page.wait_for_function("page.shown.view.from[1] === 0")
+        page.mouse.move(*find_place(page, 0.1, 0.1))
+        assert values.inner_text().endswith(f"{NOISE} = 1e-5 rad") and page.locator("#where").inner_text() == where
+        assert save_download(page, "#picture", tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     config = read_config(tmp_path / "out" / "point.toml")
     assert config.encoders.noise == 1e-4 and config.axes == []
     motor = config.observer.motor
     assert any(motor.alpha == pytest.approx(alpha) for alpha in alphas)
-    assert f" at {NOISE}: 1e-4 rad, {ALPHA}: {motor.alpha:.4g} " in where
-    assert f", {LAMBDA}: {motor.lambda_:.4g} " in where
+    assert where.startswith(f"{NOISE} 1e-4 rad, motor.alpha {motor.alpha:.4g} rad/s², motor.lambda {motor.lambda_:.4g} ")
     observer = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
     assert observer == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
+
+
+@needs_chromium
+def test_a_filter_the_points_it_leaves_and_a_link_to_them(tmp_path):
+    """In maps, as points of one metric over another, over parallel axes, and as a table."""
+    columns = {
+        "motor__converged": lambda frame: frame[ALPHA] > 3.0,
+        "motor__margin_exact": lambda frame: frame[LAMBDA] / 2.0,
+        "motor__chatter": lambda frame: 1.0 / frame[ALPHA],
+    }
+    result, frame = make_study_result(**columns), make_study_result(**columns).frame
+    page_file = write_static(make_source(result), tmp_path / "out")
+    passing = frame[frame["motor.converged"] & (frame["motor.margin_exact"] > 1.1)]
+    filtered = f"#state:has-text('{len(passing)} of 180 points pass the filter.')"
+    with open_pages(page_file) as (page,):
+        page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
+        page.fill("#filter", "converged and margin > 1.1")
+        page.keyboard.press("Enter")
+        page.wait_for_selector(filtered)
+        page.mouse.move(*find_place(page, 0.02, 0.9))
+        assert "left out by the filter" in page.locator("#plot .values").inner_text()
+        # what it cannot read is told
+        page.fill("#filter", "convergd")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#state:has-text(\"Filter: 'convergd' is no axis or metric\")")
+        page.fill("#filter", f"not converged or seed != 0 and {NOISE} < 2e-5")
+        page.keyboard.press("Enter")
+        either = ~frame["motor.converged"] | (frame["seed"] != 0) & (frame[NOISE] < 2e-5)
+        page.wait_for_selector(f"#state:has-text('{either.sum()} of 180 points pass')")
+        # one metric over another
+        page.fill("#filter", "converged and margin > 1.1")
+        page.keyboard.press("Enter")
+        page.select_option("#kind", "points")
+        page.select_option("#px", "motor.chatter")
+        page.select_option("#py", "motor.velocity_rmse")
+        page.wait_for_selector("body[data-drawn='motor.velocity_rmse motor.chatter motor.velocity_rmse']")
+        page.wait_for_selector(filtered)
+        # the link opens the same
+        page.goto(page.url)
+        page.reload()
+        page.wait_for_selector(f"{filtered} >> visible=true")
+        assert page.evaluate("page.shown.chart.lines[0].x.length") == len(passing)
+        # over parallel axes a drag along one of them adds to the filter
+        page.select_option("#kind", "parallel")
+        page.wait_for_function("page.kinds.parallel.chart")
+        alpha = page.evaluate("page.kinds.parallel.fields().findIndex((one) => one.name.endsWith('.alpha'))")
+        count = page.evaluate("page.kinds.parallel.fields().length")
+        across = (alpha + 0.4) / (count - 0.2)
+        drag(page, find_place(page, across - 0.02, 0.6), find_place(page, across + 0.02, 1.0))
+        page.wait_for_function("page.view.filter.includes('observer.motor.alpha >= ')")
+        assert page.locator("#filter").input_value().startswith("converged and margin > 1.1 and observer.motor.alpha >= ")
+        page.wait_for_function("document.querySelector('#state').textContent.includes('points pass')")
+        # the best points as a table, and all of them as CSV
+        page.click("#count")
+        first = page.locator("#rows tbody tr").first
+        first.wait_for()
+        table = pd.read_csv(save_download(page, "#csv", tmp_path / "points.csv"))
+        assert table["motor.velocity_rmse"].is_monotonic_increasing and set(table["motor.converged"]) == {"yes"}
+        bounds = [float(word) for word in re.findall(r"alpha [<>]= (\S+)", page.locator("#filter").input_value())]
+        inside = passing[(passing[ALPHA] >= bounds[0]) & (passing[ALPHA] <= bounds[1])]
+        assert 0 < len(inside) == len(table) < len(passing)
+        np.testing.assert_allclose(table["motor.velocity_rmse"], np.sort(inside["motor.velocity_rmse"]), rtol=1e-5)
+        first.locator("button").click()
+        page.locator("#where:not(:empty)").wait_for()
+        check_figures(page, 0)
+
+
+@needs_chromium
+def test_an_address_with_anything_in_it_opens_a_page(tmp_path):
+    page_file = write_static(make_source(make_study_result()), tmp_path / "out")
+    addresses = [
+        "metric=%3Cimg%20src=x%20onerror=alert(1)%3E&x=nothing&y=seed&facet=seed&how=constructor",
+        f"at.{NOISE}=1e99&at.seed=-3&region=9~9~1~1&row=1e3&pins=9999~x",
+        f"region=0.5~1~3~NaN&at.{NOISE}=0.7&row=179&condition=none",
+        "kind=points&px=constructor&range=a~b~~&filter=%3Cb%3E",
+        "kind=parallel&metric=seed&filter=seed%20%3E%20x",
+        "kind=__proto__",
+        "%%%",
+    ]
+    with open_pages(page_file) as (page,):
+        for words in addresses:
+            page.goto(f"{page_file.as_uri()}#{words}")
+            page.reload()
+            page.wait_for_selector("body[data-drawn]:not([data-drawn='overview'])")
+            page.wait_for_selector("#state:not(:has-text('reading'))")
+            assert page.locator("#plot .uplot").count() >= 1 and "cannot be read" not in page.locator("#state").inner_text()
+
+
+def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_path):
+    columns = {
+        "motor__converged": lambda frame: (frame[ALPHA] > 10.0) | (frame[NOISE] < 5e-5),
+        "motor__margin_alpha": lambda frame: frame[ALPHA],
+    }
+    result = make_study_result(**columns)
+    write_static(make_source(result), tmp_path)
+    data = read_data(tmp_path)
+    assert data["start"] == {"x": 1, "y": 2, "at": [1, 0, 0, 0]}
+    stars = {star["at"][0]: star for star in data["stars"]}
+    assert stars[1]["first"] and not stars[0]["first"]
+    # of the gains of least error those that may change most, as in the report
+    runs = worst_runs(
+        Groups([result.frame[result.frame[NOISE] > 5e-5]], [LAMBDA, ALPHA], [LAMBDA, ALPHA, "seed"]),
+        "motor.velocity_rmse",
+        True,
+    )
+    best = best_gains(runs)
+    place = runs.index[best.index]
+    axes = [axis["paths"][0]["values"] for axis in data["axes"]]
+    assert (axes[2][stars[1]["at"][2]], axes[1][stars[1]["at"][1]]) == place
+    assert data["overview"]["shape"] == [5, 6]
 
 
 @needs_chromium
@@ -201,18 +320,22 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
     columns = {"motor__velocity_rmse": lambda frame: frame[ALPHA] - 10.0, "motor__f_plus": lambda frame: 1.0}
     result = make_result(rigid_study(axes=axes, effects=effects), **columns)
     with open_pages(write_static(make_source(result), tmp_path / "out")) as (page,):
-        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA}']")
         # from the least to the largest, which no logarithm shows
-        assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
-        assert page.locator("#at2 option").all_inner_texts() == ["all", "1, 1e-5 rad", "2, 1e-4 rad"]
+        assert "colours: motor: velocity error, rms (rad/s), from -8 to 40" in page.locator("#plot .plane").get_attribute(
+            "aria-label"
+        )
+        assert page.locator("[id='at-run-substeps'] option").all_inner_texts() == ["all", "1, 1e-5 rad", "2, 1e-4 rad"]
         # a curve goes from small to large
         assert page.locator("#condition").count() == 0
-        page.locator("#plot").click(position={"x": 100, "y": 100})
-        with page.expect_download() as download:
-            page.click("#point")
-        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        page.mouse.click(*find_place(page, 0.95, 0.1))
+        page.locator("#where:not(:empty)").wait_for()
+        save_download(page, "#point", tmp_path / "out" / "point.toml")
         # enlarged until numbers end
-        assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
+        assert page.evaluate("ticks(1, 1 + Number.EPSILON, false).length") <= 7
+        assert page.evaluate("[ticks(0.4, 120, true), ticks(0, 1, false), ticks(2, 3, true)]") == [
+            [0.5, 1, 2, 5, 10, 20, 50, 100], [0, 0.2, 0.4, 0.6, 0.8, 1], [2, 2.2, 2.4, 2.6, 2.8, 3],
+        ]  # fmt: skip
     config = read_config(tmp_path / "out" / "point.toml")
     assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
     effects_of_point = config.to_dict()["effects"]
@@ -265,6 +388,7 @@ VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
         ({"values": VALUES | {ALPHA: "<b>"}, "seed": 0}, "observer.motor.alpha"),
         ({"values": VALUES, "seed": -1}, r"seed: should be a whole number from 0 and below 2\^31"),
         ({"values": VALUES}, "seed: should be a whole number"),
+        *(({"values": VALUES, "seed": seed}, "seed: should be a whole number") for seed in (True, False, 1.0, "1", [1])),
     ],
 )
 def test_points_that_the_study_may_not_have_are_refused(swept_folder, question, message):
@@ -304,33 +428,61 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with open_pages(server.url) as (page,):
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
-            plot = page.locator("#plot")
-            plot.click(position={"x": 200, "y": 100})
+            # beside the map, and both in the window
+            page.set_viewport_size({"width": 1440, "height": 900})
+            page.mouse.click(*find_place(page, 0.9, 0.1))
             page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
             page.locator("#told:has-text('stored')").wait_for()
             text = page.locator("#told").inner_text()
             assert text.endswith("as stored in the sweep.")
-            with page.expect_download() as download:
-                page.click("#point")
-            (tmp_path / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
-            error = run(tmp_path / "point.toml").summary["metrics"]["motor.velocity_rmse"]
+            boxes = [page.locator(name).bounding_box() for name in ("#plot .plane", "#traces figure:nth-child(2) .plane")]
+            assert boxes[0]["x"] + boxes[0]["width"] < boxes[1]["x"]
+            assert all(box["y"] > 0 and box["y"] + box["height"] < 900 for box in boxes)
+            save_download(page, "#point", tmp_path / "point.toml")
+            trial = run(tmp_path / "point.toml")
+            error = trial.summary["metrics"]["motor.velocity_rmse"]
             assert float(text.split(": ")[-1].split(",")[0]) == pytest.approx(error, rel=1e-3)
+            signals = pd.read_csv(save_download(page, "#runcsv", tmp_path / "run.csv"))
+            np.testing.assert_allclose(signals["motor.velocity"], trial.trace["motor.velocity"], rtol=1e-5, atol=1e-7)
+            assert save_download(page, "#runpicture", tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
             page.click("#pinned button")
-            plot.click(position={"x": 700, "y": 500})
+            page.mouse.click(*find_place(page, 0.1, 0.9))
             page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")
             assert page.locator("#pinned li").count() == 2
             figures = page.locator("#traces figure")
             assert figures.count() == 5 and "error of the observer in the phase plane" in figures.last.inner_text()
+            # the pinned run is thin, and drawn after the newest one
+            widths = "page.runs.plots[0].lines.map(({ width }) => width)"
+            assert page.evaluate(widths) == [2, 2, 1, 1]
             # drawn, and read by keyboard
             coloured = (
-                "getImageData(85, 15, 300, 150).data.some((byte, i, all) => i % 4 === 0 && Math.abs(byte - all[i + 2]) > 60)"
+                "getImageData(85, 15, 200, 80).data.some((byte, i, all) => i % 4 === 0 && Math.abs(byte - all[i + 2]) > 60)"
             )
             drawn = f"[...document.querySelectorAll('#traces canvas')].map((canvas) => canvas.getContext('2d').{coloured})"
             assert all(page.evaluate(drawn))
             figures.first.locator(".plane").focus()
             page.keyboard.press("ArrowRight")
             assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
+            # figures over time are enlarged together
+            drag(page, find_place(page, 0.2, 0.5, 0, "#traces"), find_place(page, 0.6, 0.52, 0, "#traces"))
+            ranges = page.evaluate("page.runs.plots.map((one) => one.range && one.range[0])")
+            assert (
+                ranges[0] == pytest.approx([0.04, 0.12], abs=0.01)
+                and ranges[1] == ranges[2] == ranges[0]
+                and ranges[-1] is None
+            )
+            # as difference, of which the newest has none
+            page.select_option("#against", "difference")
+            apart = page.evaluate("page.runs.plots[0].lines.map(({ y }) => Math.max(...y.map(Math.abs)))")
+            # the true velocity does not depend on the gains
+            assert apart[0] > 1e-3 and apart[1] == 0.0
             check_figures(page, 0)
+            # a link restores both runs
+            page.goto(page.url)
+            page.reload()
+            page.locator("#pinned li").nth(1).wait_for()
+            page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")
+            assert page.locator("#pinned button").all_inner_texts() == ["unpin", "pin"]
             # a run that the sweep has no figures of
             missing_metric = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
             reply = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {missing_metric})")
@@ -398,18 +550,18 @@ def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
     page_file = write_static(make_source(result), tmp_path / "out")
     with open_pages(page_file) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} motor.velocity_rmse']")
-        page.select_option("#log", "false")
-        plane, values = page.locator("#plot .plane"), page.locator("#plot .values")
-        plane.focus()
-        for key in ("ArrowRight", "ArrowRight", "ArrowRight", "Enter"):
+        page.select_option("#log", "linear")
+        page.wait_for_function("!page.shown.chart.x.log")
+        page.locator("#plot .plane").focus()
+        for key in ("ArrowRight", "ArrowRight", "ArrowRight"):
             page.keyboard.press(key)
         alpha = np.geomspace(2.0, 50.0, 6)[2]
-        assert [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")] == pytest.approx(
-            [2.0 * alpha, alpha, 2.0 * alpha], rel=1e-3
-        )
+        lines = page.locator("#plot .values").inner_text().replace(f" [{ALPHA}]", "").split("\n")
+        numbers = [float(line.split(": ")[-1].split()[0]) for line in lines]
+        assert numbers == pytest.approx([2.0 * alpha, alpha, 2.0 * alpha], rel=1e-3)
+        page.keyboard.press("Enter")
         page.locator("#chosen").wait_for()
-        with page.expect_download() as download:
-            page.click("#point")
-        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        page.locator("#where:not(:empty)").wait_for()
+        save_download(page, "#point", tmp_path / "out" / "point.toml")
         check_figures(page, 0)
     assert read_config(tmp_path / "out" / "point.toml").observer.motor.alpha == pytest.approx(alpha, rel=1e-12)

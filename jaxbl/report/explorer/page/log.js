@@ -24,9 +24,8 @@ const smoothed = (values, width) => {
 };
 
 const ends = (values, from, to) => {
-  let [low, high] = [Infinity, -Infinity];
-  for (let i = from; i < to; i++) if (Number.isFinite(values[i])) { low = Math.min(low, values[i]); high = Math.max(high, values[i]); }
-  return low < high ? [low, high] : [low - 0.5, low + 0.5];
+  const [low, high] = endsOf([values.subarray(from, to)]);
+  return low < high ? [low, high] : low === high ? [low - 0.5, low + 0.5] : [0, 1];
 };
 
 /** Means of values in cells over one or two coordinates; nan where fewer than `least` samples are. */
@@ -56,6 +55,16 @@ globalThis.jaxblData = async (about) => {
   const view = { group: about.groups[0], x: about.over[0], y: about.over[1] ?? about.over[0], part: null, at: 0 };
   const begin = (group) => Object.assign(view, { group, shown: group.lines.slice(0, 2).map((one) => one.column), cutoff: group.bandwidth });
   begin(view.group);
+  // as a link has it
+  const given = address.read(), wanted = about.groups.find((one) => one.name === given.group), shown = given.shown?.split("~");
+  if (wanted) begin(wanted);
+  for (const name of ["x", "y"]) if (named[given[name]]) view[name] = given[name];
+  if (shown?.every((one) => view.group.lines.some(({ column }) => column === one))) view.shown = shown;
+  if (given.cutoff) view.cutoff = Number(given.cutoff) || null;
+  const part = given.part?.split("~").map(Number);
+  if (part?.every(Number.isFinite) && part[0] < part[1]) view.part = part;
+  view.at = Math.max(0, Math.min(about.rows - 1, Math.floor(given.at) || 0));
+  const remember = () => address.write({ group: view.group.name, x: view.x, y: view.y, shown: view.shown.join("~"), cutoff: view.cutoff ?? "none", part: view.part?.join("~"), at: view.at });
   const colour = (column) => COLOURS[view.group.lines.findIndex((one) => one.column === column) % COLOURS.length];
   const axis = (column) => ({ label: named[column].label, unit: named[column].unit });
 
@@ -99,6 +108,7 @@ globalThis.jaxblData = async (about) => {
     const width = view.cutoff ? Math.round(0.32 / (view.cutoff * about.period)) : 1;
     for (const name of view.shown) data[name] = smoothed(data[name], width);
     draw();
+    remember();
     document.body.dataset.drawn = [view.group.name, view.x, view.y, ...view.shown].join(" ");
   };
   const redraw = reporting("The log", update);
@@ -106,16 +116,16 @@ globalThis.jaxblData = async (about) => {
   const draw = () => {
     const [from, to] = rows(), { group, shown } = view, y = { label: group.quantity, unit: group.unit };
     const label = (column) => group.lines.find((one) => one.column === column).label;
-    const first = held.indexOf(1), bands = first < 0 ? [] : [{ from: time[first], to: time[held.lastIndexOf(1)], name: "held out" }];
-    const whole = new Plot($("time"), { x: timeAxis, y, height: 280, named: true, caption: `${group.name} over time`,
-      zoomed: (range) => { view.part = range && range[0]; draw(); } });
+    const first = held.indexOf(1), bands = first < 0 ? [] : [{ low: time[first], high: time[held.lastIndexOf(1)], name: "held out" }];
+    const whole = new Chart($("time"), { x: timeAxis, y, height: 280, named: true, caption: `${group.name} over time`,
+      zoomed: (range) => { view.part = range && range[0]; remember(); draw(); } });
     if (view.part) whole.range = [view.part, null];
     whole.set(shown.map((column, i) => ({ name: label(column), x: time, y: data[column], colour: colour(column), width: i ? 1.2 : 1.8, alpha: 0.85, sorted: true })), bands);
     $("overhead").textContent = `Over ${named[view.x].label}, and over ${named[view.x].label} and ${named[view.y].label}`;
     const xs = data[view.x], ys = data[view.y], limits = [ends(xs, from, to), ends(ys, from, to)];
     const every = Math.max(1, Math.floor((to - from) / DOTS)), picked = [];
     for (let i = from; i < to; i += every) picked.push(i);
-    const over = new Plot($("over1"), { x: axis(view.x), y, height: 300, caption: `${group.name} over ${named[view.x].label}: samples, and means of ${BINS} bins as lines` });
+    const over = new Chart($("over1"), { x: axis(view.x), y, height: 300, caption: `${group.name} over ${named[view.x].label}: samples, and means of ${BINS} bins as lines` });
     const middles = Float32Array.from({ length: BINS }, (_, k) => limits[0][0] + ((k + 0.5) * (limits[0][1] - limits[0][0])) / BINS);
     over.set(shown.flatMap((column) => [
       { name: label(column), x: picked.map((i) => xs[i]), y: picked.map((i) => data[column][i]), colour: colour(column), alpha: 0.35, dots: 2 },
@@ -124,17 +134,20 @@ globalThis.jaxblData = async (about) => {
     plots = [[whole, (column, i) => [time[i], data[column][i]], shown[0]], [over, (column, i) => [xs[i], data[column][i]], shown[0]]];
     const found = shown.map((column) => means(data[column], [xs, ys], limits, CELLS, from, to, 3));
     const sizes = found.flatMap((one) => [...one].filter(Number.isFinite).map(Math.abs)).sort((a, b) => a - b);
-    const limit = sizes[Math.floor(0.98 * (sizes.length - 1))] || 1;
+    const limit = sizes[Math.floor(0.98 * (sizes.length - 1))] || 1, scale = new Scale({ colours, low: -limit, high: limit, whole: [-limit, limit], label: group.quantity, unit: group.unit });
     $("over2").replaceChildren();
     found.forEach((values, k) => {
       const figure = made("figure");
       $("over2").append(figure);
-      const plot = new Plot(figure, { x: { ...axis(view.x), limits: limits[0] }, y: { ...axis(view.y), limits: limits[1] }, height: 300, caption: `${group.name}, ${label(shown[k])}: mean in each cell; grey: fewer than 3 samples` });
-      plot.cells = { x: limits[0], y: limits[1], size: CELLS, values };
-      plot.scale = new Scale({ colours, low: -limit, high: limit, log: false, label: group.quantity, unit: group.unit });
+      const axes = [axis(view.x), axis(view.y)].map((one, i) => ({ ...one, ends: limits[i] }));
+      const plot = new Chart(figure, { x: axes[0], y: axes[1], height: 300, scale, caption: `${group.name}, ${label(shown[k])}: mean in each cell; grey: fewer than 3 samples` });
+      const middle = (cell) => axes.map(({ label: name, unit }, i) => `${name}: ${text(limits[i][0] + ((cell[i] + 0.5) * (limits[i][1] - limits[i][0])) / CELLS[i])} ${unit}`.trim());
+      const said = (cell) => { const value = values[cell[1] * CELLS[0] + cell[0]]; return Number.isFinite(value) ? [`${group.quantity}: ${text(value)} ${group.unit}`, ...middle(cell)] : null; };
+      plot.cells = { x: limits[0], y: limits[1], size: CELLS, text: said, colours: sheetOf(CELLS, (i) => (Number.isFinite(values[i]) ? [...scale.colour(values[i]), 255] : [...MISSING, 90])) };
       plot.set([]);
       plots.push([plot, (_, i) => [xs[i], ys[i]], shown[k]]);
     });
+    scale.draw($("bar"));
     table(from, to, label);
     move(view.at);
   };
@@ -148,11 +161,7 @@ globalThis.jaxblData = async (about) => {
       return count ? Math.sqrt(sum / count) : NaN;
     };
     $("sizeshead").textContent = `Root mean square of what is shown${view.cutoff ? ", after the moving average" : ""}`;
-    $("sizes").replaceChildren(
-      made("thead", {}, made("tr", {}, ...[withUnit(view.group.name, view.group.unit), ...parts.map(([name]) => name)].map((textContent) => made("th", { textContent, scope: "col" })))),
-      made("tbody", {}, ...view.shown.map((column) => made("tr", {}, made("th", { textContent: label(column), scope: "row" }),
-        ...parts.map(([, which]) => made("td", { className: "number", textContent: text(rms(data[column], which)) }))))),
-    );
+    tableOf($("sizes"), [withUnit(view.group.name, view.group.unit), ...parts.map(([name]) => name)], view.shown.map((column) => [label(column), ...parts.map(([, which]) => text(rms(data[column], which)))]));
     $("state").textContent = view.part ? `From ${textBetween(view.part[0], view.part)} to ${textBetween(view.part[1], view.part)} s.` : "";
   };
 
@@ -161,7 +170,7 @@ globalThis.jaxblData = async (about) => {
     view.at = at;
     const [from, to] = rows(), i = Math.min(Math.max(at, from), to - 1);
     for (const [plot, place, column] of plots) {
-      plot.cursor = column && place(column, i).every(Number.isFinite) ? place(column, i) : null;
+      plot.marks = column && place(column, i).every(Number.isFinite) ? [[...place(column, i), "ring"]] : [];
       plot.draw();
     }
     $("moment").value = String(Math.round((1000 * (i - from)) / Math.max(to - 1 - from, 1)));
@@ -189,7 +198,10 @@ globalThis.jaxblData = async (about) => {
     stop();
     const [from, to] = rows();
     move(from + Math.round((Number($("moment").value) / 1000) * (to - 1 - from)));
+    remember();
   });
+  $("csv").onclick = () => { const [from, to] = rows(), names = ["t", view.x, view.y, ...view.shown]; saveTable("log.csv", Object.fromEntries(names.map((name) => [name, (name === "t" ? time : data[name]).slice(from, to)]))); };
+  $("picture").onclick = () => savePicture("log.png", $("drawn"));
   addEventListener("resize", () => { for (const [plot] of plots) plot.draw(); });
   form();
   await redraw();

@@ -4,63 +4,33 @@
 const SIDES = ["motor", "load"];
 /** What is drawn of a run: title, axes, and lines [name, column of x, column of y, dashed]; of the last half where the first is transient. */
 const tracePlots = (columns) => {
-  const sides = SIDES.filter((side) => `${side}.velocity` in columns), time = { label: "time", unit: "s" }, plots = [];
-  const over = (caption, label, unit, lines) => plots.push({ caption, time: true, x: time, y: { label, unit }, lines: lines.map(([name, y, dash]) => [name, "t", y, dash]) });
-  for (const side of sides) {
-    const symbol = side === "motor" ? "θe" : "θs";
-    over(`${side}: position`, `position ${symbol}`, "rad", [["observed", `${side}.position_estimate`, false], ["true", `${side}.position`, true]]);
-    over(`${side}: velocity`, "velocity", "rad/s", [["observed", `${side}.velocity_estimate`, false], ["true", `${side}.velocity`, true]]);
-    over(`${side}: error of the velocity, true less observed`, "velocity error", "rad/s", [["error", `${side}.velocity_error`, false]]);
-  }
-  const what = "z" in columns ? "transmitted torque" : "disturbance torque";
-  over(`${what}, true and observed`, what, "N m", [...sides.map((side) => [`by the ${side} observer`, `${side}.torque_estimate`, false]), ["true", "torque", true]]);
-  if ("z" in columns) {
-    plots.push({ caption: "hysteresis: torque over twist, second half of the run", half: true, x: { label: "twist z", unit: "rad" }, y: { label: what, unit: "N m" },
-      lines: [["by the motor observer", "z", "motor.torque_estimate", false], ["true", "z", "torque", true]] });
-  }
-  return plots;
+  const sides = SIDES.filter((one) => `${one}.velocity` in columns), what = "z" in columns ? "transmitted torque" : "disturbance torque";
+  const over = (title, unit, lines) => ({ title: withUnit(title, unit), time: true, x: { name: "time", unit: "s" }, y: { name: title, unit }, lines: lines.map(([name, y, dash]) => [name, "t", y, dash]) });
+  const signal = (side, name, unit) => over(`${side}: ${name}`, unit, [["observed", `${side}.${name}_estimate`, false], ["true", `${side}.${name}`, true]]);
+  return [
+    ...sides.flatMap((side) => [signal(side, "velocity", "rad/s"), over(`${side}: velocity error, true less observed`, "rad/s", [["error", `${side}.velocity_error`, false]])]),
+    over(what, "N m", [...SIDES.map((side) => [`by the ${side} observer`, `${side}.torque_estimate`, false]), ["true", "torque", true]]),
+    ...("z" in columns ? [{ title: `hysteresis, second half: ${what} (N m)`, half: true, x: { label: "twist z", unit: "rad" }, y: { name: what, unit: "N m" }, lines: [["by the motor observer", "z", "motor.torque_estimate", false], ["true", "z", "torque", true]] }] : []),
+    ...sides.map((side) => signal(side, "position", "rad")),
+  ];
 };
-
-/** A value as TOML: a whole number stands for a real one, too. */
-const exact = (value) => (typeof value === "number" ? String(value) : JSON.stringify(value));
-
-/** A point in words: axes as { path, unit }, values by path. */
-const pointWords = (axes, values) => axes.map(({ path, unit }) => `${path}: ${text(values[path])} ${unit}`.trim()).join(", ");
-
-/** A point, its values by path, as a study that includes this one; it has all of its `effects` if one of them is varied. */
-const pointText = (values, effects) => {
-  const lines = ['include = "study.toml"', "axes = []", "figures = []", "notes = []"], tables = effects.map((one) => ({ ...one }));
-  let varied = false;
-  for (const [path, value] of Object.entries(values)) {
-    const [, name, key] = /^effects\.(.+)\.([^.]+)$/.exec(path) ?? [];
-    // two of a kind go by their numbers
-    if (name) tables[/^\d+$/.test(name) ? Number(name) : tables.findIndex(({ kind }) => kind === name)][key] = value;
-    else lines.push(`${path} = ${exact(value)}`);
-    varied ||= Boolean(name);
-  }
-  for (const one of varied ? tables : []) lines.push("", "[[effects]]", ...Object.entries(one).map(([key, value]) => `${key} = ${exact(value)}`));
-  return `${lines.join("\n")}\n`;
-};
-
-/** Gains of a point, for a study to include. */
-const gainsText = (gains, values) => {
-  const tables = Object.entries(gains).map(([side, own]) => {
-    const [lambda, alpha] = ["lambda", "alpha"].map((name) => exact(values[`observer.${side}.${name}`] ?? own[name]));
-    return `[observer.${side}]\nlambda = ${lambda}\nalpha = ${alpha}\n`;
-  });
-  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
-};
-
 /** A metric's figure of a run as maps draw it: sizes of what has a sign, 1 and 0 of what is true or not, nan where there is none. */
 const drawnFigure = ({ yes, size }, raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw);
 
 class Runs {
-  constructor(study) {
-    Object.assign(this, { study, all: [], plots: [] });
+  /** `changed` hears that other runs are pinned. */
+  constructor(study, changed = () => {}) {
+    Object.assign(this, { study, changed, all: [], plots: [] });
+    $("against").onchange = () => this.draw();
+    $("runcsv").onclick = () => saveTable("run.csv", this.newest.columns);
+    $("runpicture").onclick = () => savePicture("run.png", $("runs"));
   }
+  pinned() { return this.all.filter((one) => one.pinned).map((one) => one.row); }
+  /** Pins the newest run. */
+  pin() { if (this.newest) { this.newest.pinned = true; this.draw(); } }
   /** Has the run of a point simulated, `values` by path; it takes the place of the newest, unless that is pinned. `stored` is
    * what the sweep has of a metric: { metric, value }. */
-  async simulate(values, seed, stored) {
+  async simulate(values, seed, stored, row) {
     const asked = (this.asked = Symbol("asked"));
     $("runs").hidden = false;
     $("told").textContent = "simulating …";
@@ -84,15 +54,14 @@ class Runs {
       return;
     }
     if (asked !== this.asked) return;
-    this.all = this.all.filter((one) => one.pinned);
+    this.all = this.all.filter((one) => one.pinned && one.row !== row);
     if (this.all.length === COLOURS.length) this.all.shift();
-    const free = COLOURS.filter((colour) => !this.all.some((one) => one.colour === colour));
     const columns = Object.fromEntries(Object.entries(found.columns).map(([name, bytes]) => [name, unpacked(bytes)]));
     for (const side of SIDES.filter((one) => `${one}.velocity` in columns)) {
       columns[`${side}.velocity_error`] = columns[`${side}.velocity`].map((one, i) => one - columns[`${side}.velocity_estimate`][i]);
     }
     const name = [...this.study.named.map((path) => `${path.replace(/^observer\./, "")} ${text(values[path])}`), `seed ${seed}`].join(", ");
-    this.newest = { ...found, name, columns, colour: free[0], pinned: false };
+    this.newest = { ...found, row, name, columns, colour: COLOURS.find((colour) => !this.all.some((one) => one.colour === colour)), pinned: false };
     this.all.push(this.newest);
     this.draw();
     const drawn = found.every > 1 ? `Every ${found.every}th sample is drawn. ` : "";
@@ -113,72 +82,72 @@ class Runs {
     const spread = `with λ and the motor's inertia changed in their last digits it is ${text(low)} to ${text(high)}`;
     return value >= low - room && value <= high + room ? `${both}. Rounding decides: ${spread}.` : `This run differs from the sweep's: ${both}; ${spread}.`;
   }
-  config() { return this.newest.config; }
+  /** The runs that are drawn: pinned ones first and thin, so that the newest lies between them and the truth; or what they differ by. */
   draw() {
-    const { columns } = this.newest, specs = tracePlots(columns), several = this.all.length > 1;
-    const range = this.plots.find((one) => one.spec.time)?.range;
+    const { newest } = this, range = this.plots.find((one) => one.spec.time)?.range, others = this.all.filter((one) => one !== newest), apart = others.length && $("against").value;
+    $("apart").hidden = !others.length;
+    for (const name of ["runcsv", "runpicture"]) $(name).hidden = false;
     $("pinned").replaceChildren(...this.all.map((one) => this.entry(one)));
-    $("key").replaceChildren(legend([["solid: observed, or error", "currentColor", false], ["dashed: true", "currentColor", true], ["dots: majorant of the proof", "#8a8d93", true]]));
-    const whole = $("traces");
-    whole.replaceChildren();
-    this.plots = [];
+    $("traces").replaceChildren();
+    const plots = [];
     const add = (spec, lines) => {
       const figure = made("figure");
-      whole.append(figure);
-      const plot = new Plot(figure, { ...spec, zoomed: spec.time && ((to) => this.follow(plot, to)) });
+      $("traces").append(figure);
+      const plot = new Chart(figure, { height: 128, ...spec, title: apart ? `${spec.title}, pinned less newest` : spec.title, zoomed: (to) => { plot.build(); if (spec.time) this.follow(plot, to); } });
       plot.spec = spec;
       if (spec.time && range) plot.range = [range[0], null];
-      plot.set(lines);
-      this.plots.push(plot);
+      plots.push([plot, lines]);
     };
-    const named = (run, name) => (several ? `${run.name}: ${name}` : name);
-    for (const spec of specs) {
-      const sides = spec.lines.length > 2;
-      add({ ...spec, named: sides && !several }, this.all.flatMap((run) => spec.lines.filter(([, , y]) => y in run.columns).map(([name, x, y, dashed], i) => {
-        const part = (column) => (spec.half ? column.subarray(column.length >> 1) : column);
+    const named = (run, name) => (others.length ? `${run.name}: ${name}` : name);
+    for (const spec of tracePlots(newest.columns).filter((one) => !apart || one.time)) {
+      const part = (column) => (spec.half ? column.subarray(column.length >> 1) : column), sides = spec.lines.filter((one) => one[2] in newest.columns).length > 2;
+      add({ ...spec, named: sides && !others.length }, (apart ? others : [newest, ...others]).flatMap((run) => spec.lines.filter(([,, y]) => y in run.columns).map(([name, x, y, dashed], i) => {
+        const own = part(run.columns[y]), at = part(run.columns[x]), values = apart ? this.less(own, at, newest.columns[y], newest.columns[x]) : own;
         // two observers of one quantity
-        const colour = !several && sides && !dashed ? COLOURS[i] : several || !dashed ? run.colour : undefined;
-        return { name: named(run, name), x: part(run.columns[x]), y: part(run.columns[y]), colour, alpha: dashed ? 1 : 0.8, dash: dashed ? [6, 4] : [], width: dashed ? 1.3 : 1.8, sorted: x === "t" };
+        const colour = !others.length && sides && !dashed ? COLOURS[i] : others.length || !dashed ? run.colour : undefined;
+        return { name: named(run, name), x: at, y: values, colour, dash: dashed ? [6, 4] : [], width: run === newest ? 2 : 1, sorted: x === "t" };
       })));
     }
-    for (const side of SIDES.filter((one) => this.newest.planes[one])) {
+    for (const side of SIDES.filter((one) => newest.planes[one] && !apart)) {
       const planes = this.all.map((run) => run.planes[side]).filter(Boolean), bounded = planes.some(({ majorant }) => majorant);
       const [x, y] = [0, 1].map((i) => Math.max(...planes.map(({ reach }) => reach[i]))).map((reach) => (reach > 0 ? [-reach, reach] : null));
-      const spec = { caption: `${side}: error of the observer in the phase plane${bounded ? ", with the majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`, height: 300,
-        x: { label: "position error e", unit: "rad", limits: x }, y: { label: "its slope ė", unit: "rad/s", limits: y } };
-      add(spec, this.all.filter((run) => run.planes[side]).flatMap((run) => {
-        const { error, slope, majorant } = run.planes[side];
-        const lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour }];
-        return majorant ? [...lines, { name: named(run, "majorant"), x: unpacked(majorant[0]), y: unpacked(majorant[1]), colour: several ? run.colour : "#8a8d93", dash: [2, 3] }] : lines;
+      const spec = { title: `${side}: error of the observer in the phase plane${bounded ? ", dashed: majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`,
+        x: { label: "position error e", unit: "rad", ends: x }, y: { name: "its slope ė", unit: "rad/s", ends: y } };
+      add(spec, [newest, ...others].filter((run) => run.planes[side]).flatMap((run) => {
+        const { error, slope, majorant } = run.planes[side], lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour, width: run === newest ? 1.5 : 1 }];
+        return majorant ? [...lines, { name: named(run, "majorant"), x: unpacked(majorant[0]), y: unpacked(majorant[1]), colour: others.length ? run.colour : GREY, dash: [2, 3] }] : lines;
       }));
     }
-    this.table();
+    // their widths are known when all are there
+    for (const [plot, lines] of plots) plot.set(lines);
+    this.plots = plots.map(([plot]) => plot);
+    const { metrics } = newest, cell = (name, own) => (typeof own[name] === "boolean" ? (own[name] ? "yes" : "no") : text(drawnFigure(this.study.metric(name) ?? {}, own[name])));
+    tableOf($("metrics"), ["metric", ...this.all.map((one) => one.name)], Object.keys(metrics).map((name) => [this.study.metric(name)?.label ?? name, ...this.all.map((one) => cell(name, one.metrics))]));
+  }
+  /** A signal less another one, which is taken between its samples where the two have other times. */
+  less(own, at, other, times) {
+    return own.map((value, i) => {
+      const k = Math.min(before(times, at[i]), times.length - 2), share = (at[i] - times[k]) / (times[k + 1] - times[k]);
+      return share > 1 + 1e-9 ? NaN : value - (other[k] + share * (other[k + 1] - other[k] || 0));
+    });
   }
   entry(one) {
-    const mark = made("span", { className: "mark" });
+    const mark = made("span", { className: "mark" }), pin = made("button", { type: "button", textContent: one.pinned ? "unpin" : "pin" });
     mark.style.borderTopColor = one.colour;
-    const pin = made("button", { type: "button", textContent: one.pinned ? "unpin" : "pin" });
     pin.addEventListener("click", () => {
       one.pinned = !one.pinned;
       if (!one.pinned && one !== this.newest) this.all = this.all.filter((other) => other !== one);
+      this.changed();
       this.draw();
     });
-    return made("li", {}, mark, one.name, pin);
+    return made("li", {}, mark, one.name, " ", pin);
   }
   /** All plots over time show what one of them does. */
   follow(from, range) {
     for (const plot of this.plots) {
       if (plot === from || !plot.spec.time) continue;
       plot.range = range && [range[0], null];
-      plot.draw();
+      plot.build();
     }
-  }
-  table() {
-    const { metrics } = this.newest;
-    const cell = (name, own) => made("td", { className: "number", textContent: typeof own[name] === "boolean" ? (own[name] ? "yes" : "no") : text(drawnFigure(this.study.metric(name) ?? {}, own[name])) });
-    $("metrics").replaceChildren(
-      made("thead", {}, made("tr", {}, ...["metric", ...this.all.map((one) => one.name)].map((name) => made("th", { textContent: name, scope: "col" })))),
-      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(name, one.metrics))))),
-    );
   }
 }

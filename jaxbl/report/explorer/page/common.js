@@ -1,0 +1,189 @@
+"use strict";
+/* What the explorer's pages share: what is chosen, the address, files read by parts, colours, and what is saved. */
+
+const $ = (id) => document.getElementById(id);
+const save = (name, url) => made("a", { href: url, download: name }).click();
+const saveText = (name, content, type = "application/toml") => save(name, URL.createObjectURL(new Blob([content], { type })));
+/** Columns of numbers and words, by name, as a table for other programs. */
+const saveTable = (name, columns) => {
+  const names = Object.keys(columns), quoted = (one) => (/[",\n]/.test(one) ? `"${String(one).replaceAll('"', '""')}"` : String(one));
+  saveText(name, [names, ...Array.from(columns[names[0]], (_, i) => names.map((one) => columns[one][i]))].map((row) => row.map(quoted).join(",")).join("\n") + "\n", "text/csv");
+};
+/** An element as it is seen, its canvases and its texts, as PNG. */
+const savePicture = (name, element) => {
+  const whole = element.getBoundingClientRect(), sheet = made("canvas", { width: whole.width * devicePixelRatio, height: whole.height * devicePixelRatio });
+  const context = sheet.getContext("2d"), style = getComputedStyle(document.body);
+  context.scale(devicePixelRatio, devicePixelRatio);
+  context.fillStyle = style.backgroundColor;
+  context.fillRect(0, 0, whole.width, whole.height);
+  for (const one of element.querySelectorAll("canvas, .over, .legend > span, .mark")) {
+    const { left, top, width, height } = one.getBoundingClientRect(), own = getComputedStyle(one), at = [left - whole.left, top - whole.top];
+    if (one.matches("canvas")) context.drawImage(one, ...at, width, height);
+    else if (one.matches(".mark")) { context.fillStyle = own.borderTopColor; context.fillRect(...at, width, 3); }
+    else { Object.assign(context, { fillStyle: own.color, font: `${own.fontSize} system-ui, sans-serif`, textBaseline: "top" }); context.fillText(one.textContent, at[0] + (one.querySelector(".mark") ? 32 : 0), at[1] + 3, width); }
+  }
+  save(name, sheet.toDataURL("image/png"));
+};
+const choose = (label, id, options, chosen, act) => {
+  const select = made("select", { id }, ...options.map(([value, name]) => made("option", { value, textContent: name, selected: String(value) === String(chosen) })));
+  select.addEventListener("change", () => act(select.value));
+  return made("label", {}, label, select);
+};
+const tableOf = (element, heads, rows) => element.replaceChildren(
+  made("thead", {}, made("tr", {}, ...heads.map((textContent) => made("th", { textContent, scope: "col" })))),
+  made("tbody", {}, ...rows.map(([first, ...others]) => made("tr", {}, first instanceof Node ? made("td", {}, first) : made("th", { textContent: first, scope: "row" }), ...others.map((textContent) => made("td", { className: "number", textContent }))))),
+);
+
+/** What a link says of the view, as words by name. */
+const address = {
+  read: () => Object.fromEntries(new URLSearchParams(location.hash.slice(1))),
+  write: (view) => history.replaceState(null, "", `#${new URLSearchParams(Object.entries(view).filter(([, value]) => value !== "" && value != null))}`),
+};
+addEventListener("hashchange", () => location.reload());
+
+/** Title, what was found, and the config. */
+const head = ({ title, lead, config, file }) => {
+  const lines = lead.map((line) => made("p", { textContent: line })), more = lines.splice(1);
+  document.title = $("title").textContent = title;
+  $("lead").replaceChildren(...lines, ...(more.length ? [made("details", {}, made("summary", { textContent: "more of what was found" }), ...more)] : []));
+  $("config").textContent = config;
+  $("configname").textContent = file;
+};
+
+/* ------------------------------------------------------------------------------------------------------------- data */
+
+const waiting = new Map();
+/** Called by the scripts that carry a Parquet file for pages opened from disk. */
+globalThis.jaxblBytes = (number, content) => {
+  waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0)));
+};
+
+/** The Parquet file beside the page as hyparquet reads it: its length, and bytes from and to. */
+const bytesOf = (about) => {
+  const kept = new Map();
+  const script = (number) => {
+    if (!kept.has(number)) {
+      kept.set(number, new Promise((resolve, reject) => {
+        waiting.set(number, resolve);
+        const element = made("script", { src: `points.${String(number).padStart(4, "0")}.js`, onerror: () => reject(new Error(`${element.src} is missing`)) });
+        document.head.append(element);
+      }));
+    }
+    return kept.get(number);
+  };
+  const fromScripts = async (start, end) => {
+    const first = Math.floor(start / about.script), last = Math.floor((end - 1) / about.script);
+    const parts = await Promise.all(Array.from({ length: last - first + 1 }, (_, i) => script(first + i)));
+    const out = new Uint8Array(end - start);
+    parts.forEach((part, i) => {
+      const begin = (first + i) * about.script, from = Math.max(start, begin), to = Math.min(end, begin + part.length);
+      out.set(part.subarray(from - begin, to - begin), from - start);
+    });
+    return out.buffer;
+  };
+  let whole = null;
+  const byRange = async (start, end) => {
+    if (whole) return (await whole).slice(start, end);
+    const answer = await fetch("points.parquet", { headers: { Range: `bytes=${start}-${end - 1}` } });
+    if (!answer.ok) throw new Error(`points.parquet: ${answer.status} ${answer.statusText}`);
+    if (answer.status === 206) return answer.arrayBuffer();
+    // some servers send the whole file, which is enough once
+    whole ??= answer.arrayBuffer();
+    return (await whole).slice(start, end);
+  };
+  const slice = location.protocol === "file:" ? fromScripts : byRange;
+  return { byteLength: about.bytes, slice: (start, end = about.bytes) => slice(start, end) };
+};
+
+/** Columns of the Parquet file beside the page, each read when it is asked for. */
+class Columns {
+  /** `most` columns are kept; `told` hears the share that is read. */
+  constructor(about, most, told) {
+    Object.assign(this, { rows: about.rows, file: bytesOf(about), most, told, kept: new Map() });
+  }
+  get(name, Kind = Float32Array) {
+    if (!this.kept.has(name)) {
+      if (this.kept.size >= this.most) this.kept.delete(this.kept.keys().next().value);
+      const read = this.read(name, Kind);
+      // it may be there later
+      read.catch(() => { this.kept.delete(name); this.metadata = null; });
+      this.kept.set(name, read);
+    }
+    return this.kept.get(name);
+  }
+  async read(name, Kind) {
+    this.metadata ??= hyparquet.parquetMetadataAsync(this.file);
+    const metadata = await this.metadata, out = new Kind(this.rows);
+    let rowStart = 0;
+    for (const group of metadata.row_groups) {
+      const rowEnd = rowStart + Number(group.num_rows);
+      // the page stays alive
+      await new Promise((resolve) => setTimeout(resolve));
+      this.told(name, rowStart / this.rows);
+      await hyparquet.parquetRead({
+        file: this.file, metadata, columns: [name], rowStart, rowEnd,
+        onChunk: ({ columnData, rowStart: first }) => out.set(columnData, first),
+      });
+      rowStart = rowEnd;
+    }
+    return out;
+  }
+}
+
+/** What reads and draws, as a function that says it where that fails. */
+const reporting = (what, act) => () => act().catch((error) => { $("state").textContent = `${what} cannot be read: ${error.message}`; });
+
+/* ---------------------------------------------------------------------------------------------------------- colours */
+
+/** The colour of no value. */
+const MISSING = [189, 189, 189];
+const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
+
+/** Colours of values from low to high: { colours, low, high, log, label, unit, names }, colours as [red, green, blue]; names as of
+ * an axis. */
+class Scale {
+  constructor(given) { Object.assign(this, given); }
+  /** Of finite values; logarithmic where they are positive and span more than a factor of 30. Of many, a hundredth at either end
+   * lies beyond the colours. */
+  static of(values, about) {
+    const whole = endsOf([values]);
+    // of no values, or of one value
+    const one = whole[0] > whole[1] ? "no value" : whole[0] === whole[1] ? text(whole[0]) : "";
+    let [low, high] = one === "no value" ? [0, 1] : whole;
+    if (values.length > 400 && !one) {
+      const every = Math.ceil(values.length / 20000), some = values.filter((value, i) => i % every === 0 && Number.isFinite(value)).sort((a, b) => a - b);
+      [low, high] = [0.01, 0.99].map((share) => some[Math.round(share * (some.length - 1))]);
+    }
+    if (low === high) [low, high] = [low - 0.5 * Math.abs(low) - 1e-12, high + 0.5 * Math.abs(high) + 1e-12];
+    return new Scale({ one, whole, low, high, log: low > 0 && high / low > 30, ...about });
+  }
+  share(value) { return this.log ? Math.log(value / this.low) / Math.log(this.high / this.low) : (value - this.low) / (this.high - this.low); }
+  colour(value) { return Number.isFinite(value) ? this.colours[Math.round(255 * Math.min(1, Math.max(0, this.share(value) || 0)))] : MISSING; }
+  /** What it says. */
+  get said() { return this.one || `from ${text(this.whole[0])} to ${text(this.whole[1])}`; }
+  /** A bar with round values below it, and with what it shows above. */
+  draw(element) {
+    const canvas = made("canvas"), density = devicePixelRatio, width = element.clientWidth, context = canvas.getContext("2d"), inner = width - 60;
+    element.replaceChildren(made("p", { className: "over", textContent: withUnit(this.label, this.unit) }), canvas);
+    Object.assign(canvas, { width: width * density, height: 30 * density });
+    canvas.style.cssText = `width: ${width}px; height: 30px`;
+    context.scale(density, density);
+    for (let k = 0; k < inner; k++) { context.fillStyle = `rgb(${this.colours[Math.round((255 * k) / inner)].join(",")})`; context.fillRect(30 + k, 0, 1.5, 12); }
+    Object.assign(context, { fillStyle: getComputedStyle(document.body).color, font: "12px system-ui, sans-serif", textAlign: "center", textBaseline: "top" });
+    const places = this.names ? this.names.map((name, k) => [name, k]) : this.one ? [[this.one, (this.low + this.high) / 2]] : ticks(this.low, this.high, this.log).map((one) => [text(one), one]);
+    for (const [name, value] of places) if (this.share(value) > -1e-6 && this.share(value) < 1 + 1e-6) context.fillText(name, 30 + inner * this.share(value), 15, 90);
+  }
+}
+
+/** A canvas of one pixel a cell, [red, green, blue, opacity] by the cell's number, rows upwards; null leaves it empty. */
+const sheetOf = ([width, height], pixel) => {
+  const sheet = made("canvas", { width, height }), image = new ImageData(width, height);
+  for (let j = 0; j < height; j++) {
+    for (let i = 0; i < width; i++) {
+      const colour = pixel(j * width + i);
+      if (colour) image.data.set(colour, 4 * ((height - 1 - j) * width + i));
+    }
+  }
+  sheet.getContext("2d").putImageData(image, 0, 0);
+  return sheet;
+};
