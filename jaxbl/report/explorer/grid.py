@@ -15,8 +15,9 @@ from jaxbl.config import Config
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.maps import least_lambdas, unit_of
-from jaxbl.report.picture import packed
+from jaxbl.report.gain_plane import least_lambdas
+from jaxbl.report.maps import unit_of
+from jaxbl.report.panels import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 

@@ -16,8 +16,8 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import describe_diagnosis
 from jaxbl.report.element import describe_element
-from jaxbl.report.figures import missing_quantity
 from jaxbl.report.identify import describe_identification
+from jaxbl.report.panels import missing_quantity
 
 from .folder import Source, colours_of, points_writer, write_page
 

@@ -10,9 +10,8 @@ from jaxbl.config import Config, is_boolean, with_values
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
-from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
-from jaxbl.report.picture import packed
+from jaxbl.report.panels import MAP, packed
 from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
