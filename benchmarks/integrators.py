@@ -333,7 +333,8 @@ def plot(results: list[tuple[Problem, list[Row]]], path: Path) -> None:
     """Error over cost, one panel a problem."""
     import matplotlib.pyplot as plt
 
-    from jaxbl.report.figures import COLOURS, save, style
+    from jaxbl.report.drawing import save_canvas, style
+    from jaxbl.report.panels import COLOURS
 
     with style():
         figure, axes = plt.subplots(1, len(results), figsize=(4.3 * len(results), 4.4))
@@ -345,7 +346,7 @@ def plot(results: list[tuple[Problem, list[Row]]], path: Path) -> None:
             axis.set(xscale="log", yscale="log", title=problem.title, xlabel="cost per simulated second (1: the default)")
             axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
         axes[0].set_ylabel("largest position error (rad)")
-        print("\nfigure:", save(figure, path))
+        print("\nfigure:", save_canvas(figure, path))
 
 
 def main() -> None:

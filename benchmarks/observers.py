@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 import jaxbl
-from jaxbl.report.figures import COLOURS, FAINT, save, style
+from jaxbl.report.drawing import save_canvas, style
+from jaxbl.report.panels import COLOURS, FAINT
 from jaxbl.sweeps.metrics import SIDE_METRICS, RunMetric
 
 ROOT = Path(__file__).parents[1]
@@ -320,7 +321,7 @@ def main() -> None:
         pd.concat([measure(name, drive, asked.out) for name, drive in drives.items()]).to_csv(stored, index=False)
     table = pd.read_csv(stored)
     print(write_tables(table, drives))
-    save(draw_situations(table, drives), PICTURE)
+    save_canvas(draw_situations(table, drives), PICTURE)
 
 
 if __name__ == "__main__":

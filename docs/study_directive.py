@@ -22,7 +22,7 @@ from docutils.parsers.rst import directives
 from sphinx.util.docutils import SphinxDirective
 
 import jaxbl
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "gallery"
@@ -47,7 +47,7 @@ def draw_study(name: str, command: str, figures: list[str], text: str) -> list[P
         drawings = jaxbl.draw(run(tomllib.loads(text)), *figures)
         shutil.rmtree(folder, ignore_errors=True)
         for i, drawn in enumerate(drawings):
-            save(drawn.figure, folder / f"{i:02}_{drawn.name}.png")
+            save(drawn, folder / f"{i:02}_{drawn.name}.png")
         known.write_text(state, encoding="utf-8")
     return sorted(folder.glob("*.png"))
 

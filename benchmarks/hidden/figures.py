@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from jaxbl.report.figures import COLOURS, save, style
+from jaxbl.report.drawing import save_canvas, style
+from jaxbl.report.panels import COLOURS
 
 from .effects import LEVELS
 from .outcomes import TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
@@ -24,7 +25,7 @@ def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
             ("gap", _gap(outcomes)),
         ):
             if figure is not None:
-                files.append(save(figure, folder / f"{name}.png"))
+                files.append(save_canvas(figure, folder / f"{name}.png"))
     return files
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbl.report.figures import COLOURS, save, style
+from jaxbl.report.drawing import save_canvas, style
+from jaxbl.report.panels import COLOURS
 
 from .machines import Case
 
@@ -174,7 +175,7 @@ def write(rows: Sequence[Row], text: str, folder: Path) -> list[Path]:
     drawn = [row for row in rows if row.torques and not row.error]
     if drawn:
         with style():
-            files.append(save(_figure(drawn), folder / "torque_errors.png"))
+            files.append(save_canvas(_figure(drawn), folder / "torque_errors.png"))
     return files
 
 

@@ -10,56 +10,55 @@ from jaxbl.files import write_json
 from jaxbl.lines import Lines
 from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, BenchResult
 
-from .figures import BLUE, GREEN, VERMILION, Drawn, style, subplots
-from .page import save_all
+from .drawing import save
+from .panels import BLUE, GREEN, VERMILION, Axis, Bars, Figure, Line, Panel
 
 
-@style()
-def draw_throughput(result: BenchResult) -> list[Drawn]:
+def draw_throughput(result: BenchResult) -> list[Figure]:
     """The figures of a benchmark."""
     return [_bars(result), _curve(result)]
 
 
-def _bars(result: BenchResult) -> Drawn:
+_SPEED = Axis("lane-steps per second", log=True)
+
+
+def _bars(result: BenchResult) -> Figure:
     names = list(dict.fromkeys(row.name for row in result.rows))
     names.sort(key=lambda name: result.find_speed(name, "float32") or result.find_speed(name, "float64") or 0.0)
-    figure, (ax,) = subplots(8.0, 0.42 * len(names) + 1.1)
-    for shift, precision, alpha in ((0.19, "float32", 1.0), (-0.19, "float64", 0.45)):
-        for i, name in enumerate(names):
-            speed = result.find_speed(name, precision)
-            if speed is not None:
-                ax.barh(i + shift, speed, 0.38, color=VERMILION if name.startswith("jaxbl") else BLUE, alpha=alpha)
-                ax.text(1.15 * speed, i + shift, f"{speed:.2g}", va="center", fontsize=7)
-    ax.set(xscale="log", xlabel="lane-steps per second (log scale); upper bar float32, lower bar float64")
-    ax.set_yticks(range(len(names)), names)
-    ax.set_xlim(right=12.0 * max(row.lane_steps_per_second for row in result.rows))
-    ax.grid(axis="y", visible=False)
-    return Drawn(
+    bars, speeds = [], []
+    for shift, precision, opacity in ((0.19, "float32", 1.0), (-0.19, "float64", 0.45)):
+        for who, colour in (("jaxbl", VERMILION), ("others", BLUE)):
+            rows = [
+                (i + shift, speed)
+                for i, name in enumerate(names)
+                if name.startswith("jaxbl") == (who == "jaxbl") and (speed := result.find_speed(name, precision)) is not None
+            ]
+            if rows:
+                places, lengths = zip(*rows, strict=True)
+                speeds += lengths
+                texts = [f"{speed:.2g}" for speed in lengths]
+                bars.append(Bars(places, lengths, f"{who}, {precision}", colour, 0.38, opacity=opacity, texts=texts))
+    x = _SPEED._replace(ends=(0.3 * min(speeds), 12.0 * max(speeds)))
+    return Figure(
         "throughput",
-        figure,
+        [Panel(x, Axis(names=tuple(enumerate(names))), bars)],
         "The paper's chain on many lanes by each program. A lane-step is one sample of one lane: plant, two observers, "
         "filter and both identifiers. Longer bars are faster; from one grid line to the next is a factor of ten.",
+        height=0.42 * len(names) + 1.1,
     )
 
 
-def _curve(result: BenchResult) -> Drawn:
-    figure, (ax,) = subplots(7.0, 3.8)
+def _curve(result: BenchResult) -> Figure:
+    lines = []
     for name, colour in ((CPP_NAME, BLUE), (FUSED_NAME, VERMILION), (SCAN_NAME, GREEN)):
-        for precision, line in zip(PRECISIONS, ("-", "--"), strict=True):
-            points = [
-                (point["lanes"], point["lane_steps_per_second"])
-                for point in result.curve
-                if (point["name"], point["precision"]) == (name, precision)
-            ]
+        for precision, dashes in zip(PRECISIONS, ("-", "--"), strict=True):
+            points = [point for point in result.curve if (point["name"], point["precision"]) == (name, precision)]
             if points:
-                label = f"{name}, {precision}"
-                ax.plot(*zip(*points, strict=True), line, color=colour, marker="o", markersize=3, label=label)
-    ax.set_xscale("log", base=2)
-    ax.set(yscale="log", xlabel="lanes", ylabel="lane-steps per second")
-    ax.legend()
-    return Drawn(
+                x, y = ([point[key] for point in points] for key in ("lanes", "lane_steps_per_second"))
+                lines.append(Line(x, y, f"{name}, {precision}", colour, dashes=dashes, marker="o", size=3.0))
+    return Figure(
         "lanes",
-        figure,
+        [Panel(Axis("lanes", log=True), _SPEED, lines)],
         "Throughput over the number of lanes. On the left the fixed cost of a call and of a block of samples limits it, on "
         "the right caches and memory.",
     )
@@ -111,5 +110,6 @@ def throughput_lines(result: BenchResult) -> Lines:
 def write_bench_report(result: BenchResult, folder: Path) -> Lines:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_json(folder / "bench.json", asdict(result))
-    save_all(draw_throughput(result), folder)
+    for figure in draw_throughput(result):
+        save(figure, folder / "figures" / f"{figure.name}.png")
     return throughput_lines(result)

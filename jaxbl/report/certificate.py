@@ -7,7 +7,7 @@ from jaxbl.files import json_with_checksum, remove, write_atomic
 from jaxbl.json_types import JsonObject
 from jaxbl.result import ResultTable
 
-from .figures import BLUE, VERMILION, Drawn, legend_below, style, subplots
+from .panels import BLUE, VERMILION, Axis, Figure, Line, Panel, Span
 
 ASSUMPTIONS = (
     "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
@@ -111,25 +111,28 @@ def certificate_tables(summary: JsonObject) -> list[ResultTable]:
     return [table, ResultTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
 
 
-@style()
-def draw_certificates(summary: JsonObject) -> list[Drawn]:
+def draw_certificates(summary: JsonObject) -> list[Figure]:
     """The proven bound over time on each side, and the worst that was found."""
     return [_bounds(side, proof) for side, proof in _proven(summary).items()]
 
 
-def _bounds(side: str, proof: JsonObject) -> Drawn:
-    figure, (ax,) = subplots(6.6, 4.4, beside=True)
-    time, bound, start = proof["curve"]["time"], proof["curve"]["bound"], proof["reaching_time"]
+def _bounds(side: str, proof: JsonObject) -> Figure:
+    time, bound, start, worst = (
+        proof["curve"]["time"],
+        proof["curve"]["bound"],
+        proof["reaching_time"],
+        proof["search"]["worst"],
+    )
     # beyond its last point the bound stays as it is
     end = max(1.3 * start, time[-1], 20.0 * proof["assumptions"]["period"])
-    ax.step([*time, end], [*bound, bound[-1]], where="post", color=BLUE, label="proven bound")
-    ax.axhline(proof["search"]["worst"], color=VERMILION, ls="--", label="worst found, from rest")
-    ax.plot(start, proof["accuracy"], "o", ms=7, color=BLUE, label="proven from here on")
-    ax.set(xlabel="time (s)", ylabel="velocity error (rad/s)", yscale="log", title=side, xlim=(0.0, end))
-    legend_below(figure)
-    return Drawn(
-        f"certificate_{side}",
-        figure,
+    parts = [
+        Line([*time, end], [*bound, bound[-1]], "proven bound", BLUE, steps=True),
+        Span(worst, worst, "worst found, from rest", VERMILION, "y"),
+        Line([start], [proof["accuracy"]], "proven from here on", BLUE, 0.0, marker="o", size=7.0),
+    ]
+    caption = (
         f"{side}: bound of the error of the estimated velocity, whatever noise and missing acceleration do within what is "
-        f"assumed, and the worst of {proof['search']['runs']} adversarial runs.",
+        f"assumed, and the worst of {proof['search']['runs']} adversarial runs."
     )
+    panel = Panel(Axis("time (s)", ends=(0.0, end)), Axis("velocity error (rad/s)", log=True), parts, f"{side} observer")
+    return Figure(f"certificate_{side}", [panel], caption)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.colors import LogNorm, Normalize
 
 from jaxbl.config import Config, is_boolean
 from jaxbl.files import json_with_checksum, write_atomic, write_table
@@ -18,16 +17,22 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
-from .figures import COLOURS, MISSING, Axes, Drawn, Figure, Patch, colour_bar, legend_below, style, subplots, with_unit
-from .maps import axis_label, color_norm, hatch_failures, is_log, set_up_map
+from .maps import axis_of, cell_edges, colour_scale, is_log, path_words, value_label
+from .panels import BLUE, COLOURS, MISSING, Array, Axis, Dots, Figure, Line, Map, Panel, Part, Scale, Span, intervals
 
 _PANELS = 3
+_ROWS = 12
+_FEW = 0.05
+"""Share of points up to which a map of where a metric changed would be empty."""
+_EVEN = 1.1
+"""Factor within which a change is the same everywhere: a map of it would have one colour."""
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> str:
     """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
     # of an earlier comparison
-    (folder / "figures" / "comparison.png").unlink(missing_ok=True)
+    for name in ("comparison", "factors"):
+        (folder / "figures" / f"{name}.png").unlink(missing_ok=True)
     write_table(folder / "comparison.parquet", tabulate_points(comparison))
     write_atomic(folder / "study.toml", comparison.first_config.to_toml())
     write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
@@ -163,98 +168,129 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-@style()
-def draw_comparison(comparison: Comparison) -> list[Drawn]:
-    """Show where the metrics that changed most did so: a map over the last two axes, or lines over one; nothing where none
-    did, or no axis has several numbers."""
+def draw_comparison(comparison: Comparison) -> list[Figure]:
+    """The factors of the metrics that changed, and maps over the last two axes of those whose change is not the same
+    everywhere, or lines over one; nothing where none changed."""
     changes = sorted((change for change in comparison.metrics if change.count), key=lambda change: not change.better)
-    changes = changes[:_PANELS]
     if not changes:
         return []
-    config, frames = comparison.first_config, [comparison.frame(change.metric) for change in changes]
-    varied = [path for path in comparison.axes if frames[0][path].nunique() > 1]
+    config, frames = comparison.first_config, {change.metric: comparison.frame(change.metric) for change in changes}
+    figures = _factors(frames)
+    frame = next(iter(frames.values()))
+    varied = [path for path in comparison.axes if frame[path].nunique() > 1]
     # of axes that advance together one is enough
     labels = {path: path for path in varied} | {axis.path: axis.zip or axis.path for axis in config.axes}
-    numbers = [path for path in varied if pd.api.types.is_numeric_dtype(frames[0][path])]
+    numbers = [path for path in varied if pd.api.types.is_numeric_dtype(frame[path])]
     axes = list({labels[path]: path for path in reversed(numbers)}.values())[1::-1]
     if not axes:
-        return []
-    is_map = len(axes) > 1
-    size = (4.4 * len(changes), 3.8) if is_map else (4.2 * len(changes), 3.4)
-    figure, panels = subplots(*size, columns=len(changes), beside=True)
-    for ax, change, frame in zip(panels, changes, frames, strict=True):
-        if is_map:
-            _map(figure, ax, config, change, frame, axes)
-        else:
-            _line(ax, config, frame, axes[0])
-        ax.set_title(with_unit(change.metric, "" if is_map else find_metric(change.metric).unit))
-    beyond = _noise_name(comparison)
+        return figures
+    is_map, beyond = len(axes) > 1, _noise_name(comparison)
     drawn = {labels[path] for path in axes}
-    averaged = ", ".join(path for path in varied if labels[path] not in drawn)
+    words = [path_words(config, path) for path in axes]
+    averaged = ", ".join(path_words(config, path) for path in varied if labels[path] not in drawn)
     averaged = f", median over {averaged}" if averaged else ""
     if is_map:
-        legend_below(figure, [Patch(facecolor="white", edgecolor="black", hatch="//", label=f"within {beyond}")], 1)
+        uneven = [
+            change
+            for change in changes
+            if change.count > _FEW * change.points and _spread(frames[change.metric], change.metric) > _EVEN
+        ]
+        panels = [_map(config, change, frames[change.metric], axes, beyond) for change in uneven[:_PANELS]]
         caption = (
             "Factor from the first study to the second (of what is true or false, difference of the share) over "
-            f"{axes[1]} and {axes[0]}{averaged}; hatched: at most half of the points differ by more than {beyond}."
+            f"{words[1]} and {words[0]}{averaged}; grey: at most half of the points differ by more than {beyond}."
         )
     else:
-        panels[-1].legend()
-        caption = f"Both studies over {axes[0]}{averaged}; where there are points, they differ by more than {beyond}."
-    return [Drawn("comparison", figure, caption)]
+        panels = [_line(config, change.metric, frames[change.metric], axes[0]) for change in changes[:_PANELS]]
+        caption = f"Both studies over {words[0]}{averaged}; where there are points, they differ by more than {beyond}."
+    columns = len(panels)
+    return figures + [Figure("comparison", panels, caption, columns, max(3.9 * columns, 5.0), 3.2)] * bool(panels)
 
 
-def _map(figure: Figure, ax: Axes, config: Config, metric: MetricChange, frame: pd.DataFrame, axes: list[str]) -> None:
-    """Factors over two axes."""
-    y, x = axes
-    boolean = is_boolean(metric.metric)
+def _change(frame: pd.DataFrame, metric: str) -> Any:
+    """The factor at each point, NaN where there is none; of what is true or false the difference."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = frame["second"] - frame["first"] if boolean else frame["second"] / frame["first"]
-    change = change.replace([np.inf] if boolean else [np.inf, 0.0], np.nan)
+        change = frame["second"] - frame["first"] if is_boolean(metric) else frame["second"] / frame["first"]
+    return change.replace([np.inf] if is_boolean(metric) else [np.inf, 0.0], np.nan)
+
+
+def _spread(frame: pd.DataFrame, metric: str) -> float:
+    """The factor between large and small changes of a metric; of what is true or false, infinitely many."""
+    if is_boolean(metric):
+        return math.inf
+    low, high = _change(frame, metric).quantile([0.05, 0.95])
+    return high / low
+
+
+def _factors(frames: dict[str, pd.DataFrame]) -> list[Figure]:
+    """Median and spread of the factor of each metric that has one."""
+    rows = {
+        value_label(metric): change.quantile([0.05, 0.5, 0.95])
+        for metric, frame in list(frames.items())[:_ROWS]
+        if not is_boolean(metric) and (change := _change(frame, metric)).gt(0.0).any()
+    }
+    if not rows:
+        return []
+    places = list(range(len(rows)))
+    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(places, *zip(*rows.values(), strict=True), colour=BLUE)]
+    y = Axis(ends=(len(rows) - 0.5, -0.5), names=tuple(enumerate(rows)))
+    caption = "Factor from the first study to the second: median of all points, and the range of nine in ten."
+    x = Axis("factor from the first study to the second", log=True)
+    return [Figure("factors", [Panel(x, y, parts)], caption, height=0.9 + 0.3 * len(rows))]
+
+
+def _map(config: Config, metric: MetricChange, frame: pd.DataFrame, axes: list[str], beyond: str) -> Panel:
+    """Factors over two axes."""
+    boolean = is_boolean(metric.metric)
+    change = _change(frame, metric.metric)
     places = frame[axes].assign(change=change, differs=frame["differs"].astype(float)).groupby(axes, sort=True)
     table, share = places["change"].median(), places["differs"].mean()
     values = table.to_numpy(float)
-    norm, colours = _norm(values, boolean), "RdBu_r" if metric.better != "more" else "RdBu"
-    centres = [np.unique(frame[path].to_numpy(float)) for path in (x, y)]
-    logs = [_is_drawn_log(config, *axis) for axis in zip((x, y), centres, strict=True)]
-    cells = set_up_map(ax, centres, logs)
-    if 2 * len(table) > len(centres[0]) * len(centres[1]):
-        ax.pcolormesh(*cells.edges, table.unstack().to_numpy(float), cmap=colours, norm=norm, rasterized=True)
-        hatch_failures(ax, cells, share.unstack().fillna(1.0).to_numpy(float), "", colour="black")
+    scale = _scale(values, boolean, "RdBu_r" if metric.better != "more" else "RdBu")
+    y, x = (np.unique(frame[path].to_numpy(float)) for path in axes)
+    drawn = [
+        axis_of(config, path, numbers, _is_drawn_log(config, path, numbers))
+        for path, numbers in zip(axes[::-1], (x, y), strict=True)
+    ]
+    name = f"within {beyond}"
+    if 2 * len(table) > len(x) * len(y):
+        across, up = (cell_edges(numbers, axis.log) for numbers, axis in zip((x, y), drawn, strict=True))
+        same = share.unstack().fillna(1.0).to_numpy(float) <= 0.5
+        parts: list[Part] = [Map(across, up, table.unstack().to_numpy(float), scale, same, name)]
     else:
         # points of a design, or of a refined study
         points, far = table.reset_index(), share.to_numpy() > 0.5
-        ax.plot(points.loc[~far, x], points.loc[~far, y], ".", ms=3, color=MISSING)
-        ax.scatter(points.loc[far, x], points.loc[far, y], c=values[far], cmap=colours, norm=norm, s=14)
-    ax.set(xlabel=axis_label(config, x), ylabel=axis_label(config, y))
-    colour_bar(figure, ax, norm, colours=colours)
+        near, differing = points[~far], points[far]
+        parts = [
+            Line(near[axes[1]], near[axes[0]], name, MISSING, 0.0, marker=".", size=3.0),
+            Dots(differing[axes[1]], differing[axes[0]], values[far], scale),
+        ]
+    return Panel(*drawn, parts, metric.metric)
 
 
-def _norm(values: np.ndarray, boolean: bool) -> Normalize:
+def _scale(values: Array, boolean: bool, colours: str) -> Scale:
     """Colours about no change."""
     finite = values[np.isfinite(values)]
     if boolean:
         most = max(float(np.abs(finite).max(initial=0.0)), 1e-3)
-        return Normalize(-most, most)
-    most = max(math.exp(min(float(np.abs(np.log(finite)).max(initial=0.0)), 100.0)), 1.0 + 1e-6)
-    return LogNorm(1.0 / most, most)
+        return Scale(-most, most, "difference of the share", colours=colours)
+    # a few extremes would leave no colour for all else
+    sizes = np.abs(np.log(finite[finite > 0.0])) if finite.size else np.zeros(1)
+    most = max(math.exp(min(float(np.quantile(sizes, 0.98)), 100.0)), 1.0 + 1e-6)
+    return Scale(1.0 / most, most, "factor", True, colours)
 
 
-def _line(ax: Axes, config: Config, frame: pd.DataFrame, path: str) -> None:
+def _line(config: Config, metric: str, frame: pd.DataFrame, path: str) -> Panel:
     """Both studies over one axis."""
     groups = frame.groupby(path, sort=True)
-    medians = groups[["first", "second"]].median()
-    x = medians.index.to_numpy(float)
-    far = groups["differs"].any().to_numpy(bool)
+    medians, far = groups[["first", "second"]].median(), groups["differs"].any().to_numpy(bool)
+    x, parts = medians.index.to_numpy(float), list[Part]()
     for name, colour in zip(medians, COLOURS, strict=False):
-        ax.plot(x, medians[name], "-", color=colour, label=name)
-        ax.plot(x[far], medians.loc[far, name], "o", ms=4, color=colour)
-    ax.set(xlabel=axis_label(config, path))
-    if _is_drawn_log(config, path, x):
-        ax.set_xscale("log")
-    if isinstance(color_norm(medians.to_numpy(float), "auto"), LogNorm):
-        ax.set_yscale("log")
+        values = medians[name].to_numpy(float)
+        parts += [Line(x, values, name, colour), Line(x[far], values[far], colour=colour, width=0.0, marker="o", size=4.0)]
+    scale = colour_scale(medians.to_numpy(float), value_label(metric))
+    return Panel(axis_of(config, path, x, _is_drawn_log(config, path, x)), Axis(scale.label, metric, scale.log), parts)
 
 
-def _is_drawn_log(config: Config, path: str, values: np.ndarray) -> bool:
+def _is_drawn_log(config: Config, path: str, values: Array) -> bool:
     return any(axis.path == path for axis in config.axes) and is_log(config, path, values)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
@@ -14,28 +13,28 @@ from jaxbl.lines import DOUBT, Lines
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .figures import (
-    BLACK,
+from .motor_alone_figures import draw_motor_alone
+from .numbers import lead_with_doubt, number_table, percent, write_fit
+from .panels import (
     BLUE,
     FAINT,
     MISSING,
     ORANGE,
     VERMILION,
-    Drawn,
-    decades,
-    draw_zero,
-    legend,
+    ZERO,
+    Axis,
+    Band,
+    Bars,
+    Figure,
+    Line,
+    Panel,
+    Span,
     missing_label,
     missing_quantity,
-    stacked,
-    style,
-    subplots,
+    stack,
     with_unit,
-    write_inside,
 )
-from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_table, percent, write_fit
-from .residuals import draw_residuals, plot_torque
+from .residuals import draw_residuals, torque_parts
 
 _BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
@@ -394,8 +393,7 @@ def _number_table(summary: JsonObject) -> ResultTable:
     return number_table("Parameters of the model", read_quantities(summary["parameters"]))
 
 
-@style()
-def draw_diagnosis(diagnosis: Diagnosis) -> list[Drawn]:
+def draw_diagnosis(diagnosis: Diagnosis) -> list[Figure]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
         return [_draw_gap(diagnosis.summary), *draw_motor_alone(diagnosis)]
@@ -405,115 +403,97 @@ def draw_diagnosis(diagnosis: Diagnosis) -> list[Drawn]:
     return [_over_time(diagnosis), _draw_gap(diagnosis.summary), *tables, *residuals]
 
 
-def _tables(found: Diagnosis) -> Drawn:
+def _tables(diagnosis: Diagnosis) -> Figure:
     """Torques without a name, over position and speed, with their standard errors."""
-    sides = found.summary["torque_tables"]["tables"]
-    panels = [(side, table) for side, tables in sides.items() for table in tables]
-    figure, axes = subplots(11.0, 3.6, columns=len(panels))
-    for ax, (side, table) in zip(axes, panels, strict=True):
-        kind = "velocity" if table["over"] == "speed" else "position"
-        points, torques, errors = (np.array(table[key]) for key in ("points", "torques", "errors"))
-        ax.fill_between(points, torques - 2.0 * errors, torques + 2.0 * errors, color=FAINT, alpha=0.35, lw=0.0)
-        ax.plot(points, torques, "o-", color=_AFTER, ms=4, lw=1.4)
-        draw_zero(ax)
-        unit = found.record.unit_of(f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
-        force = found.record.unit_of(f"{side}.torque", "N m")
-        ax.set(
-            xlabel=with_unit(f"{side} {_OVER[table['over']]}", unit),
-            ylabel=with_unit(f"{side}: resisting {missing_quantity(force)}", force),
-        )
+    panels = []
+    for side, tables in diagnosis.summary["torque_tables"]["tables"].items():
+        force = diagnosis.record.unit_of(f"{side}.torque", "N m")
+        for table in tables:
+            kind = "velocity" if table["over"] == "speed" else "position"
+            points, torques, errors = (np.array(table[key]) for key in ("points", "torques", "errors"))
+            unit = diagnosis.record.unit_of(f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
+            band = Band(points, torques - 2.0 * errors, torques + 2.0 * errors, "", FAINT, 0.35)
+            x = Axis(with_unit(f"{side} {_OVER[table['over']]}", unit))
+            y = Axis(with_unit(f"{side}: resisting {missing_quantity(force)}", force))
+            panels.append(Panel(x, y, [ZERO, band, Line(points, torques, colour=_AFTER, marker="o", size=4.0)]))
     caption = (
         "What none of the known effects explains, as tables in model.toml: the torque that resists motion "
         "beside the named effects. Band: two standard errors. Held-out data are predicted better with it."
     )
-    return Drawn("torque_tables", figure, caption)
+    return Figure("torque_tables", panels, caption, len(panels), max(3.4 * len(panels), 5.0))
 
 
-def _draw_gap(summary: JsonObject) -> Drawn:
+def _draw_gap(summary: JsonObject) -> Figure:
     """Each channel's error over its noise, before and after, with the control; and the probability of each effect."""
     gap, candidates = summary["gap"], _candidates(summary)
-    height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.9, 0.42 * len(candidates) + 1.9)
-    figure, (left, right) = subplots(11.0, height, columns=2, width_ratios=[2.3, 1.0])
-    _gap_panel(left, gap)
-    _chances_panel(right, candidates)
+    height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.2, 0.42 * len(candidates) + 1.2)
     caption = (
-        f"{_verdict(summary)[1]} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
-        "as given to the model with the missing effects. Black line: noise; bars: the most that noise, the uncertainty of "
-        "the numbers and torques too small to be named leave of a complete model. Control, which must do worse: "
+        f"{_verdict(summary)[1]} Left: rms error on held-out data over the channel's noise; lines lead from the model "
+        "as given to the model with the missing effects. Black line: noise; strokes: the most that noise, the uncertainty "
+        "of the numbers and torques too small to be named leave of a complete model. Control, which must do worse: "
         "another effect at its best. Right: probability of each effect, and of those "
         "that this log does not rule out instead."
     )
-    return Drawn("gap", figure, caption)
+    panels = [_gap_panel(gap), _chances_panel(candidates)]
+    return Figure("gap", panels, caption, 2, 10.4, height, widths=(2.0, 1.0))
 
 
-def _gap_panel(ax: Axes, gap: JsonObject) -> None:
+def _gap_panel(gap: JsonObject) -> Panel:
     names = list(gap["holdout_rmse_before"])
-    floor = np.array([gap["noise_floor"][name] for name in names])
+    floor, rows = np.array([gap["noise_floor"][name] for name in names]), np.arange(len(names))
 
     def over(errors: Mapping[str, float | None]) -> np.ndarray:
         return np.array([errors.get(name) for name in names], float) / floor
 
-    rows = np.arange(len(names))
-    before, after = over(gap["holdout_rmse_before"]), over(gap["holdout_rmse_after"])
-    for row, start, stop in zip(rows, before, after, strict=True):
-        # an arrow for a change of less than 25 % would be shorter than its head
-        if np.isfinite([start, stop]).all() and abs(np.log(start / stop)) > 0.25:
-            ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.2})
-    ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
-    ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
-    ax.axvline(1.0, color=BLACK, lw=1.6, label="noise")
-    limits = over(_limits(gap))
-    ax.plot(limits, rows, "|", color=BLACK, ms=16, mew=2.0, ls="none", label="a complete model at most", zorder=3)
-    points = [before, after, limits]
+    before, after, most = map(over, (gap["holdout_rmse_before"], gap["holdout_rmse_after"], _limits(gap)))
+    ways = np.stack([before, after, np.full(len(names), np.nan)], axis=1).ravel()
+    parts = [
+        Line(ways, np.repeat(rows, 3), colour=FAINT, width=1.2),
+        Line(before, rows, "before", _BEFORE, 0.0, marker="D", size=7.0),
+        Line(after, rows, "after", _AFTER, 0.0, marker="o", size=7.0),
+        Span(1.0, 1.0, "noise", width=1.6, dashes="-"),
+        Line(most, rows, "a complete model at most", width=0.0, marker="|", size=16.0),
+    ]
+    values = [before, after, most]
     if control := gap["controls"].get("wrong"):
-        points.append(over(control["rmse"]))
-        ax.plot(points[-1], rows + 0.24, "x", color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {control['effect']}")
-    values = np.concatenate(points)
-    values = values[np.isfinite(values) & (values > 0.0)]
-    ax.set(
-        xscale="log",
-        xlim=(0.5 * min(float(values.min(initial=1.0)), 1.0), 2.0 * max(float(values.max(initial=1.0)), 3.0)),
-        ylim=(len(names) - 0.4, -0.6),
-        xlabel="rms error on held-out data over noise",
-    )
-    decades(ax, "x")
+        values.append(over(control["rmse"]))
+        parts.append(Line(values[-1], rows + 0.24, f"control: {control['effect']}", FAINT, 0.0, marker="x", size=7.0))
+    drawn = np.concatenate(values)
+    drawn = drawn[np.isfinite(drawn) & (drawn > 0.0)]
+    ends = 0.5 * min(float(drawn.min(initial=1.0)), 1.0), 2.0 * max(float(drawn.max(initial=1.0)), 3.0)
     labels = [
         f"{_CHANNELS[name]}\n{rms_text(start)} → {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]}"
         for name, start in gap["holdout_rmse_before"].items()
     ]
-    ax.set_yticks(rows, labels, fontsize=9)
-    legend(ax, 3, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2)
+    y = Axis(ends=(len(names) - 0.4, -0.6), names=tuple(enumerate(labels)))
+    return Panel(Axis("rms error on held-out data over noise", log=True, ends=ends), y, parts)
 
 
-def _chances_panel(ax: Axes, candidates: list[tuple[str, JsonObject, bool]]) -> None:
-    ax.set(xlim=(0.0, 1.0), xlabel="confidence", yticks=[])
-    if not candidates:
-        write_inside(ax, "no effect named", va="center", color=FAINT)
-        return
-    for row, (name, effect, is_found) in enumerate(candidates):
-        chance = effect["confidence"]
-        ax.barh(row, chance, 0.3, color=_AFTER if is_found else MISSING)
-        ax.text(0.0, row - 0.22, f" {name}: {probability(chance)}", ha="left", va="bottom", fontsize=9)
-    ax.set_ylim(max(len(candidates), 3) - 0.4, -0.8)
-    ax.grid(visible=False, axis="y")
+def _chances_panel(candidates: list[tuple[str, JsonObject, bool]]) -> Panel:
+    bars = [
+        Bars([row], [effect["confidence"]], colour=_AFTER if is_found else MISSING, thickness=0.3)
+        for row, (_, effect, is_found) in enumerate(candidates)
+    ]
+    texts = [f"{name}: {probability(effect['confidence'])}" for name, effect, _ in candidates]
+    names = Line([0.0] * len(texts), np.arange(len(texts)) - 0.36, width=0.0, marker=" ", texts=texts)
+    y = Axis(ends=(max(len(candidates), 3) - 0.4, -0.8), names=((-9.0, ""),))
+    return Panel(Axis("confidence", ends=(0.0, 1.0)), y, [*bars, names], note="" if candidates else "no effect named")
 
 
-def _over_time(found: Diagnosis) -> Drawn:
+def _over_time(diagnosis: Diagnosis) -> Figure:
     """Missing torque of each side, before and after."""
-    figure, axes = stacked(len(found.pairs), 2.4)
-    for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
-        unit = found.record.unit_of(f"{side}.torque", "N m")
-        bandwidth = found.located[side].bandwidth
+    panels = []
+    for side, pieces in diagnosis.pairs.items():
+        unit, bandwidth, parts = diagnosis.record.unit_of(f"{side}.torque", "N m"), diagnosis.located[side].bandwidth, []
         for before, after, held in pieces:
-            plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=2.6, alpha=0.6, label="before")
-            plot_torque(ax, after, bandwidth, color=_AFTER, lw=0.9, label="after")
             if held and not all(other for _, _, other in pieces):
-                ax.axvspan(before.time[0], before.time[-1], color=ORANGE, alpha=0.18, lw=0.0, zorder=0, label="held out")
-        ax.set_ylabel(missing_label(f"{side}:\n", unit))
-        legend(ax, 4)
-    lead = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
+                parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
+            parts += torque_parts(before, bandwidth, "before", noise=False, colour=_BEFORE, width=2.6, opacity=0.6)
+            parts += torque_parts(after, bandwidth, "after", colour=_AFTER, width=0.9)
+        panels.append(Panel(Axis("time (s)"), Axis(missing_label(f"{side}:\n", unit)), parts))
+    lead = f"Held-out log {diagnosis.holdout.path.name}: t" if diagnosis.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
         f"{lead}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
         "most clearly. A complete model stays within the grey band."
     )
-    return Drawn("before_after", figure, caption)
+    return stack("before_after", panels, caption, 2.4)

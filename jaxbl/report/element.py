@@ -10,11 +10,8 @@ from jaxbl.lines import Lines
 from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
-from .figures import BLUE, FAINT, ORANGE, Drawn, legend, outline, stacked, style, subplots
 from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
-
-_POINTS = 6000
-"""Points of a cloud: a page is about 1000 pixels wide."""
+from .panels import BLUE, ORANGE, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
 
 
 def write_element(result: ElementIdentification, folder: Path) -> str:
@@ -56,29 +53,22 @@ def _size(error: JsonObject, unit: str) -> str:
     return f"{error['rms']:.3g} {unit} rms, {percent(error['relative'])} of the torque"
 
 
-@style()
-def draw_element(result: ElementIdentification) -> list[Drawn]:
+def draw_element(result: ElementIdentification) -> list[Figure]:
     """All figures of a transmission on a test rig."""
-    trace, record = result.trace, result.task.record
-    channels = record.statistics.channels
-    unit, torque_unit = channels["theta_e"].unit, channels["u"].unit
+    trace, record, numbers = result.trace, result.task.record, result.element.numbers
+    unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
     time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
-    points = slice(None, None, max(len(x) // _POINTS, 1))
-    figure, (ax,) = subplots(7.0, 4.2)
-    ax.plot(x[points], u[points], ".", ms=2.0, color=FAINT, alpha=0.6, label="measured")
-    ax.plot(x[points], fitted[points], ".", ms=1.2, color=BLUE, label="found")
-    numbers = result.element.numbers
+    parts: list[Part] = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
     if "half_gap" in numbers:
         middle, half = numbers["centre"].value, numbers["half_gap"].value
-        ax.axvspan(middle - half, middle + half, color=ORANGE, alpha=0.2, lw=0.0, label="gap")
-    quantity = "torque" if unit == "rad" else "force"
-    ax.set(xlabel=f"displacement ({unit})", ylabel=f"{quantity} ({torque_unit})")
-    legend(ax, 3, markerscale=4)
-    drawn = [Drawn("loop", figure, "Torque over displacement: as measured, and of the transmission that was found.")]
-    figure, axes = stacked(2, 1.8)
-    for ax, values, label in zip(axes, (u, u - fitted), ("torque", "not explained"), strict=True):
-        for part in record.segments:
-            samples = part.start + outline(values[part])
-            ax.plot(time[samples], values[samples], color=BLUE, lw=0.9)
-        ax.set_ylabel(f"{label}\n({torque_unit})")
-    return [*drawn, Drawn("residual", figure, "The torque over time, and what of it is not explained.")]
+        parts.append(Span(middle - half, middle + half, "gap", ORANGE))
+    loop = Panel(Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})"), parts)
+    time, *signals = join(time, record.segments, u, u - fitted)
+    panels = [
+        Panel(Axis("time (s)"), Axis(f"{label}\n({torque_unit})"), [Line(time, signal, colour=BLUE, width=0.9)])
+        for signal, label in zip(signals, ("torque", "not explained"), strict=True)
+    ]
+    return [
+        Figure("loop", [loop], "Torque over displacement: as measured, and of the transmission that was found."),
+        stack("residual", panels, "The torque over time, and what of it is not explained."),
+    ]

@@ -1,7 +1,7 @@
 """The error of an observer in its phase plane with the majorant curve of the proof: the paper's Fig. 29."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pandas import DataFrame
@@ -9,9 +9,7 @@ from pandas import DataFrame
 from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
 from jaxbl.json_types import JsonObject
 
-from .figures import BLACK, VERMILION, Axes, Drawn, arrange, legend, literal, style, subplots, write_inside
-
-Array = np.ndarray
+from .panels import VERMILION, Array, Axis, Figure, Line, Panel, Part, arrange, cloud, literal
 
 _MOST_PEAKS = 40
 """Half cycles of the error that are drawn."""
@@ -55,8 +53,7 @@ def error_path(trace: DataFrame, side: str, judged: JsonObject) -> ErrorPath:
     return ErrorPath(error[drawn], slope[drawn], peaks, ratio, curve)
 
 
-@style()
-def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Drawn:
+def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Figure:
     """The error of an observer in its phase plane, and its peaks, beside the majorant of the proof.
 
     Args:
@@ -66,46 +63,42 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Drawn:
     """
     error, slope, peaks, ratio, curve = error_path(trace, side, judged)
     lambda_, alpha, bound = (judged[name] for name in ("lambda", "alpha", "f_plus"))
-    figure, (left, right) = subplots(8.0, 3.8, columns=2)
-    left.plot(error, slope, color=VERMILION, lw=1.2, label="error")
+    # a path that noise tangles would fill the plane: its points let the majorant be seen
+    path = Line(error, slope, "error", VERMILION, 1.2) if len(peaks) > 1 else cloud(error, slope, "error", opacity=0.25)
+    left, right, axis = [path], [], Axis("peak of |ė| (rad/s)")
     peaks = np.abs(peaks)
-    ratios = peaks[1:] / peaks[:-1]
-    text = f"ratio {np.median(ratios):.3g} (median)" if len(ratios) else "no two peaks beyond the chatter"
-    right.plot(peaks, "o", ms=4, color=VERMILION, label=f"run: {text}")
+    if len(peaks):
+        ratios = peaks[1:] / peaks[:-1]
+        name = f"run: ratio {np.median(ratios):.3g} (median)" if len(ratios) else "run: no two peaks beyond the chatter"
+        right.append(Line(np.arange(len(peaks)), peaks, name, VERMILION, 0.0, marker="o", size=4.0))
+        axis = axis._replace(log=True, ends=(0.5 * peaks.min(), 3.0 * peaks.max()))
     if len(curve[0]):
-        left.plot(*curve, color=BLACK, lw=1.0, label="majorant (36)")
+        left.append(Line(*curve, "majorant (36)", width=1.0))
         count = np.arange(max(len(peaks), 2))
-        for label, factor, dashes in (("majorant (37)", ratio, "-"), ("exact worst case", judged["peak_ratio"], "--")):
+        for name, factor, dashes in (("majorant (37)", ratio, "-"), ("exact worst case", judged["peak_ratio"], "--")):
             # a worst case that ends at once has no second peak
             if factor:
-                label += f": ratio {factor:.3g}"
-                right.plot(peaks[0] * factor**count, dashes, color=BLACK, lw=1.0, label=label, scaley=False)
-    if not len(peaks):
-        write_inside(right, "no peak stands out\nfrom the chatter", va="center")
-        right.set(xticks=[], yticks=[])
-    else:
-        right.set(yscale="log", ylim=(0.5 * peaks.min(), 3.0 * peaks.max()))
-        legend(right)
-    _set_limits(left, (error, slope), curve)
-    left.set(xlabel="position error e (rad)", ylabel="its slope ė (rad/s)")
-    right.set(xlabel="half cycle", ylabel="peak of |ė| (rad/s)")
-    left.locator_params(axis="x", nbins=5)
-    legend(left)
+                right.append(Line(count, peaks[0] * factor**count, f"{name}: ratio {factor:.3g}", width=1.0, dashes=dashes))
+    plane = _plane(("position error e (rad)", "its slope ė (rad/s)"), left, (error, slope), curve)
+    note = "" if len(peaks) else "no peak stands out\nfrom the chatter"
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
-    return Drawn(
+    return Figure(
         f"error_plane_{side}",
-        figure,
+        [plane, Panel(Axis("half cycle"), axis, right, note=note)],
         f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane, and its "
         f"velocity peaks (analogue of Fig. 29). The majorant of the proof is for the worst disturbance within "
         f"f⁺ = {bound:.3g} rad/s², without friction; a ratio below 1 proves convergence.{reason}",
+        columns=2,
     )
 
 
-def _set_limits(ax: Axes, path: Any, curve: Any) -> None:
-    """Ends of the plane, from x and y of the error and of its majorant."""
-    for axis, *values in zip("xy", path, curve, strict=True):
-        if reach := plane_reach(*values):
-            ax.set(**{f"{axis}lim": (-reach, reach)})
+def _plane(
+    labels: Sequence[str], parts: Sequence[Part], path: Sequence[Array], curve: Sequence[Array], title: str = ""
+) -> Panel:
+    """A phase plane that goes as far as an error and, unless that is far outside, its majorant."""
+    reaches = [plane_reach(*values) for values in zip(path, curve, strict=True)]
+    x, y = (Axis(label, ends=(-reach, reach) if reach else None) for label, reach in zip(labels, reaches, strict=True))
+    return Panel(x, y, parts, title)
 
 
 def plane_reach(error: Array, majorant: Array) -> float:
@@ -122,35 +115,24 @@ _TURNS = 6
 """Half cycles of a path that ends."""
 
 
-@style()
-def draw_worst_planes(marks: Sequence[JsonObject]) -> Drawn | None:
+def draw_worst_planes(marks: Sequence[JsonObject]) -> list[Figure]:
     """The worst path of the error and the majorant of the proof for marked gains (`marks` of a verdict), normalised so that
-    f⁺ and the first peak are 1; None where no alpha is above f⁺."""
-    marks = [mark for mark in marks if (mark["alpha_ratio"] or 0.0) > 1.0 and mark["lambda_ratio"] > 0.0][:_MOST_PLANES]
-    if not marks:
-        return None
-    rows, columns = arrange(len(marks))
-    figure, axes = subplots(3.2 * columns + 0.4, 3.6 * rows, rows, columns)
-    for ax in axes[len(marks) :]:
-        ax.set_visible(False)
-    for ax, mark in zip(axes, marks, strict=False):
-        gains = mark["lambda_ratio"], mark["alpha_ratio"], 1.0
+    f⁺ and the first peak are 1; nothing where no alpha is above f⁺."""
+    panels = []
+    for mark in [mark for mark in marks if (mark["alpha_ratio"] or 0.0) > 1.0 and mark["lambda_ratio"] > 0.0][:_MOST_PLANES]:
+        gains, ratio = (mark["lambda_ratio"], mark["alpha_ratio"], 1.0), mark["peak_ratio"]
         x, y = worst_half_cycle(*gains)
-        ratio = mark["peak_ratio"]
         sizes = (-ratio) ** np.arange(_TURNS if ratio < 1.0 else 2)[:, None]
-        path = (np.sign(sizes) * sizes**2 * x).ravel(), (sizes * y).ravel()
-        ax.plot(*path, color=VERMILION, lw=1.4, label=f"worst disturbance: ratio {ratio:.3g}")
-        curve = majorant(1.0, *gains)
-        ax.plot(*curve, color=BLACK, lw=1.0, label=f"majorant: ratio {-curve[1][101]:.3g}")
-        _set_limits(ax, path, curve)
-        ax.locator_params(axis="x", nbins=4)
-        ax.set(xlabel="e f⁺ / ė₀²", ylabel="ė / ė₀")
-        ax.set_title(literal(mark["name"]), loc="left", pad=34)
-        legend(ax)
-    return Drawn(
-        "error_planes",
-        figure,
+        path, curve = ((np.sign(sizes) * sizes**2 * x).ravel(), (sizes * y).ravel()), majorant(1.0, *gains)
+        lines = [
+            Line(*path, f"worst disturbance: ratio {ratio:.3g}", VERMILION),
+            Line(*curve, f"majorant: ratio {-curve[1][101]:.3g}", width=1.0),
+        ]
+        panels.append(_plane(("e f⁺ / ė₀²", "ė / ė₀"), lines, path, curve, literal(mark["name"])))
+    caption = (
         "Error of the marked gains in the phase plane, without friction, from a velocity error ė₀: under its worst "
         "disturbance within f⁺, and the majorant of the proof (36)-(37) (cf. Fig. 29). A ratio of successive peaks below 1 "
-        "means convergence in finite time.",
+        "means convergence in finite time."
     )
+    columns = arrange(len(panels))
+    return [Figure("error_planes", panels, caption, columns, 3.2 * columns + 0.4)] * bool(panels)

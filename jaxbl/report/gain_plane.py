@@ -1,38 +1,63 @@
 """Gains of an observer against the gain conditions, in the units of a user's drive: the atlas of `verify` at one f⁺."""
 
-from typing import Any
+from collections.abc import Mapping
 
+import jax
 import numpy as np
-from matplotlib.ticker import LogLocator, NullFormatter
 
+from jaxbl.gains.gain_search import usual_rule
 from jaxbl.json_types import JsonObject
-from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.observer.conditions import CONDITIONS, Condition
+from jaxbl.sweeps.elementwise import apply_elementwise
 
-from .figures import MISSING, Axes, Drawn, Patch, legend_below, mark, style, subplots
-from .maps import condition_curves
+from .panels import MISSING, Array, Axis, Band, Figure, Line, Pair, Panel, mark
+
+EXACT = {"exact": CONDITIONS["exact"]}
+_LOOKS = {
+    "davila_fridman": ("-", "#FF5FA2"),
+    "levant": ("-.", "#FF9E4A"),
+    "seeber_horn": ("--", "#7FDBFF"),
+    "moreno_osorio": ("-.", "#B6F09C"),
+    "exact": ("-", "#FFD400"),
+}
+"""Dashes and colour of each gain condition's curve."""
 
 
-def name_gains(ax: Axes, bound: float) -> None:
-    """Name axes, whose limits are set, of alpha (rad/s²) along x and lambda (√rad/s) along y; on the other sides stand α /
-    f⁺ and λ / √f⁺."""
-    ax.set(xscale="log", yscale="log", xlabel="α (rad/s²)", ylabel="λ (√rad/s)")
-    name_ratio(ax, "x", bound, "α / f⁺")
-    name_ratio(ax, "y", np.sqrt(bound), "λ / √f⁺")
+def least_lambdas(condition: Condition, alphas: Array, bound: float) -> Array:
+    """The least lambda of a condition at each alpha, for one f_plus."""
+    with jax.enable_x64(True):
+        return apply_elementwise(condition.least_lambda, [alphas, np.full_like(alphas, bound)])
 
 
-def name_ratio(ax: Axes, axis_name: str, unit: float, label: str) -> None:
-    """A second axis on the top (`which` x) or on the right (y), which counts in a unit; both are logarithmic."""
-    functions = (lambda value: value / unit, lambda ratio: ratio * unit)
-    if axis_name == "x":
-        axes = ax.xaxis, ax.secondary_xaxis("top", functions=functions).xaxis
-    else:
-        axes = ax.yaxis, ax.secondary_yaxis("right", functions=functions).yaxis
-    axes[1].set_label_text(label)
-    low, high = axes[0].get_view_interval()
-    for axis in axes:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
+def condition_curves(conditions: Mapping[str, Condition], bound: float, alphas: Pair, alpha_is_x: bool = True) -> list[Line]:
+    """Curves of the least lambda of gain conditions over a range of alpha, for one f_plus."""
+    low, high = max(alphas[0], bound * 1.0001), alphas[1]
+    fine = np.geomspace(low, high, 400) if high > low else np.array([])
+    curves = []
+    for name, condition in conditions.items():
+        x, y = fine, least_lambdas(condition, fine, bound) if fine.size else fine
+        if not alpha_is_x:
+            x, y = y, x
+        dashes, colour = _LOOKS[name]
+        # named where it is drawn; a dark line beneath parts it from any colour
+        curves.append(Line(x, y, colour="#222222", width=3.4))
+        curves.append(Line(x, y, condition.title, colour, 2.0, dashes, at_line=True))
+    return curves
+
+
+def usual_rule_curve(bound: float, alphas: Pair) -> Line:
+    """The usual rule's gains for each f_plus from `bound` on, as far as alpha goes."""
+    bounds = np.geomspace(bound, max(alphas[1] / usual_rule(1.0)[1], bound), 100)
+    lambdas, curve_alphas = zip(*map(usual_rule, bounds), strict=True)
+    return Line(curve_alphas, lambdas, "usual rule", "#FF9E4A", 2.0, "--", at_line=True)
+
+
+def gain_axes(bound: float, alphas: Pair, lambdas: Pair) -> tuple[Axis, Axis]:
+    """Axes of alpha (rad/s²) along x and lambda (√rad/s) along y; on the other sides stand α / f⁺ and λ / √f⁺."""
+    return (
+        Axis("α, switching gain (rad/s²)", log=True, ends=alphas, ratio=(bound, "α / f⁺")),
+        Axis("λ, correction gain (√rad/s)", log=True, ends=lambdas, ratio=(float(np.sqrt(bound)), "λ / √f⁺")),
+    )
 
 
 _GAINS = "lambda", "alpha", "f_plus", "largest_f_plus"
@@ -55,9 +80,8 @@ def conditions_line(side: str, judged: JsonObject, source: str) -> str:
     )
 
 
-@style()
-def draw_gain_plane(side: str, judged: JsonObject) -> Drawn:
-    """The plane of gains with all conditions at one f⁺ > 0, and where the gains lie in it.
+def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
+    """The plane of gains with the exact condition and the usual rule at one f⁺ > 0, and where the gains lie in it.
 
     Args:
         side: motor or load.
@@ -65,35 +89,28 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Drawn:
     """
     lambda_, alpha, bound, largest = (judged[key] for key in _GAINS)
     least = judged["least_lambda"]["exact"]
-    figure, (ax,) = subplots(6.6, 5.8, beside=True)
-    ax.grid(False)
     # a gain of zero has no place on a logarithmic axis
     alphas = min(0.7 * bound, 0.5 * alpha or bound), max(20.0 * bound, 3.0 * alpha)
     lowest, highest = 0.15 * np.sqrt(bound), 30.0 * np.sqrt(bound)
     lambdas = min(0.3 * (lambda_ or lowest), 0.5 * (least or lowest), lowest), max(3.0 * lambda_, highest)
-    ax.set(xscale="log", yscale="log", xlim=alphas, ylim=lambdas)
-    handles: list[Any] = condition_curves(ax, CONDITIONS, bound, alphas)
+    _, exact = condition_curves(EXACT, bound, alphas)
     # α has to exceed f⁺, whatever λ is
-    x, y = np.asarray(ax.lines[-1].get_xydata()).T
-    ax.fill_between([alphas[0], x[0], *x], [lambdas[1], lambdas[1], *y], lambdas[0], color=MISSING, alpha=0.6, lw=0.0)
-    handles.append(Patch(facecolor=MISSING, alpha=0.6, label="exact one fails"))
+    x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]
+    parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000")]
+    parts.append(usual_rule_curve(bound, alphas))
     if largest > 0.0:
-        (edge,) = condition_curves(ax, {"exact": CONDITIONS["exact"]}, largest, alphas)
-        x, y = np.asarray(edge.get_xydata()).T
-        label = f"where it would fail at f⁺ = {largest:.3g} rad/s²"
-        edge.set(data=([x[0], *x], [lambdas[1], *y]), color="black", ls="--", lw=1.2, path_effects=[], label=label)
-        handles.append(edge)
+        _, edge = condition_curves(EXACT, largest, alphas)
+        name = f"where it would fail at f⁺ = {largest:.3g} rad/s²"
+        parts.append(Line([edge.x[0], *edge.x], [lambdas[1], *edge.y], name, width=1.2, dashes="--"))
     if least is not None:
-        ax.plot([alpha, alpha], [least, max(lambda_, lambdas[0])], color="black", lw=1.2)
-    ax.set(xlim=alphas, ylim=lambdas)
-    name_gains(ax, bound)
-    handles.append(mark(ax, (alpha, lambda_), "*", "the observer's gains", 15))
-    ax.set_title(f"{side}: λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²")
-    legend_below(figure, handles, 2)
+        parts.append(Line([alpha, alpha], [least, max(lambda_, lambdas[0])], width=1.2))
+    parts.append(mark(alpha, lambda_, "the observer's gains"))
     caption = (
-        f"Gains of the {side} observer and the least λ of each gain condition at the true f⁺ = {bound:.3g} rad/s² along the "
-        "run. Above and on the right: the axes of the atlas (jaxbl verify)."
+        f"Gains of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) and the least λ of the exact "
+        f"condition at the true f⁺ = {bound:.3g} rad/s² along the run; the usual rule's gains for this f⁺ and larger ones. "
+        "Above and on the right: the axes of the atlas (jaxbl verify)."
     )
     if least is not None and lambda_ > 0.0:
         caption += f" Stroke: λ is {lambda_ / least:.3g} times the least one of the exact condition."
-    return Drawn(f"gain_conditions_{side}", figure, caption)
+    panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title=f"{side} observer")
+    return Figure(f"gain_conditions_{side}", [panel], caption, width=5.6, height=4.4)

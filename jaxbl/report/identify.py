@@ -10,8 +10,8 @@ from jaxbl.lines import DOUBT, Lines
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .figures import SIDES
 from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
+from .panels import SIDES
 
 
 def write_identification(result: Identification, folder: Path) -> str:

@@ -1,6 +1,5 @@
 """Figures, table and report of an inspected log."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,8 @@ from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectr
 from jaxbl.records.time_stamps import GAP_PERIODS
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .figures import (
+from .numbers import lead_with_doubt, percent
+from .panels import (
     BLACK,
     BLUE,
     COLOURS,
@@ -21,18 +21,20 @@ from .figures import (
     GREEN,
     PURPLE,
     VERMILION,
-    Drawn,
-    draw_zero,
-    legend,
+    ZERO,
+    Axis,
+    Bars,
+    Figure,
+    Line,
+    Panel,
+    Part,
+    Span,
+    cloud,
+    join,
     limits,
-    stacked,
-    style,
-    subplots,
+    stack,
 )
-from .numbers import lead_with_doubt, percent
 
-_POINTS = 6000
-"""Points of a line: a page is about 1000 pixels wide."""
 _CHANNELS = {
     "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
     "transmitted": ("transmitted", GREEN),
@@ -96,18 +98,17 @@ def _channel_table(record: Record) -> list[tuple[str, ...]]:
     return rows
 
 
-@style()
-def draw_inspection(inspection: Inspection) -> list[Drawn]:
+def draw_inspection(inspection: Inspection) -> list[Figure]:
     """All figures of an inspected log."""
     record = inspection.record
-    drawn = [_channels(record), _spectra(record)]
+    figures = [_channels(record), _spectra(record)]
     if record.torque is not None and np.ptp(record.torque):
-        drawn.append(_torque_over_velocity(record))
+        figures.append(_torque_over_velocity(record))
     if inspection.twist is not None:
-        drawn.append(_twist(inspection))
+        figures.append(_twist(inspection))
     if not record.statistics.sampling.even:
-        drawn.append(_intervals(record))
-    return drawn
+        figures.append(_intervals(record))
+    return figures
 
 
 def _values(record: Record) -> dict[str, np.ndarray]:
@@ -116,53 +117,42 @@ def _values(record: Record) -> dict[str, np.ndarray]:
     return {name: signal for name, signal in values.items() if signal is not None}
 
 
-def _thin(record: Record, segments: Sequence[slice]) -> np.ndarray:
-    """Indices of samples: no more than a page shows, in proportion to the segments."""
-    step = max(len(record.time) // _POINTS, 1)
-    return np.concatenate([np.arange(segment.start, segment.stop, step) for segment in segments])
-
-
-def _channels(record: Record) -> Drawn:
+def _channels(record: Record) -> Figure:
     side, channels = main_side(record), record.statistics.channels
-    panels = [(signal, *_CHANNELS[name], channels[name].unit) for name, signal in _values(record).items()]
+    signals = [(signal, *_CHANNELS[name], channels[name].unit) for name, signal in _values(record).items()]
     unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
-    panels.append((compute_velocity(record, side), f"{side} velocity", PURPLE, unit))
-    figure, axes = stacked(len(panels), 1.5, width=7.0)
-    for ax, (signal, label, colour, unit) in zip(axes, panels, strict=True):
-        for segment in record.segments:
-            samples = _thin(record, [segment])
-            ax.plot(record.time[samples], signal[samples], color=colour, lw=0.9)
-        ax.set_ylabel(f"{label}\n({unit})")
-    return Drawn(
-        "channels", figure, f"The channels over time, and the velocity by differences of the low-passed {side} position."
-    )
+    signals.append((compute_velocity(record, side), f"{side} velocity", PURPLE, unit))
+    time, *joined = join(record.time, record.segments, *(signal for signal, *_ in signals))
+    panels = [
+        Panel(Axis("time (s)"), Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
+        for values, (_, label, colour, unit) in zip(joined, signals, strict=True)
+    ]
+    caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
+    return stack("channels", panels, caption, 1.5)
 
 
-def _spectra(record: Record) -> Drawn:
-    values = {name: signal for name, signal in _values(record).items() if np.ptp(signal)}
-    part = longest_segment(record.segments)
-    figure, axes = stacked(len(values), 2.1, "frequency (Hz)", width=7.0)
-    for ax, (name, signal) in zip(axes, values.items(), strict=True):
-        channel = record.statistics.channels[name]
+def _spectra(record: Record) -> Figure:
+    part, panels = longest_segment(record.segments), []
+    for name, signal in _values(record).items():
+        if not np.ptp(signal):
+            continue
+        channel, (label, colour) = record.statistics.channels[name], _CHANNELS[name]
         frequency, density = power_spectrum(signal[part], record.sample_period)
-        label, colour = _CHANNELS[name]
-        ax.loglog(frequency, np.sqrt(density), color=colour, lw=1.0)
-        ax.set_ylabel(f"{label}\n({channel.unit}/√Hz)")
+        parts: list[Part] = [Line(frequency[1:], np.sqrt(density[1:]), colour=colour, width=1.0)]
         if channel.noise:
             floor = channel.noise * np.sqrt(2.0 * record.sample_period)
-            ax.axhline(floor, color="#555555", lw=1.0, ls="--", label=f"noise {channel.noise:.2g} {channel.unit} rms")
+            parts.append(Span(floor, floor, f"noise {channel.noise:.2g} {channel.unit} rms", "#555555", "y"))
         if channel.bandwidth:
             power = "of velocity's power" if name.startswith("theta") else "of power"
-            label = f"95 % {power} below {channel.bandwidth:.3g} Hz"
-            ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
-        if channel.noise or channel.bandwidth:
-            legend(ax, 2)
-    return Drawn(
-        "spectra", figure, "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
-    )
+            text = f"95 % {power} below {channel.bandwidth:.3g} Hz"
+            parts.append(Span(channel.bandwidth, channel.bandwidth, text, "#555555", dashes=":"))
+        y = Axis(f"{label}\n({channel.unit}/√Hz)", log=True)
+        panels.append(Panel(Axis("frequency (Hz)", log=True), y, parts))
+    caption = "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
+    return stack("spectra", panels, caption, 2.1)
 
 
-def _torque_over_velocity(record: Record) -> Drawn:
+def _torque_over_velocity(record: Record) -> Figure:
     assert record.torque is not None
     side, channels, dynamics = main_side(record), record.statistics.channels, record.statistics.dynamics
     channel, period = channels[POSITION_CHANNELS[side]], record.sample_period
@@ -179,60 +169,55 @@ def _torque_over_velocity(record: Record) -> Drawn:
         caption += f" Less the torque of an inertia of {inertia:.4g}: a rough estimate, not an identification."
         # transients of the filter
         edge = round(1.0 / (bandwidth * period))
-    figure, (ax,) = subplots(7.0, 3.4)
     inner = [slice(part.start + edge, part.stop - edge) for part in record.segments if part.stop - part.start > 4 * edge]
-    samples = _thin(record, inner or record.segments)
-    ax.plot(speed[samples], torque[samples], ".", ms=1.6, color=BLUE, alpha=0.5)
-    draw_zero(ax)
-    ax.axvline(0.0, color=FAINT, lw=0.8)
+    x, y = (np.concatenate([values[part] for part in inner or record.segments]) for values in (speed, torque))
     # a few samples at sharp corners of the motion would set the scale
-    ends = limits(torque[samples], share=0.002, room=0.15)
-    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({channels['u'].unit})", ylim=ends)
-    return Drawn("torque_over_velocity", figure, caption)
+    axis = Axis(f"{label} ({channels['u'].unit})", ends=limits(y, share=0.002, room=0.15))
+    across = Span(0.0, 0.0, colour=FAINT, width=0.8, dashes="-")
+    panel = Panel(Axis(f"{side} velocity ({channel.unit}/s)"), axis, [ZERO, across, cloud(x, y, colour=BLUE)])
+    return Figure("torque_over_velocity", [panel], caption)
 
 
-def _twist(inspection: Inspection) -> Drawn:
+def _twist(inspection: Inspection) -> Figure:
     record, twist = inspection.record, inspection.twist
     assert twist is not None
-    channels = record.statistics.channels
-    panels = [(record.positions["load"], f"load position θs ({channels['theta_s'].unit})")]
+    channels, gearing = record.statistics.channels, record.statistics.gearing
+    over = [(record.positions["load"], f"load position θs ({channels['theta_s'].unit})")]
     name = "u" if record.transmitted is None else "transmitted"
     torque = _values(record).get(name)
     if torque is not None and np.ptp(torque):
-        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({channels[name].unit})"))
-    figure, axes = subplots(7.0, 3.6, columns=len(panels), sharey=True)
-    samples = _thin(record, record.segments)
-    gearing = record.statistics.gearing
+        over.insert(0, (torque, f"{_CHANNELS[name][0]} ({channels[name].unit})"))
+    rows = np.concatenate([np.arange(part.start, part.stop) for part in record.segments])
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")
-        chosen = np.searchsorted(gearing.flank_times, record.time[samples]) % 2 == 0
+        chosen = np.searchsorted(gearing.flank_times, record.time[rows]) % 2 == 0
     else:
         split, names = "the direction of motion", ("forwards", "backwards")
-        chosen = compute_velocity(record, "load")[samples] > 0.0
-    for ax, (x, label) in zip(axes, panels, strict=True):
-        for rows, colour, name in zip((samples[chosen], samples[~chosen]), COLOURS, names, strict=False):
-            ax.plot(x[rows], twist[rows], ".", ms=1.8, color=colour, alpha=0.6, label=name)
-        ax.set_xlabel(label)
-    axes[0].set_ylabel(f"θe − N₀ θs about its median ({channels['theta_e'].unit})")
-    legend(axes[-1], 2, markerscale=5)
-    return Drawn(
+        chosen = compute_velocity(record, "load")[rows] > 0.0
+    halves = list(zip((rows[chosen], rows[~chosen]), names, COLOURS, strict=False))
+    y = Axis(f"θe − N₀ θs about its median ({channels['theta_e'].unit})")
+    panels = [
+        Panel(Axis(label), y, [cloud(x[half], twist[half], name, colour) for half, name, colour in halves])
+        for x, label in over
+    ]
+    return Figure(
         "twist",
-        figure,
+        panels,
         f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {split}. Over torque: the loop's "
         "width shows lost motion and friction, its slope compliance. Over position: a periodic twist shows eccentricity of "
         "encoders or gears.",
+        columns=len(panels),
     )
 
 
-def _intervals(record: Record) -> Drawn:
+def _intervals(record: Record) -> Figure:
     median = record.statistics.sampling.median_period
     inside = record.intervals <= GAP_PERIODS * median
-    ends, intervals = np.cumsum(record.intervals)[inside], 1e3 * record.intervals[inside]
-    figure, (left, right) = subplots(7.0, 2.6, columns=2, width_ratios=(3, 1), sharey=True)
-    left.plot(ends, intervals, ".", ms=2.0, color=BLUE)
-    left.axhline(1e3 * median, color=VERMILION, lw=1.0, ls="--", label="median")
-    left.set(xlabel="time (s)", ylabel="interval\n(ms)")
-    legend(left)
-    right.hist(intervals, bins=60, orientation="horizontal", color=BLUE)
-    right.set(xlabel="samples (1)")
-    return Drawn("intervals", figure, "Intervals between raw time stamps, before resampling; gaps are left out.")
+    times, lengths = np.cumsum(record.intervals)[inside], 1e3 * record.intervals[inside]
+    counts, edges = np.histogram(lengths, bins=60)
+    bars = Bars(0.5 * (edges[1:] + edges[:-1]), counts, thickness=edges[1] - edges[0])
+    stamps = [cloud(times, lengths, colour=BLUE), Span(1e3 * median, 1e3 * median, "median", VERMILION, "y")]
+    y = Axis("interval\n(ms)")
+    panels = [Panel(Axis("time (s)"), y, stamps), Panel(Axis("samples (1)"), y, [bars])]
+    caption = "Intervals between raw time stamps, before resampling; gaps are left out."
+    return Figure("intervals", panels, caption, 2, height=2.6, widths=(3.0, 1.0))

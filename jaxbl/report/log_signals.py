@@ -14,9 +14,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards
 from jaxbl.records.signal_quality import longest_segment
 
-from .figures import SIDES, Pair
-
-Array = np.ndarray
+from .panels import SIDES, Array, Pair
 
 _CYCLES = 2.5
 """Cycles of motion shown in detail: one whole cycle is always among them."""

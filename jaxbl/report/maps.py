@@ -1,70 +1,53 @@
-"""Figures of a sweep: heatmaps with gain conditions over them, and lines over one axis."""
+"""Figures of a sweep: maps with gain conditions over them, and lines over one axis."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false, reportAssignmentType=false
 
+import math
 import re
-import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
-from matplotlib.patheffects import withStroke
 from pandas import DataFrame, Series
 
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.config.figures import filter_rows, resolve_where
 from jaxbl.gains.accuracy_laws import Law, PowerLawFit, accuracy_laws
 from jaxbl.gains.best_gains import AS_GOOD, BestGains, find_best_gains
-from jaxbl.observer.conditions import CONDITIONS, Condition
-from jaxbl.sweeps.elementwise import apply_elementwise
+from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import find_metric, is_magnitude
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Column, Groups, Rows
 from .checks import MOST_PARTS, check_figures, has_words, values_of
-from .figures import (
+from .gain_plane import condition_curves
+from .panels import (
     COLOURS,
-    MAP,
     MARKERS,
     MISSING,
     SIDES,
-    Axes,
-    Drawn,
+    Array,
+    Axis,
+    Band,
+    Dots,
     Figure,
-    Line2D,
+    Line,
+    Map,
     Pair,
-    Patch,
+    Panel,
+    Part,
+    Scale,
     arrange,
-    colour_bar,
-    legend_below,
-    style,
-    subplots,
+    mark,
     with_unit,
-    write_inside,
 )
 from .refined_maps import Filling, on_coarse_values
 
-Array = np.ndarray
-
-_HATCH = (1.0, 1.0, 1.0, 0.45)
-"""White that lets the colour beneath be read."""
-
 _MOST_DOTS = 100_000
-
-_CURVES = {
-    "davila_fridman": ("-", "#FF5FA2"),
-    "levant": ("-.", "#FF9E4A"),
-    "seeber_horn": ("--", "#7FDBFF"),
-    "moreno_osorio": ((0, (5, 1, 1, 1)), "#B6F09C"),
-    "exact": (":", "#FFD400"),
-}
-"""Dashes and colour of each gain condition's curve."""
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -86,36 +69,37 @@ laws_of = lru_cache(maxsize=1)(accuracy_laws)
 """Laws of a study, found once for its sentences, its figures and its file."""
 
 
-@style()
-def draw(result: StudyResult) -> list[Drawn]:
+def draw(result: StudyResult) -> list[Figure]:
     """All figures of a study, in memory that does not grow with its number of runs (of a refined study, with its points).
 
     Raises:
         InputError: a figure names an axis or a metric that the study does not have.
     """
     config = result.config
-    figures = config.figures or default_figures(config, result.columns)
-    check_figures(config, figures, result.columns)
+    specs = config.figures or default_figures(config, result.columns)
+    check_figures(config, specs, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
-    drawn: list[Drawn] = []
-    runs = sum(map(len, result.batches(["seed"]))) if figures else 0
-    for i, spec in enumerate(figures):
+    figures: list[Figure] = []
+    runs = sum(map(len, result.batches(["seed"]))) if specs else 0
+    for i, spec in enumerate(specs):
         dots = _dots(result, spec)
         if spec.theory is not None:
-            figure, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
+            panels, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
         elif spec.kind == "heatmap":
-            figure, caption = _heatmap(config, _rows(result, spec, points, dots), spec, points)
+            panels, caption = _heatmap(config, _rows(result, spec, points, dots), spec, points)
         else:
-            figure, caption = _lines(config, _rows(result, spec, points, dots), spec)
-        caption = f"{value_label(spec.value)} over {spec.x}{caption}"
+            panels, caption = _lines(config, _rows(result, spec, points, dots), spec)
+        caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}"
         if dots is not None:
             caption += f" The first {len(dots)} points of the design are shown."
         if not result.is_finished(runs):
             caption += f" The study is not finished: {runs} runs so far, white where none is."
         name = re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")
-        same = sum(earlier.name.partition("-")[0] == name for earlier in drawn)
-        drawn.append(Drawn(f"{name}-{same + 1}" if same else name, figure, caption))
-    return drawn
+        same = sum(earlier.name.partition("-")[0] == name for earlier in figures)
+        columns = arrange(len(panels))
+        size: Any = {"width": 3.4 * columns + 0.6, "height": 3.0} if len(panels) > 1 else {"width": 5.6, "height": 4.0}
+        figures.append(Figure(f"{name}-{same + 1}" if same else name, panels, caption, columns, **size))
+    return figures
 
 
 def _rows(result: StudyResult, figure: FigureTable, points: Points | None, dots: Series | None) -> Rows:
@@ -148,9 +132,34 @@ def _dots(result: StudyResult, figure: FigureTable) -> Series | None:
     return Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
 
 
+_WORDS = {
+    "lambda": "λ, correction gain",
+    "alpha": "α, switching gain",
+    "encoders": "encoder",
+    "equivalent_control": "low-pass",
+}
+_UNSAID = {"drive", "transmission", "observer", "run", "identifier", "effects"}
+
+
+def path_words(config: Config, path: str) -> str:
+    """Words for what an axis varies; of gains with the side only where those of both vary."""
+    parts = [part for part in path.split(".") if part not in _UNSAID]
+    sides = {axis.split(".")[1] for axis in config.axis_paths if axis.startswith("observer.")}
+    if path.startswith("observer.") and len(sides) == 1 and len(parts) > 1:
+        del parts[0]
+    return " ".join(_WORDS.get(part, part.replace("_", " ")) for part in parts)
+
+
 def axis_label(config: Config, path: str) -> str:
-    """A path with its unit, if the study has it as a number."""
-    return with_unit(path, unit_of(config, path))
+    """Words for what an axis varies, with its unit if the study has it as a number."""
+    return with_unit(path_words(config, path), unit_of(config, path))
+
+
+def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -> Axis:
+    """An axis of a figure that shows the cells about some values of a study's axis."""
+    log = is_log(config, path, values) if log is None else log
+    low, *_, high = map(float, cell_edges(values, log))
+    return Axis(axis_label(config, path), path, log, (low, high))
 
 
 def unit_of(config: Config, path: str) -> str:
@@ -159,12 +168,20 @@ def unit_of(config: Config, path: str) -> str:
     return "" if parameter is None else parameter.unit
 
 
-def _with_value(config: Config, path: str, value: Any) -> str:
-    return f"{path} = {_text(value)} {unit_of(config, path)}".rstrip()
+_PREFIXES = {-1: "m", -2: "µ", -3: "n"}
+
+
+def with_value(config: Config, path: str, value: Any) -> str:
+    """Words for a value of an axis: in milli, micro, nano where that is small."""
+    unit = unit_of(config, path)
+    if unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2:
+        power = math.floor(math.log10(abs(value)) / 3.0 + 1e-9)
+        value, unit = float(f"{value * 1e3**-power:.6g}"), _PREFIXES[power] + unit
+    return f"{path_words(config, path)} {_text(value)} {unit}".rstrip()
 
 
 def _panel_title(config: Config, spec: FigureTable, value: Any) -> str:
-    return "" if spec.facet is None else _with_value(config, spec.facet, value)
+    return "" if spec.facet is None else with_value(config, spec.facet, value)
 
 
 def _text(value: Any) -> str:
@@ -186,7 +203,9 @@ def _over(config: Config, varied: set[str], spec: FigureTable) -> str:
     sampled = _sampled_axes(config)
     # one point of the design at each place
     single = {*keys, *(sampled if {*keys} & {*sampled} else ())}
-    averaged = [axis.path for axis in config.axes if axis.path in varied - single and axis.zip not in zipped]
+    averaged = [
+        path_words(config, axis.path) for axis in config.axes if axis.path in varied - single and axis.zip not in zipped
+    ]
     if config.sweep.seeds > 1:
         averaged.append(f"{config.sweep.seeds} seeds")
     return f"; {'share' if is_boolean(spec.value) else 'median'} over {', '.join(averaged)}" if averaged else ""
@@ -204,19 +223,19 @@ def flat_remark(values: Array) -> str:
     return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""
 
 
-def color_norm(values: Array, scale: str) -> Normalize:
-    """Colour scale: logarithmic where values are positive and span more than a factor of 30, one colour where they are
+def colour_scale(values: Array, label: str, scale: str = "auto") -> Scale:
+    """Colours of values: logarithmic where they are positive and span more than a factor of 30, one colour where they are
     flat."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
-        return Normalize(0.0, 1.0)
+        return Scale(0.0, 1.0, label)
     low, high = map(float, (finite.min(), finite.max()))
     if low == high or flat_remark(values):
-        return Normalize(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12)
-    if scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0):
-        positive = finite[finite > 0.0]
-        return LogNorm(float(positive.min()), high) if positive.size else Normalize(low, high)
-    return Normalize(low, high)
+        return Scale(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12, label)
+    if (scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0)) and high > 0.0:
+        # it begins at the smallest positive value
+        return Scale(float(finite[finite > 0.0].min()), high, label, log=True)
+    return Scale(low, high, label)
 
 
 def cell_edges(centres: Array, log: bool) -> Array:
@@ -332,119 +351,68 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None)
     return medians
 
 
-def _grid_of_axes(
-    config: Config,
-    spec: FigureTable,
-    count: int,
-    panel: Pair,
-    ylabel: str,
-    *,
-    single: Pair | None = None,
-    beside: float = 0.0,
-) -> tuple[Figure, list[Axes]]:
-    """Axes of so many panels, y label and numbers on the outer ones only; sizes (inches) of a panel, of one alone, and
-    beside all."""
-    rows, columns = arrange(count)
-    size = (panel[0] * columns + beside, panel[1] * rows + 0.7) if single is None or count > 1 else single
-    figure, axes = subplots(*size, rows, columns, beside=True, sharex=True, sharey=True)
-    for i, ax in enumerate(axes):
-        ax.tick_params(labelbottom=i + columns >= count)
-        ax.set(visible=i < count, xlabel=axis_label(config, spec.x), ylabel="" if i % columns else ylabel)
-    return figure, axes[:count]
-
-
-def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[Figure, str]:
+def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[list[Panel], str]:
     """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
     assert spec.y is not None
     panels, filling, varied = _map_panels(config, rows, spec, points)
-    values = np.concatenate([panel.table.to_numpy(float) for panel in panels])
-    norm = Normalize(0.0, 1.0) if is_boolean(spec.value) else color_norm(values, spec.scale)
-    figure, axes = _grid_of_axes(config, spec, len(panels), (3.5, 3.4), axis_label(config, spec.y), beside=1.0)
-    hatches, curves = [], []
-    missing = diverged = 0
-    for ax, panel in zip(axes, panels, strict=True):
-        cells, hatch = _map_panel(ax, config, panel, spec, norm, filling)
-        hatches = hatches or hatch
-        is_missing = panel.table.isna()
-        missing += int(is_missing.sum())
-        diverged += int((panel.finite[is_missing] < 1.0).sum())
-        under = [flat_remark(panel.table.to_numpy(float))]
-        if panel.best is not None:
-            ax.plot(*panel.best[::-1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
-            under.append(f"best ★ {panel.table[panel.best]:.2g} {find_metric(spec.value).unit}".rstrip())
+    works = [panel.table[~_find_failures(panel, spec)].to_numpy(float) for panel in panels]
+    scale = colour_scale(np.concatenate(works), value_label(spec.value), spec.scale)
+    if is_boolean(spec.value):
+        scale = scale._replace(low=0.0, high=1.0, log=False)
+    name = _failure_name(panels, spec)
+    drawn = []
+    for panel in panels:
+        axes, parts = _map_parts(config, panel, spec, scale, filling, name)
+        under = [flat_remark(panel.table[~_find_failures(panel, spec)].to_numpy(float))]
         if panel.bound is not None:
             alpha_is_x = spec.x.endswith(".alpha")
-            alphas = cells.centres[0 if alpha_is_x else 1]
-            conditions = {name: CONDITIONS[name] for name in spec.overlays}
-            curves = condition_curves(ax, conditions, panel.bound, (alphas[0], alphas[-1]), alpha_is_x)
+            alphas = axes[0 if alpha_is_x else 1].ends
+            parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, panel.bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {panel.bound:.3g} rad/s²")
-        ax.set_title("\n".join(filter(None, (panel.title, ",  ".join(filter(None, under))))))
-    handles: list[Any] = [*hatches, *curves]
-    if missing:
-        word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
-        label = f"{word} ({missing} points)"
-        cross = Line2D([], [], color=MISSING, ls="", marker="x", label=label)
-        handles.append(Patch(facecolor=MISSING, label=label) if config.sweep.design == "grid" else cross)
-    # a logarithmic scale begins at the smallest positive value
-    extend = "min" if np.nanmin(values, initial=np.inf) < norm.vmin else "neither"  # type: ignore[operator]
-    colour_bar(figure, axes, norm, _wrap(value_label(spec.value)), extend=extend)
-    if handles:
-        most = max(int(figure.get_figwidth() / 2.4), 1)
-        legend_below(figure, handles, min(len(handles), most))
-    return figure, f" and {spec.y}{_over(config, varied, spec)}."
+        if panel.best is not None:
+            parts.append(mark(*panel.best[::-1], "best", size=13.0))
+            under.insert(1, f"best ★ {panel.table[panel.best]:.2g} {find_metric(spec.value).unit}".rstrip())
+        title = "\n".join(filter(None, (panel.title, ",  ".join(filter(None, under)))))
+        drawn.append(Panel(*axes, parts, title))
+    return drawn, f" and {path_words(config, spec.y)}{_over(config, varied, spec)}."
 
 
-class Cells(NamedTuple):
-    """The cells of a map: centres along x and y, and their edges."""
-
-    centres: Sequence[Array]
-    edges: Sequence[Array]
-
-    def out_to_edges(self, values: Array) -> tuple[Array, Array, Array]:
-        """Centres along x and y with the outer edges, and values `(rows, columns)` at all of them."""
-        xs, ys = (np.r_[edges[0], centres, edges[-1]] for centres, edges in zip(*self, strict=True))
-        return xs, ys, np.pad(values, 1, mode="edge")
+def _find_failures(panel: _Panel, spec: FigureTable) -> Series:
+    """Find the places of a map without a value that means something: too few of their runs converged, or one diverged."""
+    failed, side = panel.table.isna(), spec.value.partition(".")[0]
+    if panel.converged is not None and spec.value != f"{side}.converged":
+        failed |= panel.converged < 0.5
+    return failed
 
 
-def set_up_map(ax: Axes, centres: Sequence[Array], logs: Sequence[bool] = (True, True)) -> Cells:
-    """Set up axes for cells about centres along x and y, some on a logarithmic scale."""
-    edges = [cell_edges(*axis) for axis in zip(centres, logs, strict=True)]
-    ax.grid(False)
-    for name, log, ends in zip("xy", logs, edges, strict=True):
-        if log:
-            ax.set(**{f"{name}scale": "log"})
-        ax.set(**{f"{name}lim": ends[[0, -1]]})
-    return Cells(centres, edges)
+def _failure_name(panels: list[_Panel], spec: FigureTable) -> str:
+    """Say what happened where a map is grey, and at how many points; "" where it is nowhere."""
+    failed = [_find_failures(panel, spec) for panel in panels]
+    count = sum(map(int, map(sum, failed)))
+    diverged = sum(int((panel.finite[rows] < 1.0).sum()) for panel, rows in zip(panels, failed, strict=True))
+    word = "not converged" if panels[0].converged is not None or "time" in spec.value else "undefined"
+    return f"{'diverged' if diverged == count else word} ({count} points)" if count else ""
 
 
-def _map_panel(
-    ax: Axes, config: Config, panel: _Panel, spec: FigureTable, norm: Normalize, filling: Filling | None
-) -> tuple[Cells, list[Patch]]:
-    """Cells of a grid, or dots of a quasi-random design. Returns the cells and the legend's handles."""
+def _map_parts(
+    config: Config, panel: _Panel, spec: FigureTable, scale: Scale, filling: Filling | None, failure: str
+) -> tuple[list[Axis], list[Part]]:
+    """Axes, and cells of a grid, or dots of a quasi-random design."""
     assert spec.y is not None
-    table, dots, handles, grid = panel.table, panel.dots, [], np.empty(0)
-    if dots is None:
-        *centres, grid = _dense(table, filling)
-    else:
-        centres = [np.unique(dots[path].to_numpy(float)) for path in (spec.x, spec.y)]
-    cells = set_up_map(ax, centres, list(map(is_log, (config, config), (spec.x, spec.y), centres)))
-    if dots is None:
-        ax.pcolormesh(*cells.edges, grid, cmap=MAP, norm=norm, rasterized=True)
-        # what an unfinished study has not computed yet stays white
-        undefined = np.isnan(grid) if filling is not None else table.isna().unstack(fill_value=False).to_numpy(bool)
-        if undefined.any():
-            missing = np.ma.masked_array(np.zeros(grid.shape), ~undefined)
-            ax.pcolormesh(*cells.edges, missing, cmap=ListedColormap([MISSING]), rasterized=True)
-        side = spec.value.partition(".")[0]
-        if panel.converged is not None and spec.value != f"{side}.converged":
-            *_, share = _dense(panel.converged, filling)
-            handles = hatch_failures(ax, cells, share, f"{side} not converged")
-    else:
+    paths, dots = (spec.x, spec.y), panel.dots
+    if dots is not None:
+        axes = [axis_of(config, path, np.unique(dots[path].to_numpy(float))) for path in paths]
         values = drawn_values(dots, spec.value)
         there, gone = dots[values.notna()], dots[values.isna()]
-        ax.scatter(there[spec.x], there[spec.y], c=values.dropna(), cmap=MAP, norm=norm, s=16, linewidths=0)
-        ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
-    return cells, handles
+        crosses = Line(gone[spec.x], gone[spec.y], failure, MISSING, 0.0, marker="x", size=4.0)
+        return axes, [Dots(there[spec.x], there[spec.y], values.dropna(), scale), crosses]
+    *centres, grid = _dense(panel.table, filling)
+    axes = [axis_of(config, *axis) for axis in zip(paths, centres, strict=True)]
+    *_, failed = _dense(_find_failures(panel, spec).astype(float), filling)
+    # what an unfinished study has not computed yet stays white
+    failed = failed > 0.5 if filling is None else (failed > 0.5) | np.isnan(grid)
+    edges = (cell_edges(values, axis.log) for values, axis in zip(centres, axes, strict=True))
+    return axes, [Map(*edges, grid, scale, failed, failure)]
 
 
 def _dense(table: Series, filling: Filling | None) -> tuple[Array, Array, Array]:
@@ -453,25 +421,6 @@ def _dense(table: Series, filling: Filling | None) -> tuple[Array, Array, Array]
         return filling.dense(table)
     grid = table.unstack()
     return grid.columns.to_numpy(float), grid.index.to_numpy(float), grid.to_numpy(float)
-
-
-def hatch_failures(ax: Axes, cells: Cells, share: Array, label: str, colour: Any = _HATCH) -> list[Patch]:
-    """Hatch the cells of a map in which at most half of the runs pass, by their share `(rows, columns)`. Returns the
-    legend's handles."""
-    if not share.min() < 0.5:
-        return []
-    padded = cells.out_to_edges(share)
-    hatched = ax.contourf(*padded, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=colour, linewidth=0.0)
-    if share.max() >= 0.5:
-        lines = ax.contour(*padded, levels=[0.5], colors="white", linewidths=1.8)
-        lines.set_path_effects(outline_effects(3.2))
-    return [Patch(facecolor="#808080", edgecolor="white", hatch="///", label=label)]
-
-
-def outline_effects(width: float, colour: str = "black") -> list[Any]:
-    """Draw a line over a wider one."""
-    return [withStroke(linewidth=width, foreground=colour)]
 
 
 def drawn_values(part: DataFrame, value: str) -> Series:
@@ -528,31 +477,7 @@ def best_gains(runs: DataFrame) -> BestGains | None:
     )
 
 
-def condition_curves(
-    ax: Axes, conditions: Mapping[str, Condition], bound: float, alphas: Pair, alpha_is_x: bool = True
-) -> list[Line2D]:
-    """Draw the least lambda of gain conditions over a range of alpha, for one f_plus. Returns the legend's handles."""
-    low, high = max(alphas[0], bound * 1.0001), alphas[1]
-    fine = np.geomspace(low, high, 400) if high > bound else np.array([])
-    handles = []
-    for name, condition in conditions.items():
-        dashes, colour = _CURVES[name]
-        line = [fine, least_lambdas(condition, fine, bound) if fine.size else fine]
-        # the label is what the pointer says on a page
-        handles += ax.plot(
-            *line[:: 1 if alpha_is_x else -1], ls=dashes, color=colour, lw=2.0, path_effects=outline_effects(3.6),
-            label=condition.title,
-        )  # fmt: skip
-    return handles
-
-
-def least_lambdas(condition: Condition, alphas: Array, bound: float) -> Array:
-    """The least lambda of a condition at each alpha, for one f_plus."""
-    with jax.enable_x64(True):
-        return apply_elementwise(condition.least_lambda, [alphas, np.full_like(alphas, bound)])
-
-
-def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[Figure, str]:
+def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], str]:
     keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
     groups = Groups(rows, keys, config.axis_paths)
     column = _drawn_column(spec.value)
@@ -560,75 +485,64 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[Figure, str]:
     table = groups.means({"middle": column}).assign(least=spread.least, largest=spread.largest)
     if not is_boolean(spec.value):
         table["middle"] = spread.quantiles[0]
-    panels = _split(table.reset_index(), spec)
-    figure, axes = _grid_of_axes(config, spec, len(panels), (4.2, 3.4), _wrap(value_label(spec.value)), single=(6.4, 4.2))
-    sampled, band = spec.x in _sampled_axes(config), ""
-    for ax, (facet, part) in zip(axes, panels, strict=True):
-        lines = [(None, part)] if spec.series is None else part.groupby(spec.series, sort=True)
+    sampled, band, drawn = spec.x in _sampled_axes(config), "", []
+    scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
+    for facet, part in _split(table.reset_index(), spec):
+        lines, parts = [(None, part)] if spec.series is None else part.groupby(spec.series, sort=True), list[Part]()
         for i, (value, line) in enumerate(lines):
             x, colour = line[spec.x], COLOURS[i % len(COLOURS)]
-            label = None if value is None else _text(value)
-            ax.plot(x, line["middle"], "o" if sampled else "o-", ms=3.5, color=colour, label=label)
+            name = "" if value is None else with_value(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
-                ax.fill_between(x, line["least"], line["largest"], color=colour, alpha=0.18, linewidth=0)
-        xs = np.unique(part[spec.x].to_numpy(float))
-        log = is_log(config, spec.x, xs)
-        if log:
-            ax.set_xscale("log")
-        if isinstance(color_norm(np.concatenate([spread.least, spread.largest]), spec.scale), LogNorm):
-            ax.set_yscale("log")
-        ax.set(xlim=cell_edges(xs, log)[[0, -1]], title=_panel_title(config, spec, facet))
-    if spec.series is not None:
-        axes[-1].legend(title=axis_label(config, spec.series))
-    return figure, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
+                parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
+            parts.append(Line(x, line["middle"], name, colour, 0.0 if sampled else 1.4, marker="o", size=3.5))
+        x = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
+        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _panel_title(config, spec, facet)))
+    return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
-def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[Figure, str]:
+def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Panel], str]:
     """Points of lines that theory gives a slope for, with the lines fitted."""
-    facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
-    figure, axes = _grid_of_axes(config, spec, len(facets), (4.2, 3.8), _wrap(value_label(spec.value)), single=(7.2, 4.8))
-    for ax, facet in zip(axes, facets, strict=True):
+    panels = []
+    for facet in dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws):
         members = [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
-        ax.set(xscale="log", yscale="log", title=_panel_title(config, spec, facet))
-        ys = np.concatenate([_law(ax, law, i) for i, law in enumerate(members)])
-        xs = np.concatenate([law.x_values for law in members])
-        if len(xs):
-            ax.set_xlim(*cell_edges(np.unique(xs), log=True)[[0, -1]])
-        if len(ys):
-            # the lines of theory run on beyond the points
-            ax.set_ylim(ys.min() / 2.0, ys.max() * 2.0)
-        else:
-            write_inside(ax, "nothing above zero to draw")
-        ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
+        values = np.concatenate([law.y_values for law in members])
+        values = values[np.isfinite(values) & (values > 0.0)]
+        x = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
+        # the lines of theory run on beyond the points
+        ends = (float(values.min()) / 2.0, float(values.max()) * 2.0) if len(values) else None
+        parts = [part for i, law in enumerate(members) for part in _law_parts(law, i)]
+        title, note = _panel_title(config, spec, facet), "" if len(values) else "nothing above zero to draw"
+        panels.append(Panel(x, Axis(value_label(spec.value), spec.value, True, ends), parts, title, note))
     seeds = config.sweep.seeds
-    return figure, (
-        f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines: least squares over the "
-        "filled points; hollow points lie outside the law's range; dashed: theory's slope. The table says why each law ends."
+    return panels, (
+        f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "
+        f"squares over the filled points; hollow points lie outside the law's range; dashed: theory's slope, "
+        f"{spec.theory:g}. The table says why each law ends."
     )
 
 
-def _law(ax: Axes, law: Law, i: int) -> Array:
-    """One line: points, fit, and theory's slope through the middle of the fit. Returns the y drawn."""
+def _law_parts(law: Law, i: int) -> list[Part]:
+    """One line: points, fit, and theory's slope through the middle of the fit."""
     colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
     x, y, inside = law.x_values, law.y_values, law.in_range
-    name = ", ".join(map(_text, law.series.values()))
-    lead = f"{name}: " if name else ""
-    positive = np.isfinite(y) & (y > 0.0)
-    outside = positive & ~inside
-    ax.plot(x[outside], y[outside], marker, ms=6, mfc="none", color=colour)
-    ax.plot(x[inside], y[inside], marker, ms=6 if i == 0 else 3.5, color=colour)
+    lead = ", ".join(map(_text, law.series.values()))
+    lead = f"{lead}: " if lead else ""
+    outside = np.isfinite(y) & (y > 0.0) & ~inside
+    points = Line(x, y, colour=colour, width=0.0, marker=marker, size=6.0 if i == 0 else 3.5)
+    hollow = points._replace(x=x[outside], y=y[outside], fill="#FFFFFF")
     if law.fit is None:
         reasons = dict.fromkeys(law.stops[end].partition(":")[0] for end in ("below", "above"))
-        ax.plot([], [], marker, mfc="none", color=colour, label=f"{lead}no law ({', then '.join(reasons)})")
-        return y[positive]
+        return [hollow._replace(name=f"{lead}no law ({', then '.join(reasons)})")]
     ends = x[[law.fit.first, law.fit.last]]
-    ax.plot(ends, law.fit(ends), "-", color=colour, marker=marker, markevery=[], label=f"{lead}{slope_text(law.fit)}")
-    centre = float(np.sqrt(ends[0] * ends[1]))
-    around = np.array([x[0] / 10.0, x[-1] * 10.0])
+    centre, around = float(np.sqrt(ends[0] * ends[1])), np.array([x[0] / 10.0, x[-1] * 10.0])
     slope = law.fit(centre) * (around / centre) ** law.theory
-    ax.plot(around, slope, "--", lw=0.8, color=colour, scalex=False, scaley=False)
-    return y[positive]
+    return [
+        hollow,
+        points._replace(x=x[inside], y=y[inside]),
+        Line(ends, law.fit(ends), f"{lead}{slope_text(law.fit)}", colour),
+        Line(around, slope, colour=colour, width=0.8, dashes="--"),
+    ]
 
 
 def slope_text(fit: PowerLawFit) -> str:
@@ -638,9 +552,5 @@ def slope_text(fit: PowerLawFit) -> str:
 
 def _where(config: Config, spec: FigureTable) -> str:
     """Say what a figure fixes, for its caption."""
-    fixed = [_with_value(config, path, value) for path, value in resolve_where(config, spec).items()]
+    fixed = [with_value(config, path, value) for path, value in resolve_where(config, spec).items()]
     return f" where {', '.join(fixed)}" if fixed else ""
-
-
-def _wrap(label: str) -> str:
-    return "\n".join(textwrap.wrap(label, 48))

@@ -3,6 +3,7 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from itertools import product
@@ -11,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from matplotlib.colors import to_rgb
-from matplotlib.ticker import LogLocator
 
-from jaxbl.config import Config, numeric_paths
+from jaxbl.config import Config
 from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
@@ -22,32 +21,17 @@ from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .figures import COLOURS, MISSING, SIDE_COLOURS, Axes, Drawn, Line2D, Patch, legend_below, style, subplots
-from .maps import axis_label, set_up_map
+from .maps import axis_label, axis_of, cell_edges, with_value
+from .panels import COLOURS, SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Part, Scale, Span, arrange, intervals
 from .tune import error_label, for_title
 
-_KIND_COLOURS = (
-    "#CC6677",
-    "#88CCEE",
-    "#DDCC77",
-    "#117733",
-    "#AA4499",
-    "#44AA99",
-    "#999933",
-    "#882255",
-    "#332288",
-    "#DDDDDD",
-)
-"""Of kinds on a map: P. Tol's muted scheme, for all colour visions."""
 
-
-@style()
-def draw_choice(choice: ObserverChoice) -> list[Drawn]:
-    """All figures of a choice: bars for a single point, else a map for each side."""
+def draw_choice(choice: ObserverChoice) -> list[Figure]:
+    """All figures of a choice: intervals for a single point, else a map for each side."""
     summary = choice.summary
     sides = list(summary["points"][0]["sides"])
     if len(summary["points"]) == 1:
-        return [_bars(summary, sides)]
+        return [_ratios(summary, sides)]
     if len(_varied_values(choice.config, summary, sides[0])) == 1:
         return [_lines(choice.config, summary, side) for side in sides]
     return [_map(choice.config, summary, side) for side in sides]
@@ -59,34 +43,31 @@ def _sort_kinds(kinds: JsonObject) -> tuple[dict[str, JsonObject], list[str]]:
     return compared, [kind for kind in kinds if kind not in compared]
 
 
-def _bars(summary: JsonObject, sides: Sequence[str]) -> Drawn:
+def _ratios(summary: JsonObject, sides: Sequence[str]) -> Figure:
     """Ratios with their intervals, a panel for each side."""
-    count = len(summary["observers"])
-    figure, axes = subplots(5.4 * len(sides), 1.3 + 0.34 * count, 1, len(sides), beside=True)
-    for ax, side in zip(axes, sides, strict=True):
+    panels = []
+    for side in sides:
         kinds = summary["points"][0]["sides"][side]["kinds"]
-        compared, _ = _sort_kinds(kinds)
+        compared, lost = _sort_kinds(kinds)
         highest = max((result["high"] for result in compared.values()), default=1.0)
-        for i, result in enumerate(compared.values()):
-            ratio, low, high = (result[key] for key in _RATIO)
-            ax.errorbar(ratio, i, xerr=[[ratio - low], [high - ratio]], fmt="o", ms=6, capsize=3, color=SIDE_COLOURS[side])
-            text = "best" if i == 0 else _ratio(result)
-            ax.annotate(f"  {text}", (high, i), va="center", fontsize=9, xytext=(4, 0), textcoords="offset points")
-        for i in range(len(compared), count):
-            ax.annotate("diverged, or too slow", (0.02, i), xycoords=("axes fraction", "data"), va="center", color="#555555")
-        ax.axvline(1.0, color="black", lw=0.8)
-        ax.set(xscale="log", xlim=(0.9, 1.2 * (2.0 + highest) ** 1.5), title=side, xlabel="times the best one's error")
-        ax.xaxis.set_major_locator(LogLocator(numticks=5))
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.set_yticks(range(count), kinds)
-        ax.set_ylim(count - 0.5, -0.5)
-        ax.grid(axis="y", visible=False)
-    return Drawn(
-        "observers",
-        figure,
+        low, ratio, high = (np.array([result[key] for result in compared.values()]) for key in ("low", "ratio", "high"))
+        texts = ["best" if i == 0 else _ratio(result) for i, result in enumerate(compared.values())]
+        parts: list[Part] = [
+            Span(1.0, 1.0, width=0.8, dashes="-"),
+            *intervals(range(len(compared)), low, ratio, high, colour=SIDE_COLOURS[side]),
+            Line(high, range(len(compared)), width=0.0, marker=" ", texts=texts),
+            Line([0.9] * len(lost), range(len(compared), len(kinds)), width=0.0, marker=" ",
+                 texts=["diverged, or too slow"] * len(lost)),
+        ]  # fmt: skip
+        x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + highest) ** 1.5))
+        names = tuple(enumerate([*compared, *lost]))
+        panels.append(Panel(x, Axis(ends=(len(kinds) - 0.5, -0.5), names=names), parts, side))
+    caption = (
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
-        "its 95 % interval where they differ.",
+        "its 95 % interval where they differ."
     )
+    height = 0.9 + 0.34 * len(summary["observers"])
+    return Figure("observers", panels, caption, len(sides), 5.2 * len(sides), height)
 
 
 _RATIO = "ratio", "low", "high"
@@ -109,30 +90,31 @@ def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, 
     return {path: values for path, values in columns.items() if len(values) > 1}
 
 
-def _place(ax: Axes, name: str, values: Sequence[Any]) -> tuple[np.ndarray, bool]:
-    """Set up the axis x or y for values. Returns where each of them is, and whether that is on a logarithmic scale, where
-    they grow by factors."""
+def _place(config: Config, path: str, values: Sequence[Any]) -> tuple[np.ndarray, Axis]:
+    """Return where each value of an axis is drawn, and the axis: words, and numbers that are near one another, evenly."""
     are_numbers = all(isinstance(value, int | float) for value in values)
     if are_numbers and min(values) > 0.0 and max(values) / min(values) > 20.0:
-        ax.set(**{f"{name}scale": "log"})
-        return np.asarray(values, float), True
+        places = np.asarray(values, float)
+        return places, axis_of(config, path, places, log=True)
     texts = [f"{value:.4g}" if are_numbers else str(value) for value in values]
-    ax.set(**{f"{name}ticks": range(len(values)), f"{name}ticklabels": texts})
-    return np.arange(len(values), dtype=float), False
+    ends = -0.5, len(values) - 0.5
+    return np.arange(len(values), dtype=float), Axis(
+        axis_label(config, path), path, ends=ends, names=tuple(enumerate(texts))
+    )
 
 
-def _lines(config: Config, summary: JsonObject, side: str) -> Drawn:
+def _lines(config: Config, summary: JsonObject, side: str) -> Figure:
     """Errors over the one axis that has several values."""
     ((path, values),) = _varied_values(config, summary, side).items()
-    figure, (ax,) = subplots(8.4, 4.6, beside=True)
-    xs, _ = _place(ax, "x", values)
+    places, x = _place(config, path, values)
+    parts = []
     for i, kind in enumerate(summary["observers"]):
-        errors = [point["sides"][side]["kinds"][kind]["error"] for point in summary["points"]]
-        look: JsonObject = {"color": COLOURS[i % len(COLOURS)], "ls": ("-", "--", ":")[i // len(COLOURS) % 3]}
-        ax.plot(xs, np.array(errors, float), "o", ms=4, label=kind, **look)
-    ax.set(yscale="log", xlabel=axis_label(config, path), ylabel=f"{side}: {error_label(summary)}", title=side)
-    figure.legend(handles=ax.get_legend_handles_labels()[0], loc="outside right center")
-    return Drawn(f"observers_{side}", figure, f"{side}: error of each kind, tuned at each point, {_where(summary)}.")
+        errors = np.array([point["sides"][side]["kinds"][kind]["error"] for point in summary["points"]], float)
+        dashes = ("-", "--", ":")[i // len(COLOURS) % 3]
+        parts.append(Line(places, errors, kind, COLOURS[i % len(COLOURS)], dashes=dashes, marker="o", size=4.0))
+    caption = f"{side}: error of each kind, tuned at each point, {_where(summary)}."
+    panel = Panel(x, Axis(f"{side}: {error_label(summary)}", log=True), parts, side)
+    return Figure(f"observers_{side}", [panel], caption, height=4.0)
 
 
 def _two_digits(value: float) -> str:
@@ -158,64 +140,44 @@ def short_names(kinds: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def _map(config: Config, summary: JsonObject, side: str) -> Drawn:
+def _map(config: Config, summary: JsonObject, side: str) -> Figure:
     """The best kind at each point; a panel for each value of further axes."""
-    varied, short = _varied_values(config, summary, side), short_names(summary["observers"])
+    varied, short, kinds = _varied_values(config, summary, side), short_names(summary["observers"]), summary["observers"]
     (x, xs), (y, ys) = list(varied.items())[-1:-3:-1]
     further = {path: values for path, values in varied.items() if path not in (x, y)}
-    panels = list(product(*further.values()))
-    kinds = summary["observers"]
-    reference = kinds[0]
-    columns = min(len(panels), 3)
-    rows = -(-len(panels) // columns)
-    size = max(0.95 * len(xs), 2.6) * columns + 1.6, max(0.72 * len(ys), 1.6) * rows + 1.8
-    figure, axes = subplots(*size, rows, columns, beside=True, sharex=True, sharey=True)
-    colours = dict(zip(kinds, _KIND_COLOURS * 5, strict=False))
     points = {tuple(point["values"][path] for path in (*further, y, x)): point["sides"][side] for point in summary["points"]}
-    winners: set[str] = set()
-    tied = False
-    for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
-        cells = set_up_map(ax, *zip(_place(ax, "x", xs), _place(ax, "y", ys), strict=True))
-        colour = np.empty((len(ys), len(xs), 3))
-        for (j, v), (k, u) in product(enumerate(ys), enumerate(xs)):
-            point = points[*panel, v, u]
-            best = point["best"]
-            colour[j, k] = to_rgb(MISSING if best is None else colours[best])
-            if best is None:
-                continue
-            winners.add(best)
-            tied |= bool(point["not_told_apart"])
-            ratio = point["kinds"][reference]["ratio"]
-            text = short[best] + ("=" if point["not_told_apart"] else "")
-            if best != reference:
-                text += f"\n{short[reference]} {'–' if ratio is None else f'×{_two_digits(ratio)}'}"
-            dark = colour[j, k] @ (0.299, 0.587, 0.114) < 0.5
-            place = cells.centres[0][k], cells.centres[1][j]
-            ax.text(*place, text, ha="center", va="center", fontsize=9, color="white" if dark else "black")
-        ax.pcolormesh(*cells.edges, colour, edgecolors="white", lw=0.8, rasterized=True)
-        ax.set_title(", ".join(f"{p} = {v:g} {numeric_paths(config)[p].unit}" if not isinstance(v, str) else f"{p} = {v}"
-                               for p, v in zip(further, panel, strict=True)), fontsize=9)  # fmt: skip
-        if i + columns >= len(panels):
-            ax.set_xlabel(axis_label(config, x))
-        if not i % columns:
-            ax.set_ylabel(axis_label(config, y))
-    for ax in axes[len(panels) :]:
-        ax.set_visible(False)
-    handles: list[Any] = [Patch(color=colours[kind], label=f"{short[kind]}: {kind}") for kind in kinds if kind in winners]
-    remarks = {
-        f"{short[reference]} ×: error of {reference} over the best one's": winners - {reference},
-        "=: another kind may be as good": tied,
-    }
-    handles += [Line2D([], [], ls="", label=remark) for remark, holds in remarks.items() if holds]
-    figure.suptitle(f"{side}: observer with the least {summary['objective']} error", fontsize=11)
-    legend_below(figure, handles, max(int(size[0] / 2.7), 1))
-    return Drawn(
-        f"observers_{side}",
-        figure,
-        f"{side}: the kind with the least {error_label(summary)} at each point, {_where(summary)}, and below it how many "
-        f"times that error {reference} has (–: diverged). An equals sign: another kind's error may be as small (95 % "
-        "interval).",
+    (across, x_axis), (up, y_axis) = _place(config, x, xs), _place(config, y, ys)
+    edges = cell_edges(across, x_axis.log), cell_edges(up, y_axis.log)
+    scale = Scale(-0.5, 9.5, "", colours="tab10")
+    numbers = {kind: i % 10 for i, kind in enumerate(kinds)}
+    winners = {point["best"] for point in points.values()} - {None}
+    panels, columns = [], arrange(math.prod(map(len, further.values())))
+    for values in product(*further.values()):
+        cells = [[points[*values, v, u] for u in xs] for v in ys]
+        best = np.array([[numbers.get(cell["best"], np.nan) for cell in row] for row in cells])
+        texts = [_cell_text(cell, short) for row in cells for cell in row]
+        place_x, place_y = (axis.ravel() for axis in np.meshgrid(across, up))
+        winners_map = Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow")
+        parts = [winners_map, Line(place_x, place_y, width=0.0, texts=texts)]
+        title = ", ".join(with_value(config, *pair) for pair in zip(further, values, strict=True))
+        panels.append(Panel(x_axis, y_axis, parts, title))
+    names = ", ".join(f"{short[kind]}: {kind}" for kind in kinds if kind in winners)
+    caption = (
+        f"{side}: the kind with the least {error_label(summary)} at each point ({names}), {_where(summary)}, and below it "
+        f"how many times that error {kinds[0]} ({short[kinds[0]]}) has (–: diverged). An equals sign: another kind's error "
+        "may be as small (95 % interval)."
     )
+    width, height = max(0.95 * len(xs), 2.6) * columns + 1.0, max(0.72 * len(ys), 1.6) + 0.7
+    return Figure(f"observers_{side}", panels, caption, columns, width, height)
+
+
+def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
+    """The best kind at a point in letters, and how many times its error the first kind has."""
+    best, (reference, *_) = point["best"], short
+    if best is None:
+        return ""
+    text, ratio = short[best] + ("=" if point["not_told_apart"] else ""), point["kinds"][reference]["ratio"]
+    return text if best == reference else f"{text}\n{short[reference]} {'–' if ratio is None else f'×{_two_digits(ratio)}'}"
 
 
 def write_choice(choice: ObserverChoice, folder: Path) -> str:

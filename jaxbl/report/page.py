@@ -21,21 +21,15 @@ import numpy as np
 from jaxbl.files import catch_write_errors, write_atomic
 from jaxbl.result import VERDICTS, Result, ResultTable
 
-from .figures import Drawn, save
-from .picture import Picture, picture
+from .drawing import Picture, picture
+from .panels import Figure
 
 
-def write_page(folder: Path, result: Result, drawn: Sequence[Drawn], config: str) -> None:
+def write_page(folder: Path, result: Result, figures: Sequence[Figure], config: str) -> None:
     """Write figures into `figures/`, and `report.html` with the result, the figures and the study's TOML."""
-    save_all(drawn, folder)
-    pictures = [(figure.name, picture(figure)) for figure in drawn]
-    write_atomic(folder / "report.html", format_page(result, pictures, config))
-
-
-def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
-    """Write figures into the folder's `figures/`. Returns their files and captions."""
     with catch_write_errors(folder):
-        return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
+        pictures = [(figure.name, picture(figure, folder / "figures" / f"{figure.name}.png")) for figure in figures]
+    write_atomic(folder / "report.html", format_page(result, pictures, config))
 
 
 _SHORT = 8

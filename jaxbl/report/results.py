@@ -28,15 +28,15 @@ from jaxbl.validation import suggest_word
 
 from .compare import describe_comparison, draw_comparison, write_comparison
 from .diagnose import describe_diagnosis, draw_diagnosis, write_diagnosis
+from .drawing import picture
 from .element import describe_element, draw_element, write_element
-from .figures import Drawn, lay_out
 from .identify import describe_identification, write_identification
 from .identify_figures import draw_identification
 from .inspect import describe_inspection, draw_inspection, write_inspection
 from .maps import draw as draw_study
 from .observer_choice import describe_choice, draw_choice, write_choice
 from .page import write_page
-from .picture import picture
+from .panels import Figure
 from .simulate import describe_trial, draw_trial, write_trial
 from .sweep import describe_sweep, write_sweep
 from .tune import describe_tuning, draw_tuning, write_tuning
@@ -55,7 +55,7 @@ class _Kind(NamedTuple):
     """
 
     describe: Callable[[Any], Result]
-    draw: Callable[[Any], list[Drawn]]
+    draw: Callable[[Any], list[Figure]]
     write: Callable[[Any, Path], str]
     last: str = ""
 
@@ -81,16 +81,15 @@ _KINDS = {
 }
 
 
-class Drawings(list[Drawn]):
-    """Figures: a list of names, `matplotlib` figures and captions, which a notebook shows."""
+class Drawings(list[Figure]):
+    """Figures (:class:`jaxbl.report.panels.Figure`), which a notebook shows."""
 
     def _repr_html_(self) -> str:
-        return "".join(map(_figure, self))
+        return "".join(map(_format_figure, self))
 
 
-def _figure(drawn: Drawn) -> str:
-    lay_out(drawn.figure)
-    image = picture(drawn)
+def _format_figure(figure: Figure) -> str:
+    image = picture(figure)
     return (
         f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
         f"<figcaption>{escape(image.caption)}</figcaption></figure>"
@@ -109,10 +108,10 @@ def draw(result: Any, *names: str) -> Drawings:
     Raises:
         InputError: no result of these, or no figure of that name.
     """
-    drawn = {figure.name: figure for figure in _kind_of(result).draw(result)}
-    if unknown := [name for name in names if name not in drawn]:
-        raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], drawn)}")
-    return Drawings(drawn[name] for name in names or drawn)
+    figures = {figure.name: figure for figure in _kind_of(result).draw(result)}
+    if unknown := [name for name in names if name not in figures]:
+        raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], figures)}")
+    return Drawings(figures[name] for name in names or figures)
 
 
 def describe(result: Any) -> Result:

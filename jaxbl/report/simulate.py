@@ -12,25 +12,25 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
 from .error_plane import error_plane
-from .figures import (
+from .gain_plane import conditions_line, draw_gain_plane
+from .panels import (
     BLACK,
     BLUE,
     SIDE_COLOURS,
     SIDES,
     VERMILION,
-    Drawn,
-    draw_zero,
-    legend,
-    stacked,
-    style,
-    subplots,
+    ZERO,
+    Axis,
+    Figure,
+    Line,
+    Panel,
+    Span,
+    cloud,
+    stack,
     with_unit,
 )
-from .gain_plane import conditions_line, draw_gain_plane
 
-_TRUE, _OBSERVED = BLACK, VERMILION
-_POINTS = 6000
-"""Points of a line: a page is about 1000 pixels wide."""
+_TIME = Axis("time (s)")
 
 
 def write_trial(trial: Trial, folder: Path) -> str:
@@ -87,111 +87,103 @@ def describe_trial(trial: Trial) -> Result:
     return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
-@style()
-def draw_trial(trial: Trial) -> list[Drawn]:
+def draw_trial(trial: Trial) -> list[Figure]:
     """All figures of a run."""
-    trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
+    trace = trial.trace
     sides = [side for side in SIDES if f"{side}.position" in trace]
-    drawn = [_torque(trace, sides)]
-    drawn += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
-    drawn.append(_input(trace))
+    figures = [_torque(trace, sides)]
+    figures += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
+    panel = Panel(_TIME, Axis("input torque u (N m)"), [Line(trace["t"], trace["u"])])
+    figures.append(Figure("input", [panel], "Input torque (analogue of Fig. 7).", height=2.4))
     judged = trial.summary["conditions"]
-    drawn += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
-    drawn += [error_plane(trial.trace, side, gains) for side, gains in judged.items()]
+    figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
+    figures += [error_plane(trace, side, gains) for side, gains in judged.items()]
     if len(sides) == 2:
-        last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
-        drawn += [_draw_identified(trial, trace, last), _hysteresis(last), _limit_cycle(last)]
-    return drawn
-
-
-def _input(trace: DataFrame) -> Drawn:
-    figure, (ax,) = subplots(7.0, 2.4)
-    ax.plot(trace["t"], trace["u"], color=_TRUE)
-    ax.set(xlabel="time (s)", ylabel="input torque u (N m)")
-    return Drawn("input", figure, "Input torque (analogue of Fig. 7).")
+        last = DataFrame(trace[trace["t"] > 0.5 * trace["t"].iloc[-1]])
+        figures += [_draw_identified(trial, last), _hysteresis(last), _limit_cycle(last)]
+    return figures
 
 
 _FIGURES = {"motor.velocity": "8-9", "motor.position": "10-11", "load.velocity": "12-13", "load.position": "14-15"}
 _UNITS = {"velocity": "rad/s", "position": "rad"}
 
 
-def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Drawn:
-    figure, (above, below) = stacked(2, 1.9, width=7.0)
+def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Figure:
     name, unit = f"{side}.{quantity}", _UNITS[quantity]
     time, true, estimate = (trace[column] for column in ("t", name, f"{name}_estimate"))
-    above.plot(time, estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
-    above.plot(time, true, color=_TRUE, lw=1.0, label="true")
-    above.set(ylabel=f"{side} {quantity} ({unit})")
-    legend(above, 2)
-    below.plot(time, true - estimate, color=BLUE)
-    draw_zero(below)
-    below.set(ylabel=f"error ({unit})")
-    return Drawn(
-        f"{side}_{quantity}",
-        figure,
-        f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]}).",
-    )
+    lines = [Line(time, estimate, "observer", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
+    panels = [
+        Panel(_TIME, Axis(f"{side} {quantity} ({unit})"), lines),
+        Panel(_TIME, Axis(f"error ({unit})"), [ZERO, Line(time, true - estimate, colour=BLUE)]),
+    ]
+    caption = f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]})."
+    return stack(f"{side}_{quantity}", panels, caption)
 
 
-def _torque(trace: DataFrame, sides: list[str]) -> Drawn:
-    figure, (above, below) = stacked(2, 1.9, width=7.0)
+def _torque(trace: DataFrame, sides: list[str]) -> Figure:
     time, torque = trace["t"], trace["torque"]
-    for side in sides:
-        estimate, colour = trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]
-        above.plot(time, estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
-        below.plot(time, torque - estimate, color=colour, lw=1.0, alpha=0.75)
-    above.plot(time, torque, color=_TRUE, lw=1.0, label="true")
+    estimates = {side: trace[f"{side}.torque_estimate"] for side in sides}
+    above = [
+        Line(time, estimate, f"from the {side} observer", SIDE_COLOURS[side], 2.0, opacity=0.75)
+        for side, estimate in estimates.items()
+    ]
+    below = [
+        Line(time, torque - estimate, colour=SIDE_COLOURS[side], width=1.0, opacity=0.75)
+        for side, estimate in estimates.items()
+    ]
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
-    above.set(ylabel=f"{name} (N m)")
-    legend(above, 3)
-    draw_zero(below)
-    below.set(ylabel="error (N m)")
-    return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
+    panels = [
+        Panel(_TIME, Axis(f"{name} (N m)"), [*above, Line(time, torque, "true", width=1.0)]),
+        Panel(_TIME, Axis("error (N m)"), [ZERO, *below]),
+    ]
+    return stack("torque", panels, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
 
-def _draw_identified(trial: Trial, trace: DataFrame, last: DataFrame) -> Drawn:
-    identified = trial.summary["identified"]
+def _draw_identified(trial: Trial, last: DataFrame) -> Figure:
+    trace, panels = trial.trace, []
     # what a law derives from its own parameters is an angle, as they are
     units = units_of(trial.config.build().transmission)
-    figure, axes = stacked(len(identified), 2.0, width=7.0)
-    for ax, (name, values) in zip(axes, identified.items(), strict=True):
+    for name, values in trial.summary["identified"].items():
         true = values["true"]
-        for side in SIDES:
-            ax.plot(trace["t"], trace[f"{side}.{name}"], color=SIDE_COLOURS[side], label=f"{side} identifier")
-        ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
+        lines = [Line(trace["t"], trace[f"{side}.{name}"], f"{side} identifier", SIDE_COLOURS[side]) for side in SIDES]
         # the estimates of the first half still converge: the second half sets the scale
         largest = float((last[[f"{side}.{name}" for side in SIDES]] - true).abs().max(axis=None))
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
-        ax.set(ylabel=with_unit(name.replace("_", " "), units.get(name, "rad")), ylim=(true - reach, true + reach))
-    legend(axes[0], 3)
-    return Drawn("dead_zone", figure, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
+        axis = Axis(with_unit(name.replace("_", " "), units.get(name, "rad")), ends=(true - reach, true + reach))
+        panels.append(Panel(_TIME, axis, [*lines, Span(true, true, "true", along="y")]))
+    return stack("dead_zone", panels, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 
-def _hysteresis(last: DataFrame) -> Drawn:
-    figure, (left, right) = subplots(7.0, 3.4, columns=2)
-    for side in SIDES:
-        left.plot(last["z"], last[f"{side}.torque_estimate"], color=SIDE_COLOURS[side], lw=1.6, alpha=0.75, label=side)
-    left.plot(last["z"], last["torque"], ".", ms=1.5, color=_TRUE, label="true")
-    left.set(xlabel="twist z = θe − N₀ θs (rad)", ylabel="transmitted torque C (N m)")
-    legend(left, 3, loc="lower left", bbox_to_anchor=(-0.1, 1.0), columnspacing=0.8)
-    right.plot(last["theta_e"], last["theta_s"], color=_OBSERVED, lw=1.8, label="measured")
-    right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
-    right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
-    legend(right, 2)
-    return Drawn(
-        "hysteresis",
-        figure,
+def _hysteresis(last: DataFrame) -> Figure:
+    twist = last["z"]
+    loops = [
+        Line(twist, last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
+        for side in SIDES
+    ]
+    loops.append(cloud(twist, last["torque"], "true", BLACK, opacity=1.0))
+    positions = [
+        Line(last["theta_e"], last["theta_s"], "measured", VERMILION, 1.8),
+        Line(last["motor.position_estimate"], last["load.position_estimate"], "observed", width=0.8),
+    ]
+    panels = [
+        Panel(Axis("twist z = θe − N₀ θs (rad)"), Axis("transmitted torque C (N m)"), loops),
+        Panel(Axis("motor position θe (rad)"), Axis("load position θs (rad)"), positions),
+    ]
+    caption = (
         "Torque over twist (chatter and lag of the estimates widen the loop), and load over motor position. Second half of "
-        "the run (analogue of Fig. 17).",
+        "the run (analogue of Fig. 17)."
     )
+    return Figure("hysteresis", panels, caption, columns=2)
 
 
-def _limit_cycle(last: DataFrame) -> Drawn:
-    figure, (left, right) = subplots(7.0, 3.4, columns=2)
-    for ax, side, angle in ((left, "motor", "θe"), (right, "load", "θs")):
-        position, velocity = last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"]
-        ax.plot(position, velocity, color=_OBSERVED, lw=2.2, alpha=0.8, label="observed")
-        ax.plot(last[f"{side}.position"], last[f"{side}.velocity"], color=_TRUE, lw=0.9, label="true")
-        ax.set(xlabel=f"{side} position {angle} (rad)", ylabel=f"{side} velocity (rad/s)")
-    legend(left, 2, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    return Drawn("limit_cycle", figure, "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28).")
+def _limit_cycle(last: DataFrame) -> Figure:
+    panels = []
+    for side, angle in zip(SIDES, ("θe", "θs"), strict=True):
+        looks = {"_estimate": ("observed", VERMILION, 2.2, 0.8), "": ("true", BLACK, 0.9, 1.0)}
+        lines = [
+            Line(last[f"{side}.position{end}"], last[f"{side}.velocity{end}"], name, colour, width, opacity=opacity)
+            for end, (name, colour, width, opacity) in looks.items()
+        ]
+        panels.append(Panel(Axis(f"{side} position {angle} (rad)"), Axis(f"{side} velocity (rad/s)"), lines))
+    caption = "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28)."
+    return Figure("limit_cycle", panels, caption, columns=2)

@@ -24,9 +24,9 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Distinct, Groups, Rows, spread
-from .figures import SIDES
 from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
 from .numbers import percent
+from .panels import SIDES
 
 
 def write_sweep(result: StudyResult, folder: Path) -> str:

@@ -2,55 +2,49 @@
 
 from itertools import cycle, product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.patches import Patch, Rectangle
 from pandas import DataFrame
 
 from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
-from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines, doubts_among
-from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
-from .figures import (
+from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
+from .maps import cell_edges, colour_scale, flat_remark
+from .numbers import lead_with_doubt, percent
+from .panels import (
     BLUE,
     GREEN,
-    MAP,
     MARKERS,
     MISSING,
     ORANGE,
     SIDES,
     SKY,
     VERMILION,
-    Axes,
-    Drawn,
-    Line2D,
-    colour_bar,
-    legend_below,
+    Array,
+    Axis,
+    Bars,
+    Figure,
+    Line,
+    Map,
+    Panel,
+    Part,
+    Span,
     literal,
     mark,
     stretches,
-    style,
-    subplots,
     with_unit,
 )
-from .gain_plane import conditions_line, name_gains, name_ratio
-from .maps import Cells, cell_edges, color_norm, condition_curves, flat_remark, hatch_failures, outline_effects, set_up_map
-from .numbers import lead_with_doubt, percent
-
-_CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
 
-@style()
-def draw_tuning(tuning: Tuning) -> list[Drawn]:
+def draw_tuning(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
     maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
@@ -70,65 +64,40 @@ def _compared_gains(summary: JsonObject, side: str) -> list[tuple[str, str, Json
     return [(literal(row["name"]), marker, row) for row, marker in zip(rows, cycle(MARKERS), strict=False)]
 
 
-def _map(tuning: Tuning, side: str) -> Drawn:
+def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
     coarse = tuning.candidates[side].query("stage == 0")
     tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
         index="lambda",
         columns="alpha",
-        values=["error", "feasible", *(CONSTRAINT_COLUMNS[name] for name in limits["binding"])],
+        values=["error", "feasible"],
         dropna=False,
     )
-    grid = tables["error"].to_numpy(float)
-    norm = color_norm(grid, "log")
-    figure, (ax,) = subplots(7.2, 6.0, beside=True)
-    ax.set_facecolor(MISSING)
-    cells = set_up_map(ax, [axis.to_numpy(float) for axis in (tables["error"].columns, tables.index)])
-    ax.pcolormesh(*cells.edges, grid, cmap=MAP, norm=norm, rasterized=True)
-    handles: list[Any] = hatch_failures(ax, cells, tables["feasible"].to_numpy(float), "constraints not met")
-    bold = []
-    for name in limits["binding"]:
-        if line := _binding_line(ax, cells, tables, name, limits["constraints"][name]):
-            handles += line
-            bold.append(name)
-    handles += condition_curves(ax, _CONDITIONS, bound, tuple(cells.edges[0][[0, -1]]))
+    grid, failed = tables["error"].to_numpy(float), ~(tables["feasible"].to_numpy(float) >= 0.5)
+    values = np.where(failed, np.nan, grid)
+    x, y = (cell_edges(axis.to_numpy(float), True) for axis in (tables["error"].columns, tables.index))
+    alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
+    cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
+    parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
     for window in summary["stages"][1:2]:
         left, right = np.array(window[side]["alpha_ratio"]) * bound
         low, high = np.array(window[side]["lambda_ratio"]) * np.sqrt(bound)
-        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
-        handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
-    for name, marker, row in _compared_gains(summary, side):
-        handles.append(mark(ax, (row["alpha"], row["lambda"]), marker, name, 8))
-    handles.append(mark(ax, (gains["alpha"], gains["lambda"]), "*", "tuned", 15))
-    name_gains(ax, bound)
-    ax.set_title(
-        f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
-        + (f"\n{flat}" if (flat := flat_remark(grid)) else "")
-    )
-    colour_bar(figure, ax, norm, label)
-    if missing := np.isnan(grid).sum():
-        handles.append(Patch(facecolor=MISSING, label=f"diverged ({missing} points)"))
-    legend_below(figure, handles)
-    remark = f" Bold line: {' and '.join(bold)}, which bind{'s' * (len(bold) == 1)}." if bold else ""
-    return Drawn(
-        f"tuning_{side}",
-        figure,
+        corners = [left, right, right, left, left]
+        parts.append(Line(corners, [low, low, high, high, low], "first zoom", "#777777", 1.2, "--"))
+    parts += [mark(row["alpha"], row["lambda"], name, marker, 8.0) for name, marker, row in _compared_gains(summary, side)]
+    parts.append(mark(gains["alpha"], gains["lambda"], "tuned"))
+    title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
+    if flat := flat_remark(values):
+        title = f"{title}\n{flat}"
+    remark = f" The edge of what meets them is that of {' and '.join(limits['binding'])}." if limits["binding"] else ""
+    caption = (
         f"{side}: {label} over all runs, on the coarse map; above and on the right the axes of the atlas "
-        f"(jaxbl verify). Hatched: not converged, or a margin not met.{remark} Curves: least λ of the gain conditions at "
-        "the f⁺ of the pilot run. The other gains are compared below.",
+        f"(jaxbl verify). Grey: not converged, or a margin not met.{remark} Curves: the exact gain condition at "
+        "the f⁺ of the pilot run, and the usual rule's gains for it and larger ones. The other gains are compared below."
     )
-
-
-def _binding_line(ax: Axes, cells: Cells, tables: DataFrame, name: str, constraint: JsonObject) -> list[Line2D]:
-    """The line on the coarse map along which a constraint that binds is just met. Returns the legend's handles."""
-    values, level = tables[CONSTRAINT_COLUMNS[name]].to_numpy(float), constraint.get("limit", 0.5)
-    if not np.nanmin(values) < level < np.nanmax(values):
-        return []
-    colour, effects = _LIMITS[name], outline_effects(5.0, "white")
-    lines = ax.contour(*cells.out_to_edges(values), levels=[level], colors=colour, linewidths=3.0, zorder=3)
-    lines.set_path_effects(effects)
-    return [Line2D([], [], color=colour, lw=3.0, path_effects=effects, label=_with_limit(name, constraint))]
+    panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title)
+    return Figure(f"tuning_{side}", [panel], caption, width=6.4, height=4.8)
 
 
 _LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#3F51B5", "margin_exact": "#E8000B", "longest_convergence": "#8B4513"}
@@ -148,50 +117,43 @@ def _missing(names: list[str]) -> str:
     return " and ".join([*parts, "does not converge"] if "converged" in names else parts)
 
 
-def _limits(tuning: Tuning, side: str) -> Drawn:
+def _limits(tuning: Tuning, side: str) -> Figure:
     """The error along each gain through the optimum, and what ends the way to each side."""
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     limits, gains, objective = summary["limits"][side], summary["gains"][side], summary["objective"]
-    error = summary["achieved"][side][f"{objective}_rmse"]
-    figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
-    shaded: JsonObject = {}
-    handles: list[Any] = []
-    for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
-        line = DataFrame(limits["profiles"][gain])
+    error, label, panels = summary["achieved"][side][f"{objective}_rmse"], f"worst {error_label(summary)}", []
+    for gain, symbol, unit, ratio_label, ratio in _PLANES:
+        line, parts = DataFrame(limits["profiles"][gain]), list[Part]()
         x, y = (line[name].to_numpy(float) for name in (gain, "error"))
         edges = cell_edges(x, True)
-        ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]], xlabel=f"{symbol} ({unit})")
         for name, constraint in limits["constraints"].items():
-            look: JsonObject = {"facecolor": _LIMITS[name], "alpha": 0.4 if constraint["binds"] else 0.15, "lw": 0.0}
-            for first, last in stretches(line["missed"].map(lambda names, name=name: name in names)):
-                ax.axvspan(edges[first], edges[last], **look)
-                shaded[name] = Patch(**look, label=f"not met: {_with_limit(name, constraint)}")
-        handles = ax.plot(x, y, color=BLUE, lw=2.0, label=f"worst {error_label(summary)}")
+            look = f"not met: {_with_limit(name, constraint)}", _LIMITS[name], "x", 0.4 if constraint["binds"] else 0.15
+            missed = line["missed"].map(lambda names, name=name: name in names)
+            parts += [Span(edges[first], edges[last], *look) for first, last in stretches(missed)]
+        parts.append(Line(x, y, label, BLUE, 2.0))
         if objective == "velocity":
             chatter = line["chatter"].to_numpy(float)
             with np.errstate(invalid="ignore"):
                 slow = np.sqrt(y**2 - chatter**2)
-            handles += ax.plot(x, chatter, color=ORANGE, lw=1.2, label="its chatter, sample to sample")
-            handles += ax.plot(x, slow, color=GREEN, lw=1.2, label="its slow part, the rest")
-        ax.axvline(gains[gain], color="black", lw=0.8)
-        handles.append(mark(ax, (gains[gain], error), "*", "tuned", 15, held=False))
-        smaller, larger = (f"{way} {symbol}: {_short(limit)}" for way, limit in limits["towards"][gain].items())
-        ax.set_title(f"← {smaller}", loc="left", fontsize=9)
-        ax.set_title(f"{larger} →", loc="right", fontsize=9)
-        name_ratio(ax, "x", ratio(bound), label)
-    axes[0].set_ylabel(f"worst {error_label(summary)}")
-    figure.suptitle(f"{side}: what limits the gains", fontsize=10)
-    legend_below(figure, [*shaded.values(), *handles])
+            parts.append(Line(x, chatter, "its chatter, sample to sample", ORANGE, 1.2))
+            parts.append(Line(x, slow, "its slow part, the rest", GREEN, 1.2))
+        parts.append(Span(gains[gain], gains[gain], width=0.8, dashes="-"))
+        parts.append(mark(gains[gain], error, "tuned", held=False))
+        smaller, larger = (_short(limit) for limit in limits["towards"][gain].values())
+        ends = float(edges[0]), float(edges[-1])
+        axis = Axis(f"{symbol} ({unit})", log=True, ends=ends, ratio=(float(ratio(bound)), ratio_label))
+        title = f"smaller {symbol}: {smaller}\nlarger {symbol}: {larger}"
+        panels.append(Panel(axis, Axis(label, log=True), parts, title))
     caption = (
-        f"{side}: the error along each gain, with the other one as tuned, from the runs of all maps (between two rows of a "
-        "map, interpolated). "
+        f"{side}: what limits the gains: the error along each of them, with the other one as tuned, from the runs of all "
+        "maps (between two rows of a map, interpolated). "
     )
     if objective == "velocity":
         caption += (
             "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
             "chatter is not above the error. "
         )
-    return Drawn(f"limits_{side}", figure, caption)
+    return Figure(f"limits_{side}", panels, caption, 2, 8.4, 3.6)
 
 
 _PLANES = (
@@ -229,74 +191,75 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
 
 
-def _front(tuning: Tuning, side: str) -> Drawn:
+def _front(tuning: Tuning, side: str) -> Figure:
     summary, data = tuning.summary, (tuning.candidates[side].query("feasible"), DataFrame(tuning.summary["pareto"][side]))
-    feasible, front = ([table[name] for name in ("convergence_time", "error")] for table in data)
-    figure, (ax,) = subplots(6.6, 4.4, beside=True)
-    ax.plot(*feasible, ".", ms=3.5, color=MISSING, label="gains that meet all constraints")
-    ax.step(*front, "o-", where="post", ms=3.5, color=BLUE, label="none better in both")
-    handles = ax.get_legend_handles_labels()[0]
+    feasible, front = (Line(table["convergence_time"], table["error"], size=3.5) for table in data)
+    parts = [
+        feasible._replace(name="gains that meet all constraints", colour=MISSING, width=0.0, marker="."),
+        front._replace(name="none better in both", colour=BLUE, marker="o", steps=True),
+    ]
     keys, margins = ("convergence_time", f"{summary['objective']}_rmse"), summary["margins"]
     for name, marker, row in _compared_gains(summary, side):
-        place = tuple(row[key]["worst"] for key in keys)
-        if None in place:
-            handles.append(Line2D([], [], ls="", marker="", label=f"{name}: {100 * row['converged']:.3g} % converge"))
+        x, y = (row[key]["worst"] for key in keys)
+        if x is None or y is None:
+            parts.append(Line([], [], f"{name}: {100 * row['converged']:.3g} % converge", width=0.0))
             continue
         met = all(row[f"margin_{key}"] >= margin for key, margin in margins.items())
-        handles.append(mark(ax, place, marker, name if met else f"{name}, margins not met", 8, held=False))
-    handles.append(mark(ax, tuple(summary["achieved"][side][key] for key in keys), "*", "tuned", 15, held=False))
-    for (low, high), scale in ((ax.dataLim.intervalx, ax.set_xscale), (ax.dataLim.intervaly, ax.set_yscale)):
-        if low > 0.0 and high > 10.0 * low:
-            scale("log")
-    ax.set(xlabel="worst convergence time (s)", ylabel=f"worst {error_label(summary)}", title=side)
-    legend_below(figure, handles, 2)
-    return Drawn(
-        f"pareto_{side}",
-        figure,
-        f"{side}: error against convergence time, each the worst of all runs on the study's excitation.",
+        parts.append(mark(x, y, name if met else f"{name}, margins not met", marker, 8.0, held=False))
+    x, y = (summary["achieved"][side][key] for key in keys)
+    parts.append(mark(x, y, "tuned", held=False))
+    x_axis, y_axis = (
+        Axis(label, log=_spans_decade(np.concatenate([np.asarray(part[i], float) for part in parts])))
+        for i, label in enumerate(("worst convergence time (s)", f"worst {error_label(summary)}"))
     )
+    caption = f"{side}: error against convergence time, each the worst of all runs on the study's excitation."
+    return Figure(f"pareto_{side}", [Panel(x_axis, y_axis, parts, side)], caption, width=5.6)
 
 
-def _comparison(summary: JsonObject, sides: list[str]) -> Drawn:
+def _spans_decade(values: Array) -> bool:
+    finite = values[np.isfinite(values)]
+    return bool(finite.size) and finite.min() > 0.0 and finite.max() > 10.0 * finite.min()
+
+
+def _comparison(summary: JsonObject, sides: list[str]) -> Figure:
     rows, metric = summary["holdout"]["rows"], f"{summary['objective']}_rmse"
     names = list(dict.fromkeys(row["name"] for row in rows))
-    figure, axes = subplots(4.6 * len(sides) + 0.6, 1.8 + 0.62 * len(names), 2, len(sides), sharey=True)
+    y = Axis(ends=(len(names) - 0.5, -0.5), names=tuple(enumerate(map(literal, names))))
     compared = ((metric, f"worst {error_label(summary)}"), ("convergence_time", "worst convergence time (s)"))
-    for ax, ((key, label), side) in zip(axes, product(compared, sides), strict=True):
-        _bars(ax, key, [row for row in rows if row["side"] == side])
-        ax.set(xlabel=label, title=side if key == metric else "")
-    axes[0].set_yticks(range(len(names)), [literal(name) for name in names])
-    axes[0].invert_yaxis()
+    panels = [
+        _bars(key, label, y, side * (key == metric), [row for row in rows if row["side"] == side])
+        for (key, label), side in product(compared, sides)
+    ]
     first, last = summary["holdout"]["seeds"]
     seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"
-    return Drawn(
-        "tuning_holdout",
-        figure,
-        f"The gains {_where(summary)}, noise {seeds}: worst of all runs, and the median (stroke). Hatched: some runs "
-        "did not converge.",
+    caption = (
+        f"The gains {_where(summary)}, noise {seeds}: worst of all runs, and the median (stroke). Pale: some runs "
+        "did not converge."
     )
+    columns = len(sides)
+    return Figure("tuning_holdout", panels, caption, columns, 4.4 * columns + 0.6, 0.9 + 0.3 * len(names))
 
 
-def _bars(ax: Axes, key: str, rows: list[JsonObject]) -> None:
+def _bars(key: str, label: str, y: Axis, title: str, rows: list[JsonObject]) -> Panel:
     """Bars of a figure's worst value for each of the gains, with a stroke at the median."""
-    lengths = [row[key]["worst"] for row in rows if row[key]["worst"] is not None]
+    finite_rows = [
+        (i, row, row[key]["worst"], row[key]["median"]) for i, row in enumerate(rows) if row[key]["worst"] is not None
+    ]
+    lengths = [worst for *_, worst, _ in finite_rows]
     log = bool(lengths) and min(lengths) > 0.0 and max(lengths) > 30.0 * min(lengths)
-    ax.set_xscale("log" if log else "linear")
-    for i, row in enumerate(rows):
-        worst, median = row[key]["worst"], row[key]["median"]
-        if worst is None:
-            text = f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged"
-            ax.annotate(text, (0.01, i), xycoords=("axes fraction", "data"), va="center", color="#555555", fontsize=9)
-            continue
-        colour, hatch = VERMILION if row["name"] == "tuned" else SKY, None if row["converged"] == 1.0 else "//"
-        ax.barh(i, worst, 0.62, color=colour, hatch=hatch, edgecolor="white", linewidth=0.0)
-        if median is not None:
-            ax.plot(median, i, "|", ms=12, mew=1.6, color="black")
-        ax.annotate(f" {worst:.3g}", (worst, i), va="center", fontsize=9)
-    if lengths:
-        low = 0.5 * min(row[key]["median"] or row[key]["worst"] for row in rows if row[key]["worst"]) if log else 0.0
-        ax.set_xlim(low, max(lengths) * (3.0 if log else 1.22) or 1.0)
-    ax.grid(axis="y", visible=False)
+    low = 0.5 * min(median or worst for *_, worst, median in finite_rows if worst) if log else 0.0
+    high = max(lengths, default=1.0) * (3.0 if log else 1.22) or 1.0
+    parts: list[Part] = [
+        Bars([i], [worst], "", VERMILION if row["name"] == "tuned" else SKY, texts=[f"{worst:.3g}"],
+             opacity=1.0 if row["converged"] == 1.0 else 0.4)
+        for i, row, worst, _ in finite_rows
+    ]  # fmt: skip
+    medians = np.array([median for *_, median in finite_rows], float)
+    parts.append(Line(medians, [i for i, *_ in finite_rows], width=0.0, marker="|", size=12.0))
+    lost = [(i, row) for i, row in enumerate(rows) if row[key]["worst"] is None]
+    texts = [f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged" for _, row in lost]
+    parts.append(Line([low] * len(lost), [i for i, _ in lost], width=0.0, marker=" ", texts=texts))
+    return Panel(Axis(label, log=log, ends=(low, high)), y, parts, title)
 
 
 def write_tuning(tuning: Tuning, folder: Path) -> str:

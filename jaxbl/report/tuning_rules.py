@@ -1,91 +1,80 @@
 """Public tuning rules beside the exact condition: figure, sentence and table of `jaxbl verify`."""
 
-from typing import Any
-
 import numpy as np
 
-from jaxbl.gains.rules import RULES, allows_gains
+from jaxbl.gains.rules import RULES
 from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.result import ResultTable
 
-from .figures import COLOURS, FAINT, MISSING, Axes, Drawn, Line2D, Patch, decades, style, subplots
-from .maps import least_lambdas
+from .gain_plane import least_lambdas
+from .panels import COLOURS, FAINT, MISSING, Array, Axis, Band, Figure, Line, Panel, Part, Span, mark
 
 _ALPHA, _LAMBDA = (0.3, 20.0), (0.15, 25.0)
 """Ends of the plane, alpha / f⁺ and lambda / √f⁺."""
-_DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (3, 1)))
-_RULE_COLOURS = (*COLOURS[:6], FAINT)
+_LOOKS = tuple(zip((*COLOURS[:6], FAINT), ("-", "--", "-.", ":", "--", "-", "-."), strict=True))
 _MARKERS = ("D", "o", "s", "^")
 
 
-@style()
-def draw_rules(rules: list[JsonObject]) -> Drawn:
+def draw_rules(rules: list[JsonObject]) -> Figure:
     """The plane of gains with the exact border and the borders of all rules (`rules` of a verdict) at f⁺ = 1 rad/s²."""
-    figure, axes = subplots(10.4, 6.4, columns=2, beside=True, sharex=True, sharey=True)
-    titles = {
-        True: "Sufficient: all gains that they allow converge",
-        False: "Not sufficient: where shaded, gains that they allow do not converge",
-    }
-    for ax, (sufficient, title) in zip(axes, titles.items(), strict=True):
-        handles = _draw_border(ax)
-        looks, markers = zip(_RULE_COLOURS, _DASHES, strict=False), iter(_MARKERS)
+    x, y = Axis("α / f⁺", log=True, ends=_ALPHA), Axis("λ / √f⁺", log=True, ends=_LAMBDA)
+    titles = {True: "Sufficient: all gains allowed converge", False: "Not sufficient: where shaded, gains allowed fail"}
+    panels = []
+    for sufficient, title in titles.items():
+        alpha = np.geomspace(1.0001, _ALPHA[1], 400)
+        exact = least_lambdas(CONDITIONS["exact"], alpha, 1.0)
+        parts: list[Part] = [
+            Span(_ALPHA[0], 1.0, "does not converge", MISSING, opacity=0.55),
+            Band(alpha, np.full(400, _LAMBDA[0]), exact, "does not converge", MISSING, 0.55),
+        ]
+        looks, markers = iter(_LOOKS), iter(_MARKERS)
         for rule in sorted(rules, key=lambda rule: rule["kind"] == "gains"):
             if rule["sufficient"] != sufficient:
                 continue
             if rule["kind"] == "region":
-                handles.append(_draw_region(ax, rule, *next(looks)))
-                continue
-            look: Any = {"ls": "", "marker": next(markers), "mfc": "white", "mec": "black", "mew": 1.2}
-            ax.plot(rule["gains"]["alpha"], rule["gains"]["lambda"], zorder=6, ms=7, **look)
-            handles.append(Line2D([], [], label=rule["title"], **look))
-        ax.set_title(title)
-        ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, handlelength=3.2)
-    axes[0].set_ylabel("λ / √f⁺")
-    return Drawn(
-        "tuning_rules",
-        figure,
+                parts += _draw_region(rule, *next(looks))
+            else:
+                gains = rule["gains"]
+                parts.append(mark(gains["alpha"], gains["lambda"], rule["title"], next(markers), 7.0))
+        parts += [
+            Line([1.0, *alpha], [_LAMBDA[1], *exact], "exact, ρ < 1", width=2.4),
+            Line(alpha, SINE_LIMIT / np.sqrt(alpha), "a sine's limit cycle", width=1.2, dashes=":"),
+        ]
+        panels.append(Panel(x, y, parts, title))
+    caption = (
         "Rules for gains at f⁺ = 1 rad/s²: each allows what is above its line, or between its two lines; "
         "λ²/2α − λ⁴/16 < f⁺² allows what is below it. Grey: gains that do not converge under the worst disturbance. ×: "
         "gains that the rule allows, simulated; a rule that depends on units may fail only at another f⁺ (its × is in units "
-        "of that). Dotted: below it a sine within f⁺ upholds a limit cycle, if there is no friction.",
+        "of that). Dotted: below it a sine within f⁺ upholds a limit cycle, if there is no friction."
     )
+    return Figure("tuning_rules", panels, caption, 2, 10.4, 5.4)
 
 
-def _draw_border(ax: Axes) -> list[Any]:
-    """Exact border, what does not converge, and where a sine upholds a cycle. Returns the legend's handles."""
-    alpha = np.geomspace(1.0001, _ALPHA[1], 400)
-    exact = least_lambdas(CONDITIONS["exact"], alpha, 1.0)
-    ax.grid(False)
-    ax.set(xscale="log", yscale="log", xlim=_ALPHA, ylim=_LAMBDA, xlabel="α / f⁺")
-    decades(ax)
-    for axis, ticks in ((ax.xaxis, (0.5, 1, 2, 5, 10, 20)), (ax.yaxis, (0.2, 0.5, 1, 2, 5, 10, 20))):
-        axis.set_ticks(ticks)
-    below = {"color": MISSING, "alpha": 0.55, "lw": 0}
-    ax.axvspan(_ALPHA[0], 1.0, **below)
-    ax.fill_between(np.r_[1.0, alpha], _LAMBDA[0], np.r_[exact[0], exact], **below)
-    handles = ax.plot(np.r_[1.0, alpha], np.r_[_LAMBDA[1], exact], color="black", lw=2.4, label="exact, ρ < 1")
-    handles += ax.plot(alpha, SINE_LIMIT / np.sqrt(alpha), color="black", lw=1.2, ls=":", label="a sine's limit cycle")
-    return [*handles, Patch(**below, label="does not converge")]
-
-
-def _draw_region(ax: Axes, judged: JsonObject, colour: str, dashes: Any) -> Line2D:
-    """Borders of a rule's region; where it is wrong it is shaded. Returns the legend's handle."""
+def _draw_region(judged: JsonObject, colour: str, dashes: str) -> list[Part]:
+    """Borders of a rule's region; where it is wrong it is shaded."""
     alpha, rule = np.geomspace(*_ALPHA, 1201), RULES[judged["name"]]
     assert rule.intervals is not None
-    look: JsonObject = {"color": colour, "ls": dashes, "lw": 2.0, "label": judged["title"]}
+    parts: list[Part] = []
+    wrong, failing = judged["counterexample"], least_lambdas(CONDITIONS["exact"], alpha, 1.0)
     for low, high in rule.intervals(alpha, np.ones_like(alpha)):
         for border, is_border in ((low, low > 0.0), (high, np.isfinite(high))):
-            ax.plot(alpha, np.where((low < high) & is_border, border, np.nan), **look)
-    if (wrong := judged["counterexample"]) is not None:
-        lambda_ = np.geomspace(*_LAMBDA, 401)
-        rows = lambda_[:, None]
-        fails = allows_gains(rule, rows, alpha[None, :], 1.0) & (rows <= least_lambdas(CONDITIONS["exact"], alpha, 1.0))
-        ax.contourf(alpha, lambda_, fails, levels=[0.5, 1.5], colors=[colour], alpha=0.25)
-        place = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])
-        ax.plot(*place, "x", color=colour, ms=9, mew=2.5, zorder=7)
-    return Line2D([], [], **look)
+            parts.append(
+                Line(alpha, np.where((low < high) & is_border, border, np.nan), judged["title"], colour, 2.0, dashes)
+            )
+        if wrong is not None:
+            parts.append(_shade_wrong(alpha, low, np.minimum(high, failing), colour))
+    if wrong is not None:
+        x, y = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])
+        parts.append(Line([x], [y], colour=colour, width=0.0, marker="x", size=9.0))
+    return parts
+
+
+def _shade_wrong(alpha: Array, low: Array, high: Array, colour: str) -> Band:
+    """Shade the gains that a rule allows although they fail."""
+    ends = np.clip(low, *_LAMBDA), np.clip(high, *_LAMBDA)
+    return Band(alpha, ends[0], np.where(ends[0] < ends[1], ends[1], np.nan), "", colour)
 
 
 def rule_lines(rules: list[JsonObject]) -> list[str]:

@@ -6,10 +6,8 @@
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.colors import LogNorm
 from pandas import DataFrame, Series
 
 from jaxbl.files import to_jsonable
@@ -17,106 +15,70 @@ from jaxbl.gains.error_system import ErrorSystemMap, list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
-from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .error_plane import draw_worst_planes
-from .figures import (
-    BLUE,
-    COLOURS,
-    ORANGE,
-    VERMILION,
-    Axes,
-    Drawn,
-    Line2D,
-    colour_bar,
-    legend_below,
-    literal,
-    mark,
-    style,
-    subplots,
-    write_inside,
-)
-from .maps import condition_curves
+from .gain_plane import EXACT, condition_curves, usual_rule_curve
+from .maps import cell_edges
+from .panels import BLUE, COLOURS, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
 from .tuning_rules import draw_rules, rule_lines, rule_table
 
-_TWO = {name: CONDITIONS[name] for name in ("davila_fridman", "exact")}
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
-_MARKERS = ("*", "P", "D", "^", "v", "X", "s")
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 _ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 
 
-@style()
-def draw_verdict(verdict: Verdict) -> list[Drawn]:
+def draw_verdict(verdict: Verdict) -> list[Figure]:
     """All figures of a verification."""
     summary, plane = verdict.summary, verdict.error_map
     damping = [_damping(verdict)] if plane.boundary_by_damping else []
     levels = [_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)]
-    planes = draw_worst_planes(summary["marks"])
-    return [_atlas(verdict), draw_rules(summary["rules"]), *([planes] if planes else []), *damping, *levels]
+    return [_atlas(verdict), draw_rules(summary["rules"]), *draw_worst_planes(summary["marks"]), *damping, *levels]
 
 
-def _mark_gains(ax: Axes, verdict: Verdict, colour: str = "white") -> list[Line2D]:
-    """Mark the usual pair and the study's marks. Returns the legend's handles."""
+def _mark_gains(verdict: Verdict) -> list[Line]:
+    """Marks of the usual pair and of the study's marks."""
     places = [_USUAL]
     for gains in verdict.summary["marks"]:
         if gains["alpha_ratio"] is not None:
             places.append((literal(gains["name"]), gains["alpha_ratio"], gains["lambda_ratio"]))
-    pairs = zip(places, itertools.cycle(_MARKERS), strict=False)
-    return [mark(ax, place, marker, name, 12, colour) for (name, *place), marker in pairs]
+    pairs = zip(places, itertools.cycle(("*", *MARKERS)), strict=False)
+    return [mark(x, y, name, marker, 12.0) for (name, x, y), marker in pairs]
 
 
-def _set_up_plane(ax: Axes, plane: ErrorSystemMap) -> None:
-    xs, ys = plane.alpha, plane.lambda_
-    ax.set(xscale="log", yscale="log", xlim=xs[[0, -1]], ylim=ys[[0, -1]], xlabel=_ALPHA)
-    ticks = [tick for tick in (1.1, 1.5, 2, 3, 5, 10, 20, 50, 100) if xs[0] <= tick <= xs[-1]]
-    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    ax.set_xticks([], minor=True)
+def _plane_axes(plane: ErrorSystemMap, ylabel: str = _LAMBDA) -> list[Axis]:
+    pairs = ((_ALPHA, plane.alpha), (ylabel, plane.lambda_))
+    return [Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs]
 
 
-def _atlas(verdict: Verdict) -> Drawn:
+def _atlas(verdict: Verdict) -> Figure:
     plane = verdict.error_map
-    figure, (ax,) = subplots(7.6, 6.6, beside=True)
-    ax.grid(False)
-    norm, colours = LogNorm(0.05, 20.0), "PuOr_r"
-    ratio = np.clip(plane.ratio, 1e-6, 1e6)
-    ax.pcolormesh(plane.alpha, plane.lambda_, ratio, cmap=colours, norm=norm, rasterized=True, shading="nearest")
-    _set_up_plane(ax, plane)
-    handles: list[Any] = condition_curves(ax, list_conditions(verdict.config), 1.0, tuple(plane.alpha[[0, -1]]))
+    scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
+    edges = [cell_edges(values, True) for values in (plane.alpha, plane.lambda_)]
+    curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
     step = max(len(plane.alpha) // 24, 1)
-    look = {"marker": "o", "ms": 5, "mfc": "white", "mec": "black", "ls": ""}
-    ax.plot(plane.alpha[::step], plane.boundary[::step], **look, zorder=5)
-    handles += [Line2D([], [], label="simulated boundary", **look), *_mark_gains(ax, verdict)]
-    ax.set(ylabel=_LAMBDA, title="Error system under its worst disturbance: below the boundary it grows")
-    label = "ratio ρ of successive velocity peaks, simulated"
-    colour_bar(figure, ax, norm, label, colours, aspect=30, extend="both").ax.axhline(1.0, color="black", lw=1.0)
-    legend_below(figure, handles)
-    return Drawn(
-        "atlas",
-        figure,
-        f"Simulated ratio of successive velocity peaks over {ratio.size} cells; every condition demands a λ above its "
-        "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie.",
+    boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
+    parts = [Map(*edges, plane.ratio, scale), *curves, boundary, *_mark_gains(verdict)]
+    title = "Error system under its worst disturbance: below the boundary it grows"
+    caption = (
+        f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
+        "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
+    return Figure("atlas", [Panel(*_plane_axes(plane), parts, title)], caption, height=5.2)
 
 
-def _damping(verdict: Verdict) -> Drawn:
-    plane = verdict.error_map
-    figure, (ax,) = subplots(7.0, 4.8, beside=True)
+def _damping(verdict: Verdict) -> Figure:
+    plane, parts = verdict.error_map, list[Part]()
     for i, (damping, boundary) in enumerate(sorted({0.0: plane.boundary, **plane.boundary_by_damping}.items())):
-        label = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
+        name = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
         least = np.where(boundary > 0.0, boundary, np.nan)
-        ax.plot(plane.alpha, least, color=COLOURS[i % len(COLOURS)], lw=2.0, label=label)
-    _set_up_plane(ax, plane)
-    handles = [*ax.get_legend_handles_labels()[0], *_mark_gains(ax, verdict, ORANGE)]
-    ax.set_ylabel("least λ / √f⁺ that shrinks the error")
-    legend_below(figure, handles, 2)
-    return Drawn(
-        "friction",
-        figure,
+        parts.append(Line(plane.alpha, least, name, COLOURS[i % len(COLOURS)], 2.0))
+    axes = _plane_axes(plane, "least λ / √f⁺ that shrinks the error")
+    caption = (
         "Least λ at which the worst disturbance no longer enlarges a velocity error v, simulated with viscous friction. "
-        "The friction number is (friction / inertia) v / f⁺: friction shrinks large errors, not small ones.",
+        "The friction number is (friction / inertia) v / f⁺: friction shrinks large errors, not small ones."
     )
+    return Figure("friction", [Panel(*axes, [*parts, *_mark_gains(verdict)])], caption)
 
 
 def _normalise(frame: DataFrame, side: str) -> tuple[Series, Series]:
@@ -125,37 +87,37 @@ def _normalise(frame: DataFrame, side: str) -> tuple[Series, Series]:
     return frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
 
 
-def _levels(verdict: Verdict, side: str) -> Drawn:
+def _levels(verdict: Verdict, side: str) -> Figure:
     """The runs that converged and that failed, over the gains in units of each run's own true f_plus."""
-    figure, axes = subplots(9.4, 5.2, columns=len(verdict.levels), beside=True, sharex=True, sharey=True)
-    wrong, ends = verdict.counterexamples, np.ones((0, 2))
+    wrong, places = verdict.counterexamples, {}
     if len(wrong):
         wrong = wrong[(wrong["side"] == side) & (wrong["bound"] == "true") & (wrong["condition"] == "exact")]
-    for ax, (level, frame) in zip(axes, verdict.levels.items(), strict=True):
-        places = np.stack(_normalise(frame, side), axis=1)
-        places[~(np.isfinite(places).all(axis=1) & (places > 0.0).all(axis=1))] = np.nan
-        converged = frame[f"{side}.converged"].to_numpy(bool)
-        for rows, marker, colour, name in ((converged, ".", BLUE, "converged"), (~converged, "x", VERMILION, "failed")):
-            ax.plot(*places[rows].T, marker, ms=4, mew=0.9, color=colour, alpha=0.6, label=name, rasterized=True)
-        ends = np.concatenate([ends, places[np.isfinite(places).all(axis=1)]])
-        failures = sum(wrong["level"] == level) if len(wrong) else 0
-        ax.set(xscale="log", yscale="log", xlabel=_ALPHA, title=f"{_LEVELS[level]}\n{failures} failed though ρ < 1")
+    for level, frame in verdict.levels.items():
+        gains = np.stack(_normalise(frame, side), axis=1)
+        there = np.isfinite(gains).all(axis=1) & (gains > 0.0).all(axis=1)
+        places[level] = gains[there], frame[f"{side}.converged"].to_numpy(bool)[there]
+    ends = np.concatenate([gains for gains, _ in places.values()])
     if not len(ends):
-        write_inside(axes[0], "no run has a finite bound f⁺ and lambda > 0")
-        return Drawn(f"levels_{side}", figure, f"Runs of the drive, {side} observer: none to be drawn.")
+        panel = Panel(Axis(), Axis(), [], note="no run has a finite bound f⁺ and lambda > 0")
+        return Figure(f"levels_{side}", [panel], f"Runs of the drive, {side} observer: none to be drawn.")
     (left, low), (right, high) = ends.min(axis=0) / 1.2, 1.2 * ends.max(axis=0)
-    handles = [*axes[0].get_legend_handles_labels()[0]]
-    for ax in axes:
-        ax.set(xlim=(left, right), ylim=(low, high))
-        curves = condition_curves(ax, _TWO, 1.0, (max(left, 1.0001), max(right, 1.001)))
-    axes[0].set_ylabel(_LAMBDA)
-    legend_below(figure, [*handles, *curves])
-    return Drawn(
-        f"levels_{side}",
-        figure,
+    alphas, panels = (max(left, 1.0001), max(right, 1.001)), []
+    for level, (gains, converged) in places.items():
+        parts: list[Part] = [
+            cloud(*gains[rows].T, name, colour, marker=marker, size=size, opacity=0.7)
+            for rows, marker, colour, name, size in (
+                (converged, "o", BLUE, "converged", 3.0), (~converged, "x", VERMILION, "failed", 4.0)
+            )
+        ]  # fmt: skip
+        parts += [*condition_curves(EXACT, 1.0, alphas), usual_rule_curve(1.0, alphas)]
+        failures = sum(wrong["level"] == level) if len(wrong) else 0
+        axes = (Axis(_ALPHA, log=True, ends=(left, right)), Axis(_LAMBDA, log=True, ends=(low, high)))
+        panels.append(Panel(*axes, parts, f"{_LEVELS[level]}\n{failures} failed though ρ < 1"))
+    caption = (
         f"Runs of the drive, {side} observer, each in units of its own true f⁺, on the axes of the atlas. A real input is "
-        "not the worst disturbance: runs converge below the curves as well.",
+        "not the worst disturbance: runs converge below the curves as well."
     )
+    return Figure(f"levels_{side}", panels, caption, len(panels), 4.4 * len(panels), 4.2)
 
 
 def _name(level: JsonObject) -> str:

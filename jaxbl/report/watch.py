@@ -15,8 +15,8 @@ from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .figures import SIDE_COLOURS, SIDES, VERMILION, Drawn, legend, limits, outline, stacked, stretches, style
 from .numbers import lead_with_doubt
+from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stack, stretches
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
@@ -103,38 +103,38 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
     yield add
 
 
-@style()
-def draw_watch(watch: Watch) -> list[Drawn]:
+def draw_watch(watch: Watch) -> list[Figure]:
     """Gap, stiffness and friction over time."""
-    values, task = watch.values, watch.task
+    values, task, limit = watch.values, watch.task, watch.task.alarm_gap
     law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]
     # friction of each side acts on a shaft of its own
-    panels = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
+    rows = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
     if not len(values):
         return []
-    figure, axes = stacked(len(panels), 1.5)
-    time = values["t"].to_numpy(float)
-    for ax, (name, sides) in zip(axes, panels, strict=True):
-        curves, inside = [], []
+    time, panels = values["t"].to_numpy(float), []
+    half = 0.5 * task.interval
+    x = Axis("time (s)", ends=(time[0] - half, time[-1] + half))
+    for name, sides in rows:
+        parts, curves, inside = list[Part](), [], []
+        if name == "half_gap" and limit is not None:
+            inside = [limit]
+            parts += [
+                Span(time[start] - half, time[end - 1] + half, "alarm", VERMILION, opacity=0.12)
+                for start, end in stretches(values["alarm"].to_numpy(bool))
+            ]
+            parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
             middle, error = (values[f"{side}.{name}{kind}"].to_numpy(float) for kind in ("", "_error"))
             low, high = middle - INTERVAL * error, middle + INTERVAL * error
-            samples, colour = outline(middle), SIDE_COLOURS[side]
-            ax.fill_between(time[samples], low[samples], high[samples], color=colour, alpha=0.2, lw=0.0)
-            ax.plot(time[samples], middle[samples], color=colour, label=f"by the {side}'s observer")
-            curves += [middle, low, high]
-        ax.set_ylabel(f"{_LABELS[name]}\n{f'{side} ' if len(sides) == 1 else ''}({task.units[sides[0]][name]})")
-        if name == "half_gap" and task.alarm_gap is not None:
-            inside = [task.alarm_gap]
-            ax.axhline(task.alarm_gap, color="black", ls="--", lw=1.2, label="limit")
-            for start, end in stretches(values["alarm"].to_numpy(bool)):
-                ends = time[start] - 0.5 * task.interval, time[end - 1] + 0.5 * task.interval
-                ax.axvspan(*ends, color=VERMILION, alpha=0.12, lw=0.0, label="alarm")
-        # the first values of a stream may be wide
-        ax.set_ylim(limits(*curves, share=0.02, shown=inside))
-    axes[0].set_xlim(time[0] - 0.5 * task.interval, time[-1] + 0.5 * task.interval)
-    legend(axes[0], 4)
+            who = f"by the {side}'s observer"
+            parts += [Band(time, low, high, "", SIDE_COLOURS[side]), Line(time, middle, who, SIDE_COLOURS[side])]
+            # what is hardly determined would set the scale of all else
+            sure = error <= 3.0 * np.nanmedian(error) if np.isfinite(error).any() else np.isfinite(error)
+            curves += [middle[sure], low[sure], high[sure]]
+        lead = f"{sides[0]} " if len(sides) == 1 else ""
+        y = Axis(f"{_LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
+        panels.append(Panel(x, y, parts))
     caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
-    if task.alarm_gap is not None:
+    if limit is not None:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
-    return [Drawn("watch", figure, caption)]
+    return [stack("watch", panels, caption, 1.5)]

@@ -23,7 +23,7 @@ def test_a_notebook_shows_figures_with_captions_and_texts(study):
     assert len(figures) == 2 and [drawing.name for drawing in heatmap] == ["heatmap_motor_chatter"]
     html = heatmap._repr_html_()
     assert html.count("<figure>") == 1 and f"<figcaption>{heatmap[0].caption}</figcaption>" in html
-    assert f"x {ALPHA} (rad/s²) from " in html.partition('alt="')[2].partition('"')[0]
+    assert "x α, switching gain (rad/s²) from " in html.partition('alt="')[2].partition('"')[0]
 
 
 def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):

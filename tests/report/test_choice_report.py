@@ -3,15 +3,16 @@
 import copy
 import json
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from panel_parts import names_of, parts_of
 from small_study import listed_axis, rigid_study
 from test_page import Page
 
 from jaxbl.gains.tune import tune
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names
+from jaxbl.report.panels import Line
 from jaxbl.report.results import describe, draw, write_report
 
 # points differ in values of lanes alone
@@ -82,19 +83,19 @@ def test_kinds_that_are_alike_are_said_first(point_choice):
 
 def test_the_point_figure_has_a_dot_at_each_ratio(point_choice):
     (drawing,) = draw_choice(point_choice)
-    (ax,) = drawing.figure.axes
+    (panel,) = drawing.panels
     kinds = point_choice.summary["points"][0]["sides"]["motor"]["kinds"]
-    assert [label.get_text() for label in ax.get_yticklabels()] == list(kinds)
-    dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(dots, [kind["ratio"] for kind in kinds.values()])
+    assert [name for _, name in panel.y.names] == list(kinds)
+    (dots,) = [line for line in parts_of(panel, Line) if line.marker == "o"]
+    np.testing.assert_allclose(dots.x, [kind["ratio"] for kind in kinds.values()])
     assert drawing.name == "observers" and "rad/s" in drawing.caption
 
 
 def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
     (drawing,) = draw(mapped_choice, "observers_motor")
-    (ax,) = drawing.figure.axes
+    (line,) = parts_of(drawing.panels[0], Line)
     short_kinds = short_names(KINDS)
-    cells = {text.get_position(): text.get_text() for text in ax.texts}
+    cells = dict(zip(zip(line.x, line.y, strict=True), line.texts, strict=True))
     assert len(cells) == 6
     for point in mapped_choice.summary["points"]:
         noise, resolution = point["values"].values()
@@ -104,17 +105,16 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
         first, _, second = text.partition("\n")
         assert first == short_kinds[side["best"]] + "=" * bool(side["not_told_apart"])
         assert bool(second) == (side["best"] != "super_twisting")
-    save(drawing.figure, tmp_path / "map.png")
-    plt.close(drawing.figure)
+    save(drawing, tmp_path / "map.png")
 
 
 def test_one_axis_is_drawn_as_lines(mapped_choice):
     line_choice = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
     (drawing,) = draw_choice(line_choice)
-    (ax,) = drawing.figure.axes
-    assert [point.get_label() for point in ax.lines] == KINDS
+    (panel,) = drawing.panels
+    assert names_of(panel) == KINDS
     errors = [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in line_choice.summary["points"]]
-    np.testing.assert_allclose(ax.lines[2].get_ydata(), errors)
+    np.testing.assert_allclose(panel.parts[2].y, errors)
     # the same points are in the map
     np.testing.assert_allclose(
         errors, [point["sides"]["motor"]["kinds"]["kalman"]["error"] for point in mapped_choice.summary["points"]][::2]

@@ -6,11 +6,12 @@ import dataclasses
 import numpy as np
 import pytest
 from hidden.outcomes import FIRST_LINE
+from panel_parts import names_of, texts_of
 from passed import PASSED
 
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.report.diagnose import _draw_gap, _over_time, describe_diagnosis
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 
 ERRORS = {
     "theta_e": 0.1,
@@ -211,13 +212,12 @@ def test_a_torque_that_is_far_off_comes_first(relative, doubtful):
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
 def test_the_verdict_is_drawn(findings, tmp_path):
     drawing = _draw_gap(change_summary(findings=findings, verdict="explained" if findings else "no_discrepancy"))
-    left, right = drawing.figure.axes
-    assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"
-    assert left.get_yticklabels()[0].get_text() == "motor position\n0.1 → 0.0011 rad"
-    texts = [text.get_text().strip() for text in right.texts]
-    expected = ["load.coulomb_friction: 0.93", "or load.stribeck_friction: 0.07"] if findings else ["no effect named"]
-    assert texts == expected
-    assert save(drawing.figure, tmp_path / "gap.png").stat().st_size > 10_000
+    left, right = drawing.panels
+    assert left.x.label == "rms error on held-out data over noise" and left.x.log
+    assert left.y.names[0] == (0, "motor position\n0.1 → 0.0011 rad")
+    assert texts_of(right) == (["load.coulomb_friction: 0.93", "or load.stribeck_friction: 0.07"] if findings else [])
+    assert right.note == ("" if findings else "no effect named")
+    assert save(drawing, tmp_path / "gap.png").stat().st_size > 10_000
 
 
 @dataclasses.dataclass
@@ -248,7 +248,7 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     gap = {"holdout": {"separate": False}}
     part = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
     drawing = _over_time(part)  # type: ignore[arg-type]
-    (ax,) = drawing.figure.axes
-    assert ax.get_ylabel() == "motor:\nmissing torque (N m)"
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["before", "after", "± 2 noise", "held out"]
-    assert save(drawing.figure, tmp_path / "before_after.png").stat().st_size > 10_000
+    (panel,) = drawing.panels
+    assert panel.y.label == "motor:\nmissing torque (N m)"
+    assert {*names_of(panel)} == {"before", "after", "± 2 noise", "held out"}
+    assert save(drawing, tmp_path / "before_after.png").stat().st_size > 10_000

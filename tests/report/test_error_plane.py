@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from panel_parts import names_of, part_named
 from small_study import small_study
 
 from jaxbl.report.error_plane import draw_worst_planes, error_plane
@@ -12,11 +13,11 @@ def test_the_majorant_is_drawn_with_its_ratio_and_the_error_stays_inside():
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5}
     trial = run(small_study({"observer.motor": gains, "encoders.noise": 0.0, "run.duration": 1.0}))
     motor = trial.summary["conditions"]["motor"]
-    left, right = error_plane(trial.trace, "motor", motor).figure.axes
-    error, majorant = left.get_lines()
-    assert majorant.get_ydata()[0] == pytest.approx(0.5, rel=0.05)
-    assert np.abs(error.get_xdata()).max() <= np.abs(majorant.get_xdata()).max()
-    labels = [line.get_label() for line in right.get_lines()]
+    left, right = error_plane(trial.trace, "motor", motor).panels
+    error, majorant = left.parts
+    assert majorant.y[0] == pytest.approx(0.5, rel=0.05)
+    assert np.abs(error.x).max() <= np.abs(majorant.x).max()
+    labels = names_of(right)
     ratio = motor["least_lambda"]["davila_fridman"] / motor["lambda"]
     assert labels[1:] == [f"majorant (37): ratio {ratio:.3g}", f"exact worst case: ratio {motor['peak_ratio']:.3g}"]
     # what the run shows is no worse than the worst case
@@ -34,11 +35,18 @@ def test_why_there_is_no_majorant_is_said(changes, sentence):
     gains = {"lambda": 6.0, "alpha": 9.0, "velocity_error": 0.5} | changes
     trial = run(small_study({"observer.motor": gains, "run.duration": 1.0}))
     drawing = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
-    assert drawing.caption.endswith(sentence) and len(drawing.figure.axes[0].get_lines()) == 1
+    assert drawing.caption.endswith(sentence) and names_of(drawing.panels[0]) == ["error"]
 
 
 def test_marked_gains_whose_alpha_is_too_small_have_no_plane():
     mark = {"name": "a", "lambda_ratio": 1.0, "alpha_ratio": 2.0, "peak_ratio": 0.7}
-    assert draw_worst_planes([mark | {"alpha_ratio": 0.9, "peak_ratio": None}, mark | {"alpha_ratio": None}]) is None
-    drawings = draw_worst_planes([mark] * 4)
-    assert [ax.get_title(loc="left") for ax in drawings.figure.axes] == ["a"] * 4
+    assert draw_worst_planes([mark | {"alpha_ratio": 0.9, "peak_ratio": None}, mark | {"alpha_ratio": None}]) == []
+    (drawing,) = draw_worst_planes([mark] * 4)
+    assert [panel.title for panel in drawing.panels] == ["a"] * 4
+
+
+def test_an_error_that_noise_tangles_is_a_cloud():
+    trial = run(small_study({"encoders.noise": 1e-2, "observer.motor.velocity_error": 0.0, "run.duration": 1.0}))
+    left, right = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"]).panels
+    assert part_named(left, "error").width == 0.0
+    assert right.note.startswith("no peak stands out") or part_named(right, "run: no two peaks")

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from panel_parts import names_of, part_named, parts_of
 
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
-from jaxbl.report.figures import save
-from jaxbl.report.gain_plane import conditions_line, draw_gain_plane
+from jaxbl.report.drawing import draw_canvas
+from jaxbl.report.gain_plane import condition_curves, conditions_line, draw_gain_plane
+from jaxbl.report.panels import Band
 
 GAINS = {
     "exact holds": (1.24, 2.84, 1.97, "the gains are safe. λ may fall to "),
@@ -19,29 +21,40 @@ GAINS = {
 
 @pytest.mark.usefixtures("every_figure_drawn")
 @pytest.mark.parametrize("case", GAINS)
-def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
+def test_plane_and_sentence_agree_with_the_numbers(case):
     lambda_, alpha, bound, text = GAINS[case]
     result = judge_gains(lambda_, alpha, bound)
     line = conditions_line("motor", result, "of a test")
     assert line.startswith(f"motor: f⁺ = {bound:g} rad/s² is of a test; ")
     assert text in line
     drawing = draw_gain_plane("motor", result)
-    ax = drawing.figure.axes[0]
-    star = next(line for line in ax.lines if line.get_marker() == "*")
-    (x,), (y,) = star.get_data()
+    (panel,) = drawing.panels
+    star = part_named(panel, "the observer's gains")
+    assert (star.x, star.y, star.held) == ([alpha], [lambda_], True)
+    # what fails is shaded below the exact condition
+    (band,) = parts_of(panel, Band)
+    at = np.asarray(band.x) > 1.01 * bound
+    least = [judge_gains(1.0, x, bound)["least_lambda"]["exact"] for x in np.asarray(band.x)[at][::80]]
+    np.testing.assert_allclose(np.asarray(band.high)[at][::80], least, rtol=1e-6)
+    assert {"fails", "exact, ρ < 1", "usual rule"} <= {*names_of(panel)}
+    # a star outside lies on the edge, and above and on the right are the same axes in units of f⁺
+    _, (ax,) = draw_canvas(drawing)
+    (x,), (y,) = next(line for line in ax.lines if line.get_marker() == "*").get_data()
     low, high = ax.get_ylim()
     assert (x, y) == (max(alpha, ax.get_xlim()[0]), max(lambda_, low))
     assert high > low > 0.0
-    # above and on the right the same in units of f⁺
-    save(drawing.figure, tmp_path / "plane.png")
     top, right = ax.child_axes
     np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
     np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
-    # the curves of the conditions, the exact one last
-    for curve, (name, condition) in zip(ax.lines, CONDITIONS.items(), strict=False):
-        assert curve.get_label() == condition.title
-        alphas, least = np.asarray(curve.get_xydata())[200]
-        assert least == pytest.approx(judge_gains(1.0, alphas, bound)["least_lambda"][name], rel=1e-6), condition.title
+
+
+@pytest.mark.parametrize("alpha_is_x", [True, False])
+def test_curves_are_those_of_the_conditions_and_carry_their_names(alpha_is_x):
+    curves = [curve for curve in condition_curves(CONDITIONS, 1.5, (1.0, 20.0), alpha_is_x) if curve.name]
+    for curve, (name, condition) in zip(curves, CONDITIONS.items(), strict=True):
+        assert curve.name == condition.title and curve.at_line
+        alphas, least = (curve.x, curve.y) if alpha_is_x else (curve.y, curve.x)
+        assert least[200] == pytest.approx(judge_gains(1.0, alphas[200], 1.5)["least_lambda"][name], rel=1e-6), name
 
 
 def test_undisturbed_the_exact_condition_alone_asks_for_no_more_than_a_lambda():
@@ -60,11 +73,9 @@ def test_factors_lead_to_where_the_exact_condition_fails():
         assert judge_gains(1.24 / (factor * share), 2.84, 1.97)["holds"]["exact"] == holds
         assert judge_gains(1.24, 2.84, 1.97 * growth * share)["holds"]["exact"] == holds
     # the dashed curve for that f⁺ goes through the gains
-    ax = draw_gain_plane("motor", result).figure.axes[0]
-    edge = next(line for line in ax.lines if line.get_color() == "black" and line.get_linestyle() == "--")
-    x, y = edge.get_data()
+    edge = part_named(draw_gain_plane("motor", result).panels[0], "where it would fail")
     # the first point is that of the vertical part
-    assert np.interp(2.84, x[1:], y[1:]) == pytest.approx(1.24, rel=1e-3)
+    assert np.interp(2.84, edge.x[1:], edge.y[1:]) == pytest.approx(1.24, rel=1e-3)
 
 
 def test_without_a_disturbance_no_condition_asks_for_anything():

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import check_figures, needs_chromium, open_pages
-from matplotlib.figure import Figure
+from panel_parts import names_of
 from small_study import rigid_study, small_study
 
 from jaxbl.config import read_config
 from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.regression import Kinematics, model_torques
 from jaxbl.records import read_record
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.identify import describe_identification
 from jaxbl.report.identify_figures import draw_identification
 from jaxbl.report.results import write_report
@@ -140,31 +140,24 @@ def test_all_figures_are_drawn_with_units(case, tmp_path):
     assert [drawing.name for drawing in drawings] == names
     for drawing in drawings:
         assert drawing.caption.endswith(".")
-        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
+        assert save(drawing, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
         if drawing.name != "intervals":
-            assert "(" in drawing.figure.axes[0].get_ylabel(), drawing.name
-            assert "(" in drawing.figure.axes[-1].get_xlabel(), drawing.name
-    figures = {drawing.name: drawing.figure for drawing in drawings}
+            assert "(" in drawing.panels[0].y.label, drawing.name
+            assert "(" in drawing.panels[-1].x.label, drawing.name
+    panels = {drawing.name: drawing.panels for drawing in drawings}
     if case == "measured":
-        assert [ax.get_title(loc="left") for ax in figures["hysteresis"].axes] == [
+        assert [panel.title for panel in panels["hysteresis"]] == [
             "by the motor side",
             "by the load side",
             "measured",
         ]
-        assert "measured" in legend_labels(figures["torque"])
+        assert "measured" in names_of(panels["torque"][0])
     if case == "shaft":
-        assert not any("gap" in text for text in legend_labels(figures["limit_cycle"]))
+        assert not any("gap" in text for text in names_of(panels["limit_cycle"][0]))
     if case == "effects":
-        assert any("half width 0.09" in text for text in legend_labels(figures["hysteresis"]))
+        assert any("half width 0.09" in text for text in names_of(panels["hysteresis"][0]))
     if case == "gap":
-        assert [text.get_text() for text in figures["intervals"].axes[0].texts][
-            -1
-        ] == "held at nominal: not seen in this log"
-
-
-def legend_labels(figure: Figure) -> list[str]:
-    """Labels of all that is in the legends of the first axes."""
-    return figure.axes[0].get_legend_handles_labels()[1]
+        assert panels["intervals"][0].y.names[-1][1] == "drive.load_inertia\nheld at nominal: not seen in this log"
 
 
 @needs_chromium
@@ -180,9 +173,9 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     assert ("0.0500 ± 0.0010 kg", "drive.motor_inertia") in described.key_figures
     assert ("0.1500 ± 0.0010 N s/m", "drive.motor_viscous") in described.key_figures
     assert "motor: 0.0001 m rms" in described.headline
-    figures = {drawing.name: drawing.figure for drawing in draw_identification(result)}
-    assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
-    assert figures["resistance"].axes[0].get_ylabel() == "resisting force (N)"
+    drawings = draw_by_name(result)
+    assert drawings["velocities"].panels[0].y.label == "motor velocity (m/s)"
+    assert drawings["resistance"].panels[0].y.label == "resisting force (N)"
     assert "kg m²" not in (tmp_path / "report.html").read_text()
 
 
@@ -190,12 +183,12 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
     friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
     result = make_identification(geared_study({"run.duration": 2.0}, effects=friction), tmp_path)
-    axes = draw_by_name(result)["torque"].figure.axes
-    rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
+    _, below = draw_by_name(result)["torque"].panels
+    rms = [float(text.split("rms ")[1].split()[0]) for text in names_of(below)]
     assert len(rms) == 2
     bare_result = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
-    axes = draw_by_name(bare_result)["torque"].figure.axes
-    rms_without = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
+    _, below = draw_by_name(bare_result)["torque"].panels
+    rms_without = [float(text.split("rms ")[1].split()[0]) for text in names_of(below)]
     assert min(rms) < 0.6 * min(rms_without)
 
 
@@ -205,10 +198,10 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     trace = result.trace.copy()
     size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
     trace["motor.velocity"] *= size
-    above, below = draw_by_name(dataclasses.replace(result, trace=trace))["velocities"].figure.axes[::2]
-    low, high = above.get_xlim()
+    above, below = draw_by_name(dataclasses.replace(result, trace=trace))["velocities"].panels[::2]
+    low, high = above.x.ends
     assert 5.9 < low < high < 8.1
-    assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
+    assert below.x.ends == pytest.approx((0.0, 10.0), abs=0.01)
 
 
 @pytest.mark.usefixtures("every_figure_drawn")
@@ -220,7 +213,7 @@ def test_observers_that_diverged_leave_figures(tmp_path):
     drawings = draw_identification(dataclasses.replace(result, trace=trace))
     assert [drawing.name for drawing in drawings] == GEARED
     for drawing in drawings:
-        save(drawing.figure, tmp_path / f"{drawing.name}.png")
+        save(drawing, tmp_path / f"{drawing.name}.png")
 
 
 def test_gains_of_which_none_follows_the_log_are_not_called_chosen(tmp_path):
@@ -236,8 +229,8 @@ def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp
     trace = result.trace.copy()
     for side in ("motor", "load"):
         trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))
-    figure = draw_by_name(dataclasses.replace(result, trace=trace))["recursive"].figure
-    low, high = figure.axes[1].get_ylim()
+    figure = draw_by_name(dataclasses.replace(result, trace=trace))["recursive"]
+    low, high = figure.panels[1].y.ends
     margin = 0.1 * (high - low)
     assert low + margin < 0.08 < high - margin
     save(figure, tmp_path / "recursive.png")

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from browser import check_figures, needs_chromium, open_pages
 from measured import GEAR_RATIO, SERVO, find_recording, simulate_log
+from panel_parts import names_of
 from test_page import Page
 
 from jaxbl.records import inspect
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.inspect import draw_inspection
 from jaxbl.report.results import describe, write_report
 from jaxbl.result import format_result
@@ -36,10 +37,10 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
     assert [d.name for d in drawings] == names
     for d in drawings:
         assert d.caption.endswith(".")
-        assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
-        assert "(" in d.figure.axes[-1].get_xlabel()
-        assert "(" in d.figure.axes[0].get_ylabel()
-    units = [ax.get_ylabel().split("\n")[-1] for ax in drawings[0].figure.axes]
+        assert save(d, tmp_path / f"{d.name}.png").stat().st_size > 5000
+        assert "(" in d.panels[-1].x.label
+        assert "(" in d.panels[0].y.label
+    units = [panel.y.label.split("\n")[-1] for panel in drawings[0].panels]
     if case == "load alone, linear":
         assert units == ["(N)", "(m)", "(m/s)"]
     if case == "both encoders":
@@ -49,7 +50,8 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
 def test_a_gap_is_not_drawn_over(tmp_path):
     simulate_log().drop(index=range(1000, 1400)).to_parquet(tmp_path / "log.parquet")
     channels = draw_inspection(inspect(tmp_path / "log.parquet"))[0]
-    assert [len(ax.lines) for ax in channels.figure.axes] == [2, 2, 2, 2]
+    # one break between the parts, and the one at the end
+    assert [int(np.isnan(panel.parts[0].y).sum()) for panel in channels.panels] == [2, 2, 2, 2]
 
 
 def test_the_card_fits_a_terminal_whatever_is_wrong(tmp_path):
@@ -97,8 +99,7 @@ def test_the_page_in_a_browser(tmp_path):
 def test_a_real_log_with_two_encoders(tmp_path):
     inspection = inspect(find_recording("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
     twist = draw_inspection(inspection)[-1]
-    assert twist.name == "twist" and len(twist.figure.axes) == 1
-    labels = [text.get_text() for text in twist.figure.axes[0].get_legend().get_texts()]
-    assert labels == ["load on its first side", "on the other"]
+    assert twist.name == "twist" and len(twist.panels) == 1
+    assert names_of(*twist.panels) == ["load on its first side", "on the other"]
     figure = describe(inspection).key_figures[0]
     assert figure == ("126 s", "42000 samples every 3 ms, even stamps, 1 segment")

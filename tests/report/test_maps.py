@@ -1,18 +1,18 @@
-"""Figures of a study, looked at as matplotlib objects."""
+"""Figures of a study."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.collections import PathCollection, QuadMesh
-from matplotlib.colors import LogNorm
+from panel_parts import names_of, part_named, parts_of
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, small_study, spaced_axis
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import least_lambda_seeber_horn
 from jaxbl.report.checks import check_figures
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.maps import draw
+from jaxbl.report.panels import Band, Dots, Line, Map
 from jaxbl.report.results import write_report
 
 RMSE = "motor.velocity_rmse"
@@ -34,23 +34,14 @@ def product_error(frame):
 def draw_only_figure(tmp_path, data, **columns):
     """The one figure of a study, drawn to the end."""
     (drawing,) = draw(make_result(data, **columns))
-    assert save(drawing.figure, tmp_path / "a" / f"{drawing.name}.png").stat().st_size > 5000
+    assert save(drawing, tmp_path / "a" / f"{drawing.name}.png").stat().st_size > 5000
     assert plt.get_fignums() == []  # nothing is left in pyplot's own list
     return drawing
 
 
-def panels(drawing):
-    """Axes of the panels, the colour bar left out."""
-    return [ax for ax in drawing.figure.axes if ax.get_visible() and ax.get_xlabel()]
-
-
-def find_mesh(ax):
-    # the next one is the grey of what is undefined
-    return next(c for c in ax.collections if isinstance(c, QuadMesh))
-
-
-def legend_texts(drawing):
-    return [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+def find_map(panel):
+    (cells,) = parts_of(panel, Map)
+    return cells
 
 
 def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
@@ -60,92 +51,87 @@ def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
         motor__velocity_rmse=product_error,
         motor__margin_alpha=lambda frame: 2.0 * frame[ALPHA],
     )
-    (ax,) = panels(drawing)
-    values, corners = find_mesh(ax).get_array(), find_mesh(ax).get_coordinates()
-    alphas, lambdas = np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
-    np.testing.assert_allclose(values, lambdas[:, None] * alphas)
-    np.testing.assert_allclose(np.sqrt(corners[0, :-1, 0] * corners[0, 1:, 0]), alphas)
-    np.testing.assert_allclose(np.sqrt(corners[:-1, 0, 1] * corners[1:, 0, 1]), lambdas)
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    assert ax.get_xlabel() == "observer.motor.alpha (rad/s²)"
-    assert ax.get_ylabel() == "observer.motor.lambda (√rad/s)"
-    assert drawing.figure.axes[-1].get_ylabel() == "motor: velocity error, rms (rad/s)"
+    (panel,) = drawing.panels
+    cells, alphas, lambdas = find_map(panel), np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
+    np.testing.assert_allclose(cells.values, lambdas[:, None] * alphas)
+    np.testing.assert_allclose(np.sqrt(cells.x[:-1] * cells.x[1:]), alphas)
+    np.testing.assert_allclose(np.sqrt(cells.y[:-1] * cells.y[1:]), lambdas)
+    assert panel.x.log and panel.y.log
+    assert (panel.x.label, panel.x.key) == ("α, switching gain (rad/s²)", ALPHA)
+    assert (panel.y.label, panel.y.key) == ("λ, correction gain (√rad/s)", LAMBDA)
     # from 1 to 1000: a logarithmic colour scale, and the best point marked
-    assert isinstance(find_mesh(ax).norm, LogNorm)
-    assert "best ★ 1 rad/s" in ax.get_title()
-    assert drawing.caption == "motor: velocity error, rms (rad/s) over observer.motor.alpha and observer.motor.lambda."
+    assert cells.scale == (1.0, 1000.0, "motor: velocity error, rms (rad/s)", True, "viridis")
+    assert "best ★ 1 rad/s" in panel.title
+    assert drawing.caption == "motor: velocity error, rms (rad/s) over α, switching gain and λ, correction gain."
 
 
 def test_panels_share_one_colour_scale(tmp_path):
     data = small_study(axes=[*GAINS, listed_axis(NOISE, 1e-4, 1e-5)], figures=[heatmap_figure(facet=NOISE)])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame[NOISE] * 1e5)
-    low, high = panels(drawing)
-    assert low.get_title().startswith("encoders.noise = 1e-05 rad")
-    assert high.get_title().startswith("encoders.noise = 0.0001 rad")
-    assert find_mesh(low).norm is find_mesh(high).norm
-    np.testing.assert_allclose([find_mesh(low).get_array().min(), find_mesh(high).get_array().max()], [1.0, 10.0])
+    low, high = drawing.panels
+    assert low.title.startswith("encoder noise 10 µrad")
+    assert high.title.startswith("encoder noise 100 µrad")
+    assert find_map(low).scale == find_map(high).scale
+    np.testing.assert_allclose([find_map(low).values.min(), find_map(high).values.max()], [1.0, 10.0])
 
 
 def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
     data = small_study(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap_figure()])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=lambda frame: frame["seed"] ** 3.0)
-    assert (find_mesh(panels(drawing)[0]).get_array() == 8.0).all()
+    assert (find_map(drawing.panels[0]).values == 8.0).all()
     assert drawing.caption.endswith("; median over 5 seeds.")
     data = small_study(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap_figure(value="motor.converged")])
     drawing = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame["seed"] < 2)
-    np.testing.assert_allclose(find_mesh(panels(drawing)[0]).get_array(), 0.4)
-    assert find_mesh(panels(drawing)[0]).get_clim() == (0.0, 1.0)
+    cells = find_map(drawing.panels[0])
+    np.testing.assert_allclose(cells.values, 0.4)
+    assert (cells.scale.low, cells.scale.high) == (0.0, 1.0)
     assert drawing.caption.endswith("; share over 5 seeds.")
 
 
 def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure(value="motor.dead_zone_error")])
     drawing = draw_only_figure(tmp_path, data, motor__dead_zone_error=lambda frame: -product_error(frame))
-    assert find_mesh(panels(drawing)[0]).get_array().min() > 0.0
+    assert find_map(drawing.panels[0]).values.min() > 0.0
     assert drawing.caption.startswith("motor: |error of the dead zone|")
 
 
 @pytest.mark.parametrize("value", [RMSE, "motor.converged"])
 def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
     data = small_study(axes=GAINS, figures=[heatmap_figure(value=value)])
-    columns = {"motor__velocity_rmse": product_error, "motor__converged": lambda frame: frame[ALPHA] < 0.0}
+    columns = {"motor__velocity_rmse": product_error, "motor__converged": lambda frame: frame[ALPHA] < 40.0}
     drawing = draw_only_figure(tmp_path, data, finite=lambda frame: frame[ALPHA] < 40.0, **columns)
-    (ax,) = panels(drawing)
-    gone = np.ma.getmaskarray(find_mesh(ax).get_array())
-    assert gone[:, -1].all()
-    assert not gone[:, :-1].any()
-    assert legend_texts(drawing)[-1] == "diverged (4 points)"
+    cells = find_map(drawing.panels[0])
+    assert cells.failed[:, -1].all()
+    assert not cells.failed[:, :-1].any()
+    assert cells.failed_name == "diverged (4 points)"
 
 
-def test_what_did_not_converge_is_hatched(tmp_path):
+def test_what_did_not_converge_is_grey_and_sets_no_colour(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure()])
-    plain_drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product_error)
-    partly_hatched = draw_only_figure(
-        tmp_path,
-        data,
-        motor__velocity_rmse=product_error,
-        motor__converged=lambda frame: frame[ALPHA] > 5.0,
-        motor__margin_alpha=lambda frame: frame[ALPHA],
-    )
-    fully_hatched = draw_only_figure(
-        tmp_path, data, motor__velocity_rmse=product_error, motor__converged=lambda frame: frame[ALPHA] < 0.0
-    )
-    assert legend_texts(plain_drawing) == []
-    assert legend_texts(partly_hatched) == legend_texts(fully_hatched) == ["motor not converged"]
+    columns = {"motor__velocity_rmse": product_error, "motor__margin_alpha": lambda frame: frame[ALPHA]}
+    whole = draw_only_figure(tmp_path, data, **columns)
+    partly = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame[ALPHA] > 5.0, **columns)
+    nothing = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame[ALPHA] < 0.0, **columns)
+    assert names_of(*whole.panels) == ["best"]
+    assert names_of(*partly.panels) == ["not converged (8 points)", "best"]
+    assert names_of(*nothing.panels) == ["not converged (20 points)"]
+    cells = find_map(partly.panels[0])
+    np.testing.assert_array_equal(cells.failed, np.broadcast_to(np.geomspace(1.0, 50.0, 5) < 5.0, (4, 5)))
+    assert cells.scale.low == pytest.approx(cells.values[~cells.failed].min())
     # the best is sought among those that converged
-    assert "best ★ 7.1" in panels(partly_hatched)[0].get_title()
+    assert "best ★ 7.1" in partly.panels[0].title
 
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure(overlays=["davila_fridman", "seeber_horn", "exact"])])
     drawing = draw_only_figure(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
-    (ax,) = panels(drawing)
-    assert "f⁺ = 2 rad/s²" in ax.get_title()
-    assert legend_texts(drawing) == ["Davila-Fridman (32), q → 0", "Seeber-Horn 2017", "exact, ρ < 1"]
-    alpha, least = next(curve for curve in ax.lines if curve.get_linestyle() == "--").get_data()
-    np.testing.assert_allclose(least, least_lambda_seeber_horn(alpha, 2.0))
-    assert alpha[0] == pytest.approx(2.0, rel=1e-3)
-    assert alpha[-1] == pytest.approx(50.0)
+    (panel,) = drawing.panels
+    assert "f⁺ = 2 rad/s²" in panel.title
+    assert names_of(panel)[:3] == ["Davila-Fridman (32), q → 0", "Seeber-Horn 2017", "exact, ρ < 1"]
+    curve = part_named(panel, "Seeber-Horn")
+    np.testing.assert_allclose(curve.y, least_lambda_seeber_horn(curve.x, 2.0))
+    # as far as the axis goes
+    assert (curve.x[0], curve.x[-1]) == (pytest.approx(2.0, rel=1e-3), pytest.approx(panel.x.ends[1]))
 
 
 ODD_FIGURES = {
@@ -198,7 +184,7 @@ ODD_FIGURES = {
 @pytest.mark.parametrize("case", ODD_FIGURES)
 def test_odd_studies_are_drawn(tmp_path, case):
     data, columns = ODD_FIGURES[case]
-    assert panels(draw_only_figure(tmp_path, data, **columns))
+    assert draw_only_figure(tmp_path, data, **columns).panels
 
 
 def test_a_study_of_words_alone_has_no_default_figure():
@@ -208,10 +194,7 @@ def test_a_study_of_words_alone_has_no_default_figure():
 def test_words_as_panels(tmp_path):
     axes = [*GAINS, listed_axis("observer.discretisation", "implicit", "explicit")]
     drawing = draw_only_figure(tmp_path, rigid_study(axes=axes, figures=[heatmap_figure(facet="observer.discretisation")]))
-    assert [ax.get_title().split("\n")[0] for ax in panels(drawing)] == [
-        "observer.discretisation = explicit",
-        "observer.discretisation = implicit",
-    ]
+    assert [panel.title.split("\n")[0] for panel in drawing.panels] == ["discretisation explicit", "discretisation implicit"]
 
 
 def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
@@ -221,18 +204,16 @@ def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
     drawing = draw_only_figure(
         tmp_path, small_study(axes=axes, sweep=sweep, figures=[heatmap_figure()]), motor__velocity_rmse=product_error, **wild
     )
-    (ax,) = panels(drawing)
-    (dots,) = (c for c in ax.collections if isinstance(c, PathCollection))
-    x, y = dots.get_offsets().T
-    assert (x < 10.0).all()
-    np.testing.assert_allclose(dots.get_array(), x * y)
-    assert len(dots.get_offsets()) + len(ax.lines[0].get_xdata()) == 32
-    assert legend_texts(drawing) == [f"diverged ({len(ax.lines[0].get_xdata())} points)"]
+    dots, crosses = drawing.panels[0].parts
+    assert isinstance(dots, Dots) and (dots.x < 10.0).all()
+    np.testing.assert_allclose(dots.values, dots.x * dots.y)
+    assert len(dots.x) + len(crosses.x) == 32
+    assert crosses.name == f"diverged ({len(crosses.x)} points)"
     # over one of its axes a design has no line
     drawing = draw_only_figure(
         tmp_path, small_study(axes=axes, sweep=sweep, figures=[line_figure()]), motor__velocity_rmse=product_error
     )
-    assert panels(drawing)[0].lines[0].get_linestyle() == "None"
+    assert drawing.panels[0].parts[0].width == 0.0
     assert "median" not in drawing.caption
 
 
@@ -241,21 +222,21 @@ def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
     drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda frame: product_error(frame) * (1.0 + frame["seed"])
     )
-    (ax,) = panels(drawing)
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), 2.0 * np.geomspace(1.0, 50.0, 5))
-    band = ax.collections[0].get_paths()[0].vertices[:, 1]
-    assert (band.min(), band.max()) == pytest.approx((1.0, 150.0))
-    assert ax.get_legend().get_title().get_text() == "observer.motor.lambda (√rad/s)"
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    assert ax.get_ylabel() == "motor: velocity error, rms (rad/s)"
+    (panel,) = drawing.panels
+    line, band = (parts_of(panel, kind)[0] for kind in (Line, Band))
+    np.testing.assert_allclose(line.y, 2.0 * np.geomspace(1.0, 50.0, 5))
+    assert (band.low.min(), band.high.max()) == pytest.approx((1.0, 150.0))
+    assert line.name == "λ, correction gain 1 √rad/s"
+    assert panel.x.log and panel.y.log
+    assert panel.y.label == "motor: velocity error, rms (rad/s)"
     assert drawing.caption.endswith("; median over 3 seeds; band: least to largest.")
 
 
 def test_where_leaves_the_other_points_out(tmp_path):
     data = rigid_study(axes=GAINS, figures=[line_figure(where={LAMBDA: "largest"})])
     drawing = draw_only_figure(tmp_path, data, motor__velocity_rmse=product_error)
-    np.testing.assert_allclose(panels(drawing)[0].lines[0].get_ydata(), 20.0 * np.geomspace(1.0, 50.0, 5))
-    assert drawing.caption.endswith(f"over {ALPHA} where {LAMBDA} = 20 √rad/s.")
+    np.testing.assert_allclose(drawing.panels[0].parts[0].y, 20.0 * np.geomspace(1.0, 50.0, 5))
+    assert drawing.caption.endswith("over α, switching gain where λ, correction gain 20 √rad/s.")
 
 
 def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
@@ -264,25 +245,24 @@ def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
     drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * np.maximum(f[ALPHA], 30.0), 0.0)
     )
-    (ax,) = panels(drawing)
-    hollow, filled, fitted, theory, *_ = ax.lines
-    assert (hollow.get_markerfacecolor(), len(hollow.get_xdata())) == ("none", 3)
-    np.testing.assert_allclose(filled.get_xdata(), np.geomspace(1.0, 1e4, 9)[3:])
-    np.testing.assert_allclose(fitted.get_ydata(), 1e-5 * fitted.get_xdata())
-    assert theory.get_linestyle() == "--"
-    assert ax.get_ylim()[0] > 1e-5  # theory's line does not stretch the axis
-    texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert texts[0].startswith("1: 1.000 ± ")
-    assert texts[1] == "2: no law (float resolution)"
-    assert ax.get_legend().get_title().get_text() == "slope (theory 1, dashed)"
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    (panel,) = drawing.panels
+    hollow, filled, fitted, theory, *_ = panel.parts
+    assert hollow.fill and len(hollow.x) == 3
+    np.testing.assert_allclose(filled.x, np.geomspace(1.0, 1e4, 9)[3:])
+    np.testing.assert_allclose(fitted.y, 1e-5 * fitted.x)
+    assert theory.dashes == "--" and "theory's slope, 1." in drawing.caption
+    # theory's line does not stretch the axis
+    assert panel.y.ends[0] > 1e-5
+    first, second = names_of(panel)
+    assert first.startswith("1: 1.000 ± ") and second == "2: no law (float resolution)"
+    assert panel.x.log and panel.y.log
     # one panel a value, and nothing to draw in one of them
     data = rigid_study(axes=axes, figures=[line_figure(facet=LAMBDA, theory=1.0)])
     drawing = draw_only_figure(
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0)
     )
-    assert [ax.get_title() for ax in panels(drawing)] == [f"{LAMBDA} = 1 √rad/s", f"{LAMBDA} = 2 √rad/s"]
-    assert panels(drawing)[1].texts[0].get_text() == "nothing above zero to draw"
+    assert [panel.title for panel in drawing.panels] == ["λ, correction gain 1 √rad/s", "λ, correction gain 2 √rad/s"]
+    assert drawing.panels[1].note == "nothing above zero to draw"
 
 
 def test_figures_of_one_metric_get_names_of_their_own():
@@ -335,7 +315,7 @@ def test_more_parts_than_a_figure_can_have(figure, key, part):
     assert str(error.value) == message
     # a study that asks for no figures gets one all the same
     (drawing,) = draw(make_result(rigid_study(axes=axes[::-1])))
-    assert drawing.caption.endswith(f"median over {NOISE}.")
+    assert drawing.caption.endswith("median over encoder noise.")
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, sm
 
 from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
+from jaxbl.report.drawing import Picture
 from jaxbl.report.page import format_page
-from jaxbl.report.picture import Picture, packed
+from jaxbl.report.panels import packed
 from jaxbl.report.results import describe, write_report
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.trial import run
@@ -152,7 +153,11 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
         texts = dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n"))
         alpha = 50.0**0.5
         assert [float(text) for text in texts.values()] == pytest.approx([alpha, 1.0, alpha], rel=1e-3)
-        assert list(texts) == ["motor: velocity error, rms (rad/s)", f"{LAMBDA} (√rad/s)", f"{ALPHA} (rad/s²)"]
+        assert list(texts) == [
+            "motor: velocity error, rms (rad/s)",
+            "λ, correction gain (√rad/s)",
+            "α, switching gain (rad/s²)",
+        ]
         # the same place, zoomed: the pointer stays on its cell
         view.dblclick(position=place(view, left + 0.05 * width, top + 0.5 * height))
         assert "scale(3)" in page.locator("figure img").get_attribute("style")

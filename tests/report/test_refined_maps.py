@@ -4,12 +4,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.collections import QuadMesh
+from panel_parts import names_of, parts_of
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, spaced_axis
 
 from jaxbl.config import read_config
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.maps import draw
+from jaxbl.report.panels import Line, Map
 from jaxbl.report.refined_maps import Filling
 from jaxbl.report.results import describe
 from jaxbl.sweeps.metrics import metric_columns
@@ -19,10 +20,10 @@ from jaxbl.sweeps.sweep import StudyResult
 
 RMSE = "motor.velocity_rmse"
 GAINS = [spaced_axis(LAMBDA, 1.0, 16.0, 5), spaced_axis(ALPHA, 1.0, 9.0, 5, "linear")]
-MAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE}
+HEATMAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE}
 
 
-def make_refined_study(function, *axes, figures=(MAP,), depth=3, seeds=1):
+def make_refined_study(function, *axes, figures=(HEATMAP,), depth=3, seeds=1):
     """A refined study without runs: `function` of a frame of points says what converges; the error is lambda."""
     config = read_config(rigid_study(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
     points = Points(config)
@@ -46,40 +47,34 @@ def converges_in_disc(frame):
     return (np.log2(frame[LAMBDA]) - 2.0) ** 2 + ((frame[ALPHA] - 5.0) / 2.0) ** 2 < 1.3
 
 
-def panels(drawing):
-    return [ax for ax in drawing.figure.axes if ax.get_visible() and ax.get_xlabel()]
-
-
-def map_values(ax):
-    # the next one is the grey of what is undefined
-    return next(c for c in ax.collections if isinstance(c, QuadMesh)).get_array()
-
-
-def legend_texts(drawing):
-    return [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+def drawn_map(panel):
+    (cells,) = parts_of(panel, Map)
+    return cells
 
 
 def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
-    result = make_refined_study(converges_in_disc, figures=[MAP | {"value": "motor.converged"}, MAP])
+    result = make_refined_study(converges_in_disc, figures=[HEATMAP | {"value": "motor.converged"}, HEATMAP])
     assert len(result.frame) < 0.5 * 33**2
     converged, error = draw(result)
-    values = map_values(panels(converged)[0])
+    cells = drawn_map(converged.panels[0])
+    values = cells.values
     assert values.shape == (33, 33)
-    assert not np.ma.is_masked(values) and np.isfinite(values).all()
+    assert not cells.failed.any() and np.isfinite(values).all()
     alphas, lambdas = np.linspace(1.0, 9.0, 33), np.geomspace(1.0, 16.0, 33)
     grid = pd.DataFrame({LAMBDA: np.repeat(lambdas, 33), ALPHA: np.tile(alphas, 33)})
     np.testing.assert_array_equal(values, converges_in_disc(grid).to_numpy(float).reshape(33, 33))
-    assert legend_texts(converged) == []
+    assert names_of(*converged.panels) == []
     # far from the boundary a vertex of the coarse grid stands for the block around it
-    blocks = map_values(panels(error)[0])
+    blocks = drawn_map(error.panels[0]).values
     np.testing.assert_allclose(blocks[:4, :4], 1.0)
     np.testing.assert_allclose(blocks[4:6, :2], 2.0)
     np.testing.assert_allclose(blocks[-4:, :4], 16.0)
-    assert legend_texts(error) == ["motor not converged"]
     inside = result.frame[result.frame["motor.converged"]]
-    assert f"best ★ {inside[LAMBDA].min():.2g} rad/s" in panels(error)[0].get_title()
+    count = len(result.frame) - len(inside)
+    assert names_of(*error.panels) == [f"not converged ({count} points)", "best"]
+    assert f"best ★ {inside[LAMBDA].min():.2g} rad/s" in error.panels[0].title
     for drawing in (converged, error):
-        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
+        assert save(drawing, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
     assert plt.get_fignums() == []
 
 
@@ -87,10 +82,11 @@ def test_only_what_was_simulated_is_counted_as_missing():
     result = make_refined_study(converges_in_disc)
     frame = result.frame
     frame["finite"] = (frame[LAMBDA] < 16.0) | (frame[ALPHA] < 9.0)
+    frame["motor.converged"] = frame["finite"]
     (drawing,) = draw(result)
-    assert legend_texts(drawing)[-1] == "diverged (1 points)"
-    gone = np.ma.getmaskarray(map_values(panels(drawing)[0])) | np.isnan(map_values(panels(drawing)[0]).filled(0.0))
-    assert gone.sum() == 5 * 5  # its block, cut by the edges of the map
+    cells = drawn_map(drawing.panels[0])
+    assert cells.failed_name == "diverged (1 points)"
+    assert cells.failed.sum() == 5 * 5  # its block, cut by the edges of the map
 
 
 def test_panels_medians_and_lines_over_what_is_not_drawn():
@@ -100,21 +96,21 @@ def test_panels_medians_and_lines_over_what_is_not_drawn():
         return converges_in_disc(frame) & (frame[ALPHA] < 7.0 - 2000.0 * frame[NOISE])
 
     figures = [
-        MAP | {"value": "motor.converged", "facet": NOISE},
-        MAP | {"value": "motor.converged"},
+        HEATMAP | {"value": "motor.converged", "facet": NOISE},
+        HEATMAP | {"value": "motor.converged"},
         {"kind": "heatmap", "x": ALPHA, "y": NOISE, "value": "motor.converged"},
         {"kind": "line", "x": ALPHA, "value": RMSE, "series": LAMBDA},
     ]
     result = make_refined_study(converges_in_half_disc, noise, figures=figures, seeds=2)
     by_panel, together, of_noise, lines = draw(result)
-    panel_values = np.array([map_values(ax) for ax in panels(by_panel)])
+    panel_values = np.array([drawn_map(panel).values for panel in by_panel.panels])
     assert panel_values.shape == (3, 33, 33)
     # a share over noise levels is one over all of them, also where only one has its boundary
-    np.testing.assert_allclose(map_values(panels(together)[0]), panel_values.mean(axis=0))
-    assert map_values(panels(of_noise)[0]).shape == (3, 33)
-    np.testing.assert_allclose(map_values(panels(of_noise)[0]), panel_values[:, ::8].mean(axis=1), atol=0.2)
+    np.testing.assert_allclose(drawn_map(together.panels[0]).values, panel_values.mean(axis=0))
+    assert drawn_map(of_noise.panels[0]).values.shape == (3, 33)
+    np.testing.assert_allclose(drawn_map(of_noise.panels[0]).values, panel_values[:, ::8].mean(axis=1), atol=0.2)
     # one line for each value of the coarse grid
-    assert len(panels(lines)[0].lines) == 5
+    assert len(parts_of(lines.panels[0], Line)) == 5
 
 
 def test_filling_is_exact_where_every_vertex_is_known():
@@ -131,7 +127,7 @@ def test_filling_is_exact_where_every_vertex_is_known():
 def test_a_map_shows_no_more_places_than_can_be_seen():
     result = make_refined_study(lambda frame: frame[ALPHA] > 3.3, depth=10)
     drawing = draw(result)[0]
-    assert map_values(panels(drawing)[0]).shape == (2049, 2049)
+    assert drawn_map(drawing.panels[0]).values.shape == (2049, 2049)
 
 
 @pytest.mark.parametrize("seeds", [1, 3])
@@ -147,7 +143,7 @@ def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
 
 
 def test_an_unfinished_study_is_drawn_as_far_as_it_goes():
-    result = make_refined_study(converges_in_disc, figures=[MAP, MAP | {"value": "motor.converged"}])
+    result = make_refined_study(converges_in_disc, figures=[HEATMAP, HEATMAP | {"value": "motor.converged"}])
     part = result.frame.iloc[:40]
     for drawing in draw(StudyResult(result.config, part)):
-        assert panels(drawing)
+        assert drawing.panels

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from panel_parts import names_of, part_named, texts_of
 
 from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import locate
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.diagnosis.sentences import sentence_of
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.residuals import draw_residuals
 
 
@@ -33,11 +34,11 @@ def test_observers_that_converge_are_drawn_thin(tmp_path):
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
     drawing = draw_residuals(residuals, coordinates, result, observed=observed)[0]
-    above, below = (ax.get_legend_handles_labels()[1] for ax in drawing.figure.axes)
-    assert above[:2] == below == ["missing", "± 2 noise"] and len(above) == 3
+    above, below = map(names_of, drawing.panels)
+    assert above[:2] == below == ["± 2 noise", "missing"] and len(above) == 3
     assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawing.caption
-    assert drawing.figure.axes[0].lines[1].get_linewidth() < drawing.figure.axes[0].lines[0].get_linewidth()
-    assert save(drawing.figure, tmp_path / "over_time.png").stat().st_size > 10_000
+    assert part_named(drawing.panels[0], "by its").width < part_named(drawing.panels[0], "missing").width
+    assert save(drawing, tmp_path / "over_time.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("unit", ["N m", "N"])
@@ -50,13 +51,12 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
     drawings = {drawing.name: drawing for drawing in draw_residuals(residuals, coordinates, result, unit)}
     assert list(drawings) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
-    above, below = drawings["residual_torque"].figure.axes
-    assert sentence_of(result["motor"], unit) == " ".join(above.get_title("left").split())
-    assert "nothing beyond noise" in below.get_title("left")
-    assert above.get_ylabel().endswith(f"({unit})")
-    assert drawings["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"
-    marks = [text.get_text() for text in drawings["residual_spectrum"].figure.axes[0].texts]
-    assert any(text.startswith("11 Hz") for text in marks)
+    above, below = drawings["residual_torque"].panels
+    assert sentence_of(result["motor"], unit) == " ".join(above.title.split())
+    assert "nothing beyond noise" in below.title
+    assert above.y.label.endswith(f"({unit})")
+    assert drawings["residual_motor"].panels[0].x.label == "speed ω (rad/s)"
+    assert any(text.startswith("11 Hz") for text in texts_of(drawings["residual_spectrum"].panels[0]))
     for drawing in drawings.values():
-        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 10_000
+        assert save(drawing, tmp_path / f"{drawing.name}.png").stat().st_size > 10_000
         assert drawing.caption.endswith(".")

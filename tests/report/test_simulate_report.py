@@ -3,7 +3,7 @@
 import pytest
 from small_study import rigid_study, small_study
 
-from jaxbl.report.figures import save
+from jaxbl.report.drawing import save
 from jaxbl.report.simulate import draw_trial
 from jaxbl.sweeps.trial import run
 
@@ -32,10 +32,10 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
     assert [d.name for d in drawings] == names
     for d in drawings:
         assert d.caption.endswith(".")
-        assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
-        for ax in d.figure.axes:
-            assert "(" in ax.get_ylabel(), d.name
-        assert "(" in d.figure.axes[-1].get_xlabel() or d.name == "dead_zone" or d.name.startswith("error_plane")
+        assert save(d, tmp_path / f"{d.name}.png").stat().st_size > 5000
+        for panel in d.panels:
+            assert "(" in panel.y.label, d.name
+        assert "(" in d.panels[-1].x.label or d.name.startswith("error_plane")
     if case == "sigmoid":
-        zone = next(d for d in drawings if d.name == "dead_zone").figure.axes
-        assert [ax.get_ylabel() for ax in zone] == ["stiffness (N m/rad)", "dead zone (rad)", "half gap (rad)"]
+        zone = next(d for d in drawings if d.name == "dead_zone").panels
+        assert [panel.y.label for panel in zone] == ["stiffness (N m/rad)", "dead zone (rad)", "half gap (rad)"]

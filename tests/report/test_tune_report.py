@@ -9,15 +9,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from browser import check_figures, needs_chromium, open_pages
-from matplotlib.collections import QuadMesh
-from matplotlib.colors import LogNorm, to_rgb
+from panel_parts import names_of, part_named, parts_of, texts_of
 from small_study import small_study
 from test_page import Page, place
 
 from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
-from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.figures import save
+from jaxbl.report.panels import Bars, Map, Span
 from jaxbl.report.results import describe, write_report
 from jaxbl.report.tune import draw_tuning
 from jaxbl.sweeps.trial import run
@@ -74,30 +72,26 @@ def test_numbers_figures_and_page(report_folder, tuning):
     assert any("the gains 'slow' converge in only 0 % of the held-out runs" in line for line in lines)
 
 
-@pytest.mark.usefixtures("every_figure_drawn")
-def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning, tmp_path):
-    drawing = next(d for d in draw_tuning(tuning) if d.name == "tuning_motor")
-    ax = drawing.figure.axes[0]
-    (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning):
+    (panel,) = next(d for d in draw_tuning(tuning) if d.name == "tuning_motor").panels
+    (cells,) = parts_of(panel, Map)
     coarse = tuning.candidates["motor"].query("stage == 0").sort_values(["lambda", "alpha"])
-    np.testing.assert_allclose(np.ma.getdata(mesh.get_array()).ravel(), coarse["error"])
-    assert isinstance(mesh.norm, LogNorm)
+    np.testing.assert_allclose(np.ravel(cells.values), coarse["error"])
+    np.testing.assert_array_equal(np.ravel(cells.failed), ~coarse["feasible"].to_numpy(bool))
+    # colours are for what works
+    works = coarse[coarse["feasible"].astype(bool)]["error"]
+    assert cells.scale.low >= 0.5 * works.min() and cells.scale.high <= 1.5 * works.max()
     gains = tuning.summary["gains"]["motor"]
-    star = next(line for line in ax.lines if line.get_marker() == "*")
-    assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha"], gains["lambda"])
+    star = part_named(panel, "tuned")
+    assert (star.x, star.y) == ([gains["alpha"]], [gains["lambda"]])
     # in units of f⁺ above and on the right
     bound = tuning.summary["f_plus"]["motor"]
-    save(drawing.figure, tmp_path / "map.png")
-    top, right = ax.child_axes
-    np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
-    np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
-    legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
-    assert {"constraints not met", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
-        legend
-    )
+    assert [axis.ratio[0] for axis in (panel.x, panel.y)] == pytest.approx([bound, bound**0.5])
+    assert {"constraints not met, or diverged", "exact, ρ < 1", "usual rule", "config", "slow", "tuned"} <= {
+        *names_of(panel)
+    }
     # on the edge, not outside
-    low, high = ax.get_xlim()
-    assert all(low <= x * (1 + 1e-9) and x <= high * (1 + 1e-9) for line in ax.lines for x in line.get_xdata())
+    assert part_named(panel, "slow").held
 
 
 def set_binding(summary, binding):
@@ -121,51 +115,44 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
         result = dataclasses.replace(tuning, summary=set_binding(tuning.summary, binding))
         drawings = {d.name: d for d in draw_tuning(result)}
-        legends = {
-            name: [text.get_text() for legend in drawings[name].figure.legends for text in legend.get_texts()]
-            for name in ("tuning_motor", "limits_motor")
-        }
-        are_named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
-        assert are_named == [bool(binding)] * 2
-        assert ("Bold line: margin_exact, which binds." in drawings["tuning_motor"].caption) == bool(binding)
+        limits = drawings["limits_motor"]
+        assert any("margin_exact = 1.1 (binds)" in name for name in names_of(*limits.panels)) == bool(binding)
+        assert ("The edge of what meets them is that of margin_exact." in drawings["tuning_motor"].caption) == bool(binding)
         forbidden = "motor: a smaller error is forbidden by margin_exact."
         assert (forbidden in describe(result).remarks) == bool(binding)
-        titles = [ax.get_title("left") for ax in drawings["limits_motor"].figure.axes]
-        assert ("← smaller λ: margin_exact" in titles) == bool(binding)
+        assert ("smaller λ: margin_exact\n" in limits.panels[0].title) == bool(binding)
 
 
 def test_limits_are_drawn_as_the_numbers_have_them(tuning):
     drawing = next(d for d in draw_tuning(tuning) if d.name == "limits_load")
     load = tuning.summary["limits"]["load"]
-    for ax, gain in zip(drawing.figure.axes, ("lambda", "alpha"), strict=True):
-        line, profile = ax.lines[0], load["profiles"][gain]
-        np.testing.assert_allclose(line.get_xydata(), np.column_stack([profile[gain], profile["error"]]))
+    for panel, gain in zip(drawing.panels, ("lambda", "alpha"), strict=True):
+        line, profile = part_named(panel, "worst"), load["profiles"][gain]
+        np.testing.assert_allclose((line.x, line.y), (profile[gain], profile["error"]))
         larger = load["towards"][gain]["larger"]
         assert larger["limit"] == "error"
         size = f"× {1 + larger['change']:.2g}" if larger["change"] >= 1.0 else f"{100 * larger['change']:+.2g} %"
-        assert size in ax.get_title("right")
+        assert panel.title.endswith(size)
         # each stretch of missed constraints is shaded
         missed = sum("margin_exact" in names for names in profile["missed"])
-        spans = [patch for patch in ax.patches if patch.get_facecolor()[:3] == to_rgb("#E8000B")]
-        inside = sum(span.get_x() < x < span.get_x() + span.get_width() for span in spans for x in profile[gain])
+        spans = [span for span in parts_of(panel, Span) if span.name.startswith("not met: margin_exact")]
+        inside = sum(span.low < x < span.high for span in spans for x in profile[gain])
         assert inside == missed > 0
 
 
 def test_front_says_who_does_not_converge(tuning):
-    drawing = next(d for d in draw_tuning(tuning) if d.name == "pareto_motor")
-    legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
-    assert "slow: 0 % converge" in legend
-    (line,) = (line for line in drawing.figure.axes[0].lines if line.get_label() == "none better in both")
-    assert list(line.get_xdata()) == [point["convergence_time"] for point in tuning.summary["pareto"]["motor"]]
+    (panel,) = next(d for d in draw_tuning(tuning) if d.name == "pareto_motor").panels
+    assert "slow: 0 % converge" in names_of(panel)
+    line = part_named(panel, "none better in both")
+    assert line.width > 0.0 and list(line.x) == [point["convergence_time"] for point in tuning.summary["pareto"]["motor"]]
 
 
 def test_comparison_draws_what_the_numbers_say(tuning):
     drawing = next(d for d in draw_tuning(tuning) if d.name == "tuning_holdout")
     rows = [row for row in tuning.summary["holdout"]["rows"] if row["side"] == "motor"]
-    bars = [patch.get_width() for patch in drawing.figure.axes[0].patches]
+    bars = [bar.lengths[0] for bar in parts_of(drawing.panels[0], Bars)]
     np.testing.assert_allclose(bars, [row["velocity_rmse"]["worst"] for row in rows])
-    texts = [text.get_text() for text in drawing.figure.axes[2].texts]
-    assert "converged in 0 %" in texts
+    assert "converged in 0 %" in texts_of(drawing.panels[2])
 
 
 @needs_chromium

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import tomli_w
 from browser import check_figures, needs_chromium, open_pages
+from panel_parts import names_of, part_named, parts_of
 from shared_results import VERIFY_STUDY
 
+from jaxbl.report.panels import Line
 from jaxbl.report.results import write_report
 from jaxbl.report.verify import draw_verdict
 from jaxbl.sweeps.engine import Engine
@@ -31,25 +33,22 @@ def test_figures(verify_report):
         "levels_motor",
     ]
     assert all(drawing.caption for drawing in drawings.values())
-    atlas = drawings["atlas"].figure
-    legend = [text.get_text() for text in atlas.legends[0].get_texts()]
-    for label in ("exact, ρ < 1", "simulated boundary", "usual pair (1.5, 1.1)", "small gains"):
-        assert any(text.startswith(label) for text in legend), label
+    (atlas,) = drawings["atlas"].panels
+    assert {"exact, ρ < 1", "simulated boundary", "usual pair (1.5, 1.1)", "small gains"} <= {*names_of(atlas)}
     # the boundary's points are those of the bisection
-    (points,) = [line for line in atlas.axes[0].lines if line.get_marker() == "o"]
-    np.testing.assert_array_equal(points.get_ydata(), verdict.error_map.boundary)
+    np.testing.assert_array_equal(part_named(atlas, "simulated boundary").y, verdict.error_map.boundary)
 
 
 def test_every_run_is_a_dot_and_counterexamples_are_counted(verify_report):
     verdict, _, _ = verify_report
-    (levels,) = [d.figure for d in draw_verdict(verdict) if d.name == "levels_motor"]
-    for ax, level in zip(levels.axes, ("drive", "sampled"), strict=False):
-        dots, crosses = (sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() == m) for m in (".", "x"))
+    (levels,) = [d for d in draw_verdict(verdict) if d.name == "levels_motor"]
+    for panel, level in zip(levels.panels, ("drive", "sampled"), strict=True):
+        dots, crosses = (len(part_named(panel, name).x) for name in ("converged", "failed"))
         converged = verdict.levels[level]["motor.converged"].astype(bool)
         assert (dots, crosses) == (converged.sum(), (~converged).sum())
         entries = next(entry for entry in verdict.summary["levels"] if entry["level"] == level)["conditions"]
         exact = next(entry for entry in entries if entry["name"] == "exact")
-        assert ax.get_title().endswith(f"\n{exact['counterexamples']} failed though ρ < 1")
+        assert panel.title.endswith(f"\n{exact['counterexamples']} failed though ρ < 1")
     assert exact["counterexamples"] > 0
 
 
@@ -74,12 +73,11 @@ def test_tuning_rules_in_figure_page_and_lines(verify_report):
     verdict, folder, result = verify_report
     lines, rules = result.remarks, verdict.summary["rules"]
     (rules_drawing,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
-    sufficient_axes, failing_axes = rules_drawing.figure.axes
-    legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (sufficient_axes, failing_axes)]
+    legends = [names_of(panel) for panel in rules_drawing.panels]
     for rule in rules:
         assert (rule["title"] in legends[0]) == rule["sufficient"]
         assert (rule["title"] in legends[1]) != rule["sufficient"]
-    crosses = [line.get_xydata()[0] for line in failing_axes.lines if line.get_marker() == "x"]
+    crosses = [(line.x[0], line.y[0]) for line in parts_of(rules_drawing.panels[1], Line) if line.marker == "x"]
     counterexamples = [rule["counterexample"] for rule in rules if not rule["sufficient"]]
     expected = [
         (actual["alpha"] / actual["f_plus"], actual["lambda"] / actual["f_plus"] ** 0.5) for actual in counterexamples

@@ -15,8 +15,9 @@ from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
-from jaxbl.report.maps import axis_label, best_gains, least_lambdas, unit_of, worst_runs
-from jaxbl.report.picture import packed
+from jaxbl.report.gain_plane import least_lambdas
+from jaxbl.report.maps import axis_label, best_gains, unit_of, worst_runs
+from jaxbl.report.panels import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 

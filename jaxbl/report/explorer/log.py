@@ -13,8 +13,8 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import describe_diagnosis
 from jaxbl.report.element import describe_element
-from jaxbl.report.figures import missing_quantity
 from jaxbl.report.identify import describe_identification
+from jaxbl.report.panels import missing_quantity
 from jaxbl.result import Result
 from jaxbl.sweeps.metrics import find_metric
 

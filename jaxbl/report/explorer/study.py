@@ -12,9 +12,8 @@ from jaxbl.errors import InputError
 from jaxbl.files import checksum, read_json
 from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
-from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
-from jaxbl.report.picture import packed
+from jaxbl.report.panels import MAP, packed
 from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity

@@ -1,0 +1,379 @@
+"""matplotlib's drawing of figures: PNG files, and SVG for pages."""
+
+import base64
+import contextlib
+import itertools
+import math
+import textwrap
+import warnings
+from collections.abc import Iterator, Sequence
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure as Canvas
+from matplotlib.layout_engine import TightLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+from jaxbl.files import is_remote, open_draft
+from jaxbl.json_types import JsonObject
+
+from .panels import (
+    BLACK,
+    COLOURS,
+    FAINT,
+    MISSING,
+    Axis,
+    Band,
+    Bars,
+    Dots,
+    Figure,
+    Line,
+    Map,
+    Panel,
+    Scale,
+    Span,
+    describe_panel,
+    panel_json,
+    round_ticks,
+    thin,
+    tick_text,
+)
+
+_SETTINGS: Any = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    # of figures that are made elsewhere under these settings
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 150,
+    "axes.prop_cycle": cycler(color=COLOURS),
+    "svg.fonttype": "path",
+}
+_INK = ((BLACK, "currentColor"), ("#ffffff", "var(--paper)"), ("#dddddd", "var(--grid)"))
+"""Colours of a drawing that follow the page's."""
+_DARK = """svg { color: #000000; --paper: #ffffff; --grid: #dddddd; fill: currentColor }
+@media (prefers-color-scheme: dark) { svg { color: #e8e8ea; --paper: transparent; --grid: #43464c } }
+</style>"""
+_LETTER, _ROW, _KEY = 0.075, 0.19, 0.5
+"""Width of a letter of a legend, height of a row, and width of what stands before a name, inches."""
+
+
+class Picture(NamedTuple):
+    """A figure as a page shows it.
+
+    Attributes:
+        svg: the drawing.
+        size: width and height, CSS pixels.
+        caption: what it shows.
+        described: caption, axes with their ranges, and names of lines: the text in its place.
+        panels: where each of its axes lies, and its numbers (:func:`jaxbl.report.panels.panel_json`).
+    """
+
+    svg: bytes
+    size: tuple[int, int]
+    caption: str
+    described: str
+    panels: list[JsonObject]
+
+    @property
+    def source(self) -> str:
+        """The drawing as an address that holds it."""
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
+
+
+@contextlib.contextmanager
+def style() -> Iterator[None]:
+    """The settings that figures are made under; also a decorator of what makes them."""
+    with mpl.rc_context(_SETTINGS), warnings.catch_warnings():
+        # a name may have letters that the font lacks, drawn as boxes
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+        yield
+
+
+@style()
+def save_canvas(canvas: Canvas, path: Path) -> Path:
+    """Write what matplotlib has drawn as PNG, making its folder. Returns the path."""
+    if not is_remote(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with open_draft(path) as draft:
+        canvas.savefig(draft, format="png")
+    return path
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, making its folder. Returns the path."""
+    return save_canvas(draw_canvas(figure)[0], path)
+
+
+@style()
+def picture(figure: Figure, path: Path | None = None) -> Picture:
+    """Return a figure as a page shows it, and write it as PNG into a file, if one is given."""
+    canvas, axes = draw_canvas(figure)
+    if path is not None:
+        save_canvas(canvas, path)
+    file = BytesIO()
+    # names of its parts must not be those of another figure, and are the same each time
+    with mpl.rc_context({"svg.hashsalt": figure.name}):
+        canvas.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    svg = file.getvalue().decode()
+    for colour, follows in _INK:
+        svg = svg.replace(f": {colour}", f": {follows}")
+    panels, texts = [], [figure.caption]
+    for ax, panel in zip(axes, figure.panels, strict=True):
+        place, ends = ax.get_position(), (ax.get_xlim(), ax.get_ylim())
+        panels.append(panel_json(panel, (place.x0, 1.0 - place.y1, place.width, place.height), ends))
+        texts.append(describe_panel(panel, ends))
+    width, height = (round(96 * inches) for inches in canvas.get_size_inches())
+    return Picture(svg.replace("</style>", _DARK, 1).encode(), (width, height), figure.caption, " ".join(texts[:7]), panels)
+
+
+@style()
+def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
+    """Draw a figure. Returns it, and the axes of its panels."""
+    panels, columns = figure.panels, min(figure.columns, len(figure.panels))
+    rows = -(-len(panels) // columns)
+    names = [_legend_handles(panel) for panel in panels]
+    scales = _scales(panels)
+    shared = len(scales) == 1
+    # one legend for all panels where one of them has all names, and for maps
+    below = dict(itertools.chain(*(handles.items() for handles in names)))
+    if not scales and len(below) > max(map(len, names)):
+        below = {}
+    fit = _count_columns(below, figure.width)
+    foot = _ROW * math.ceil(len(below) / fit) + 0.1 if below else 0.0
+    canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
+    widths = figure.widths or [1.0] * columns
+    grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*widths, *[0.035 * sum(widths)] * shared])
+    axes: list[Axes] = []
+    axes_by_axis: dict[tuple[str, Axis], Axes] = {}
+    for i, panel in enumerate(panels):
+        how = {
+            f"share{name}": axes_by_axis.get((name, axis)) for name, axis in zip("xy", panel[:2], strict=True) if axis.label
+        }
+        ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
+        axes_by_axis |= {("x", panel.x): ax, ("y", panel.y): ax}
+        axes.append(ax)
+        _draw_panel(ax, panel)
+        wide = figure.width * widths[i % columns] / sum(widths)
+        above = 0.0 if below else _legend_above(ax, names[i], wide)
+        ax.set_title(_plain(panel.title), loc="left", pad=6.0 + 72.0 * above)
+        inner = {"x": i + columns < len(panels) and panels[i + columns].x == panel.x,
+                 "y": i % columns > 0 and panels[i - 1].y == panel.y}  # fmt: skip
+        for name, is_inner in inner.items():
+            if is_inner and getattr(panel, name).label:
+                ax.tick_params(axis=name, labelbottom=False, labelleft=False)  # type: ignore[arg-type]
+                ax.set(**{f"{name}label": ""})
+        if not shared:
+            for scale in _scales([panel]):
+                _draw_bar(canvas, scale, ax=ax)
+    if shared:
+        _draw_bar(canvas, scales[0], cax=canvas.add_subplot(grid[:, columns]))
+    if below:
+        canvas.legend(below.values(), map(_plain, below), loc="lower center", ncols=fit)
+    # an engine of matplotlib's own, where a figure has one, lays out twice, and before each drawing
+    TightLayoutEngine(pad=0.5, rect=(0.0, foot / canvas.get_figheight(), 1.0, 1.0)).execute(canvas)
+    return canvas, axes
+
+
+def _scales(panels: Sequence[Panel]) -> list[Scale]:
+    """Scales of maps that have a colour bar."""
+    parts = itertools.chain(*(panel.parts for panel in panels))
+    return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map | Dots) and part.scale.label))
+
+
+def _plain(text: str) -> str:
+    """A text without mathematical type."""
+    return text.replace("$", r"\$")
+
+
+def _count_columns(handles: dict[str, Any], width: float) -> int:
+    return max(min(int(width / (_LETTER * max(map(len, handles), default=1) + _KEY)), len(handles)), 1)
+
+
+def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
+    """Draw a legend above the axes, where it hides no line. Returns its height, inches."""
+    if not handles:
+        return 0.0
+    fit = _count_columns(handles, width - 0.6)
+    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
+    ax.legend(handles.values(), map(_plain, handles), ncols=fit, **place)
+    return _ROW * math.ceil(len(handles) / fit)
+
+
+def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
+    """Draw the colour bar of a scale."""
+    label = "\n".join(textwrap.wrap(_plain(scale.label), 44))
+    bar = canvas.colorbar(ScalarMappable(_norm(scale), scale.colours), label=label, **where)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    if scale.log:
+        _set_log_ticks(bar.ax.yaxis, scale.low, scale.high)
+
+
+def _norm(scale: Scale) -> Normalize:
+    return (LogNorm if scale.log else Normalize)(scale.low, scale.high)
+
+
+def _set_log_ticks(axis: Any, low: float, high: float) -> None:
+    axis.set_major_locator(FixedLocator(round_ticks(low, high)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(value)))
+    # the many small ticks take longer than all else in a figure
+    axis.set_minor_locator(NullLocator())
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    """Draw the parts of a panel, and set up its axes."""
+    for name, axis in zip("xy", panel[:2], strict=True):
+        ax.set(**{f"{name}label": _plain(axis.label), f"{name}scale": "log" if axis.log else "linear"})
+        if axis.ends is not None:
+            ax.set(**{f"{name}lim": axis.ends})
+    box = ax.get_position()
+    width, height = ax.figure.get_size_inches()  # type: ignore[union-attr]
+    ticks = {"x": int(np.clip(1.4 * width * box.width, 2, 8)), "y": int(np.clip(2.5 * height * box.height, 2, 6))}
+    held = []
+    for layer, part in enumerate(panel.parts):
+        if isinstance(part, Line) and part.held:
+            held.append(part)
+        else:
+            _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
+    for part in held:
+        x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((part.x, ax.get_xlim()), (part.y, ax.get_ylim())))
+        _draw_line(ax, part._replace(x=x, y=y), 5.0)
+    ax.grid(not any(isinstance(part, Map) for part in panel.parts) and panel.note == "")
+    for name, axis in zip("xy", panel[:2], strict=True):
+        drawn = getattr(ax, f"{name}axis")
+        if axis.names:
+            places, texts = zip(*axis.names, strict=True)
+            ax.set(**{f"{name}ticks": places, f"{name}ticklabels": map(_plain, texts)})
+            ax.grid(axis=name, visible=False)  # type: ignore[arg-type]
+        elif axis.log:
+            _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
+        else:
+            drawn.set_major_locator(MaxNLocator(ticks[name], steps=[1, 2, 5, 10]))
+        if axis.ratio is not None:
+            _draw_ratio(ax, name, *axis.ratio)
+    if panel.note:
+        ax.text(0.5, 0.5, _plain(panel.note), ha="center", va="center", color=FAINT, transform=ax.transAxes)
+        if not panel.parts:
+            ax.set(xticks=[], yticks=[])
+
+
+def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
+    """Draw the second scale of an axis, on the top or on the right."""
+    add = {"x": partial(ax.secondary_xaxis, "top"), "y": partial(ax.secondary_yaxis, "right")}[name]
+    axis = getattr(add(functions=(partial(np.multiply, 1.0 / unit), partial(np.multiply, unit))), f"{name}axis")
+    axis.set_label_text(label)
+    low, high = getattr(ax, f"get_{name}lim")()
+    _set_log_ticks(axis, low / unit, high / unit)
+
+
+def _line_look(line: Line) -> dict[str, Any]:
+    size = line.size
+    look = {"ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker}
+    edge = line.colour if line.marker in "x|+" or line.fill else line.fill or "none"
+    return look | {"ms": size, "mfc": line.fill or line.colour, "mec": edge, "mew": 1.1 if line.fill else 1.0}
+
+
+def _draw_line(ax: Axes, line: Line, layer: float) -> None:
+    line = thin(line)  # type: ignore[assignment]
+    look: Any = {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
+    (artist,) = ax.plot(line.x, line.y, drawstyle="steps-post" if line.steps else "default", **_line_look(line), **look)
+    # one by one, markers would be larger than an image of them
+    artist.set_rasterized(bool(line.marker) and len(line.x) > 800)
+    centred: Any = {"ha": "center", "va": "center"}
+    beside: Any = {"va": "center", "xytext": (6, 0), "textcoords": "offset points"}
+    for x, y, text in zip(line.x, line.y, line.texts):  # noqa: B905
+        ax.annotate(_plain(text), (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
+    if line.at_line:
+        _name_line(ax, line)
+
+
+def _name_line(ax: Axes, line: Line) -> None:
+    """Write a line's name on it, where it is inside of the axes and no other one's name is."""
+    (left, right), (low, high) = map(sorted, (ax.get_xlim(), ax.get_ylim()))
+    x, y = np.asarray(line.x), np.asarray(line.y)
+    inside = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
+    if len(inside):
+        i = inside[int(len(inside) * (0.95, 0.7, 0.5, 0.85, 0.6)[len(ax.texts) % 5])]
+        name = ax.annotate(
+            _plain(line.name), (x[i], y[i]), fontsize=8.5, ha="right", va="bottom", xytext=(0, 2),
+            textcoords="offset points", zorder=6, color="#111111",
+        )  # fmt: skip
+        name.set_path_effects([withStroke(linewidth=2.5, foreground="#FEFEFE")])
+
+
+def _draw_band(ax: Axes, band: Band, layer: float) -> None:
+    band = thin(band)  # type: ignore[assignment]
+    ax.fill_between(band.x, band.low, band.high, color=band.colour, alpha=band.opacity, lw=0.0, zorder=layer)
+
+
+def _draw_span(ax: Axes, span: Span, layer: float) -> None:
+    if span.low == span.high:
+        across = ax.axvline if span.along == "x" else ax.axhline
+        across(span.low, color=span.colour, lw=span.width, ls=span.dashes, zorder=layer)
+    else:
+        across = ax.axvspan if span.along == "x" else ax.axhspan
+        across(span.low, span.high, color=span.colour, alpha=span.opacity, lw=0.0, zorder=layer)
+
+
+def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
+    how: Any = {"rasterized": True, "zorder": layer}
+    values = np.asarray(cells.values, float)
+    if cells.failed is not None:
+        values = np.where(cells.failed, np.nan, values)
+        if np.any(cells.failed):
+            grey = np.where(cells.failed, 0.0, np.nan)
+            ax.pcolormesh(cells.x, cells.y, grey, cmap=ListedColormap([MISSING]), **how)
+    ax.pcolormesh(cells.x, cells.y, values, cmap=cells.scale.colours, norm=_norm(cells.scale), **how)
+
+
+def _draw_dots(ax: Axes, dots: Dots, layer: float) -> None:
+    how: Any = {"cmap": dots.scale.colours, "norm": _norm(dots.scale), "s": 16, "linewidths": 0, "rasterized": True}
+    ax.scatter(dots.x, dots.y, c=dots.values, zorder=layer, **how)
+
+
+def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
+    draw = ax.bar if bars.upright else ax.barh
+    draw(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
+    for place, length, text in zip(bars.places, bars.lengths, bars.texts):  # noqa: B905
+        ax.annotate(f" {_plain(text)}", (length, place), va="center", fontsize=9)
+
+
+_DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _draw_map, Dots: _draw_dots, Bars: _draw_bars}
+
+
+def _legend_handles(panel: Panel) -> dict[str, Any]:
+    """The legend's handle of each name in a panel that does not stand beside its line."""
+    handles: dict[str, Any] = {}
+    for part in panel.parts:
+        name = getattr(part, "name", "")
+        if isinstance(part, Map) and np.any(part.failed):
+            name = part.failed_name
+        if not name or name in handles or (isinstance(part, Line) and part.at_line):
+            continue
+        if isinstance(part, Line):
+            handles[name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
+        elif isinstance(part, Span) and part.low == part.high:
+            handles[name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
+        else:
+            handles[name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
+    return handles
