@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm, Normalize
 
 from jaxbl.config import Config, is_boolean
-from jaxbl.files import json_with_checksum, write_atomic
+from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
@@ -26,9 +26,7 @@ _PANELS = 3
 
 def write_comparison(comparison: Comparison, folder: Path) -> str:
     """Write `comparison.json`. Returns the first study's TOML."""
-    # of an earlier comparison
-    (folder / "figures" / "comparison.png").unlink(missing_ok=True)
-    write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
+    write_json(folder / "comparison.json", comparison.to_dict())
     return comparison.first_config.to_toml()
 
 

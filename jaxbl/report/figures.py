@@ -20,7 +20,6 @@ from matplotlib.patches import Patch as Patch
 from matplotlib.ticker import NullLocator
 
 from jaxbl.errors import escape_unprintable, shorten
-from jaxbl.files import is_remote, open_draft
 
 SIDES = ("motor", "load")
 Pair = tuple[float, float]
@@ -102,11 +101,9 @@ def literal(name: str) -> str:
 @style()
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
-    if not is_remote(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with open_draft(path) as draft:
-        lay_out(figure)
-        figure.savefig(draft, format="png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lay_out(figure)
+    figure.savefig(path, format="png")
     return path
 
 

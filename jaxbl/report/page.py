@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import catch_write_errors, write_atomic
+from jaxbl.files import write_atomic
 from jaxbl.result import VERDICTS, Result, ResultTable
 
 from .figures import Drawn, save
@@ -34,8 +34,7 @@ def write_page(folder: Path, result: Result, drawn: Sequence[Drawn], config: str
 
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     """Write figures into the folder's `figures/`. Returns their files and captions."""
-    with catch_write_errors(folder):
-        return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
+    return [(save(figure, folder / "figures" / f"{name}.png"), caption) for name, figure, caption in drawn]
 
 
 _SHORT = 8

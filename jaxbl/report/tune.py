@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Patch, Rectangle
 from pandas import DataFrame
 
-from jaxbl.files import write_atomic, write_json
+from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
@@ -302,7 +302,7 @@ def _bars(ax: Axes, key: str, rows: list[JsonObject]) -> None:
 def write_tuning(tuning: Tuning, folder: Path) -> str:
     """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
     summary = tuning.summary
-    write_atomic(folder / "gains.toml", gains_toml(summary))
+    (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
     write_certificates(summary, folder)
     write_json(folder / "tuning.json", summary, allow_nan=False)
     return tuning.config.to_toml()

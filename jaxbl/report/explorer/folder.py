@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from jaxbl.errors import InputError
-from jaxbl.files import catch_write_errors, is_empty, json_with_checksum, make_folder, read_json
+from jaxbl.files import Subject, open_results
 from jaxbl.json_types import JsonObject
 from jaxbl.report.maps import drawn_values
 
@@ -28,8 +27,6 @@ ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
-_MARKER = "jaxbl-explorer.json"
-"""Says that a folder is one of ours, which may be written anew."""
 _SHARED = ("explore.css", "hyparquet.LICENSE.txt")
 _SCRIPTS = ("hyparquet", "shared", "plot")
 
@@ -80,17 +77,11 @@ def write_static(source: Source, out: Path) -> Path:
     Raises:
         InputError: the folder holds something else.
     """
-    make_folder(out, option="--static")
-    marker = out / _MARKER
-    if not is_empty(out) and not marker.exists():
-        raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
-    if marker.exists() and read_json(marker).get("of") != source.identity:
-        raise InputError(f"{out}: holds the page of other results; choose another folder, or remove it")
-    with catch_write_errors(out):
-        marker.write_text(json_with_checksum({"made_by": "jaxbl explore", "of": source.identity}), encoding="utf-8")
-        for old in out.glob("points.*"):
-            old.unlink()
-        source.write(out, False)
+    with (
+        open_results(out, Subject("page", "of jaxbl explore", source.identity)) as results,
+        results.write_files("index.html") as draft,
+    ):
+        source.write(draft, False)
     return out / "index.html"
 
 

@@ -2,16 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 from pandas import DataFrame
 
 from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
-from jaxbl.files import read_json, to_path
+from jaxbl.files import check_result, read_result, to_path
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import describe_diagnosis
@@ -41,29 +39,20 @@ def log_source(folder: str | Path) -> Source | None:
     file = _summary_file(folder)
     if file is None:
         return None
-    summary = read_json(file)
+    summary = read_result(file)
     describe = describe_diagnosis if file.name == "diagnosis.json" else describe_identification
     card = (describe_element if summary.get("kind") == "element" else describe)(summary)
     lead = card.sentences
 
     def write(out: Path, served: bool) -> bool:
-        model, frame = (_read(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
+        model, trace = (check_result(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
+        frame, model = pd.read_parquet(trace), model.read_text(encoding="utf-8")
         content = write_log(summary, frame, out)
         content |= {"title": card.title, "lead": lead, "config": model, "file": "model.toml"}
         write_page(out, ("log",), content, scripts=not served)
         return False
 
     return Source(str(summary["identity"]), lead, write, {}, lambda: None, lambda: None)
-
-
-def _read(file: Path) -> Any:
-    """Text, or a table. Raises `InputError` where it cannot be read."""
-    try:
-        return pd.read_parquet(file) if file.suffix == ".parquet" else file.read_text(encoding="utf-8")
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            f"{file}: cannot be read ({error}); run the command that wrote it again, with --overwrite"
-        ) from None
 
 
 def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
