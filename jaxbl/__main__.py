@@ -6,15 +6,17 @@ import sys
 from types import FrameType
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    """End at once: foreign code that is being loaded may swallow an interrupt, and nothing is written before work begins."""
+def leave(number: int, frame: FrameType | None) -> None:
+    """End at once, as foreign code that is being loaded may swallow an interrupt; but a locked folder is tidied up first."""
+    if getattr(sys.modules.get("jaxbl.files"), "held_folders", ()):
+        raise KeyboardInterrupt
     os.write(2, b"interrupted\n")
     os._exit(130)
 
 
 # processes that a command starts load this module, too, and are ended by it
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler and "multiprocessing.spawn" not in sys.modules:
-    signal.signal(signal.SIGINT, _leave)
+    signal.signal(signal.SIGINT, leave)
 
 
 def program() -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from .cluster import Scheduler, connect
 from .errors import InputError
-from .files import make_folder, run_or_read
+from .files import Subject, open_results, run_or_read
 from .json_types import JsonObject
 from .lines import format_descriptions
 from .records.files import is_log, log_suffixes
@@ -65,12 +65,13 @@ def run_batch(
 
     Returns its rows.
     """
-    make_folder(out)
     count = len(jobs)
-    progress(0, count)
     rows = []
     processes = useful_processes(count) if processes is None else min(processes, count)
-    with connect(scheduler) as cluster:
+    with open_results(out, Subject("batch")) as results, connect(scheduler) as cluster:
+        # the folder is a batch's before there are folders of logs in it
+        results.write_manifest()
+        progress(0, count)
         for row in (
             map_jobs(_diagnose_log, jobs, processes)
             if cluster is None
@@ -78,7 +79,8 @@ def run_batch(
         ):
             rows.append(row)
             progress(len(rows), count)
-    pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
+        with results.write_files("batch.csv") as draft:
+            pd.DataFrame(rows).to_csv(draft / "batch.csv", index=False)
     return rows
 
 

@@ -1,28 +1,30 @@
-"""Files and folders that commands write: files appear whole or not at all, JSON has a checksum, and folders are locked."""
+"""Folders that commands write results into: locked, whole or not at all, and with a manifest that has the checksum of each
+file and says what the results are about."""
 
 import errno
-import hashlib
 import json
 import math
 import os
 import re
 import shutil
+import signal
 import socket
+import stat
+import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from .errors import InputError, NoResult
 from .json_types import JsonObject
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json", "watch.json")
-"""Files that `inspect`, `identify`, `diagnose` and `watch` write into a folder; each names the log of the results."""
+MANIFEST = "results.json"
+FORMAT = 5
+"""Format of the manifest; it is raised when older versions cannot read a new one."""
 
 
 def to_path(name: str | Path) -> Path:
@@ -79,25 +81,26 @@ _BEGIN_ANEW = "begin anew with --overwrite, or choose another folder with --out"
 
 
 def checksum(content: bytes) -> str:
-    """Return the checksum of some bytes, 32 hexadecimal digits."""
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
+    """Return the CRC-32 of some bytes, 8 hexadecimal digits: it detects damage, not forgery."""
+    return f"{zlib.crc32(content):08x}"
 
 
 def read_json(path: Path) -> JsonObject:
-    """Read a JSON object that a command wrote, and check it against its checksum, which is left out.
+    """Read a JSON object that :func:`json_with_checksum` made, without its checksum.
 
     Raises:
-        InputError: the file is damaged, or not one of jaxbl's.
+        InputError: it cannot be read, or does not agree with its checksum.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: is damaged ({error}); {_BEGIN_ANEW}") from None
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: is not one of jaxbl's files; choose another folder with --out")
-    if "checksum" in data and data.pop("checksum") != _json_checksum(data):
-        raise InputError(f"{path}: is damaged (does not agree with its checksum); {_BEGIN_ANEW}")
-    return data
+        data = json.loads(path.read_bytes())
+        if data.pop("checksum") == _json_checksum(data):
+            return data
+        reason = "does not agree with its checksum"
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        reason = str(error) if isinstance(error, OSError | ValueError) else "has no checksum"
+    raise InputError(f"{path}: is damaged ({reason}); {_BEGIN_ANEW}")
 
 
 def json_with_checksum(data: JsonObject) -> str:
@@ -111,43 +114,30 @@ def _json_checksum(data: JsonObject) -> str:
     return checksum(json.dumps(data, sort_keys=True).encode())
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that it exists either whole or not at all. Raises as :func:`open_draft`."""
-    with open_draft(path) as draft:
-        # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
-        draft.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
+    """Write a file so that it exists either whole or not at all.
+
+    Raises:
+        NoResult: the disk is full, access is denied, or the disk fails.
+    """
+    # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+    draft = path if is_remote(path) else path.with_name(f".{path.name}.{os.getpid()}")
+    with catch_write_errors(path):
+        try:
+            draft.write_bytes(data)
+            if draft != path:
+                draft.replace(path)
+        except BaseException:
+            with suppress(OSError):
+                if draft != path:
+                    draft.unlink()
+            raise
 
 
 def write_json(path: Path, data: Any, *, allow_nan: bool = True) -> None:
-    """Write data as JSON text without a checksum. Raises as :func:`open_draft`."""
+    """Write data as JSON text. Raises as :func:`write_atomic`."""
     write_atomic(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=allow_nan))
-
-
-def create_file(path: Path, content: str) -> bool:
-    """Write a file that does not exist yet. Returns False if another process was first. Raises as :func:`open_draft`.
-
-    In an object store a conditional put decides which process is first. Some stores ignore the condition: of two processes
-    that write at the same time, the later one wins there. On a file system the folder is locked (:func:`lock_folder`).
-    """
-    if not is_remote(path):
-        write_atomic(path, content)
-        return True
-    with catch_write_errors(path):
-        if path.exists():
-            return False
-        try:
-            path.fs.pipe_file(path.path, content.encode(), mode="create")  # pyright: ignore[reportAttributeAccessIssue]
-        except FileExistsError:
-            return False
-        except NotImplementedError:
-            path.write_bytes(content.encode())
-        return path.read_bytes() == content.encode()
-
-
-def write_table(path: Path, frame: "pd.DataFrame") -> None:
-    """Write a Parquet file so that it exists either whole or not at all. Raises as :func:`open_draft`."""
-    with open_draft(path) as draft:
-        frame.to_parquet(draft, index=False)
 
 
 def list_paths(folder: Path, pattern: str) -> list[Path]:
@@ -160,7 +150,7 @@ def list_paths(folder: Path, pattern: str) -> list[Path]:
 
 def remove(path: Path) -> None:
     """Remove a file, or a folder with its contents, if it exists."""
-    if not path.is_dir():
+    if not path.is_dir() or (isinstance(path, Path) and path.is_symlink()):
         path.unlink(missing_ok=True)
     elif isinstance(path, Path):
         shutil.rmtree(path)
@@ -168,12 +158,15 @@ def remove(path: Path) -> None:
         path.rmdir(recursive=True)
 
 
-def rename_file(path: Path, target: Path) -> None:
-    """Give a file another name in the same folder or store."""
-    if is_remote(path):
+def move_file(path: Path, target: Path) -> None:
+    """Move a file into a folder of the same disk, which is made, or into an object store."""
+    if is_remote(target):
         target.write_bytes(path.read_bytes())
         path.unlink()
     else:
+        target.parent.mkdir(exist_ok=True)
+        if target.is_dir():
+            remove(target)
         path.replace(target)
 
 
@@ -194,27 +187,26 @@ def catch_write_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def open_draft(path: Path) -> Iterator[Path]:
-    """Yield the path of a draft, which takes the place of `path` when the `with` block ends. Raises as
-    :func:`catch_write_errors`."""
-    if is_remote(path):
-        with TemporaryDirectory() as folder, catch_write_errors(path):
-            yield Path(folder) / path.name
-            path.write_bytes((Path(folder) / path.name).read_bytes())
+def hold_interrupts() -> Iterator[None]:
+    """Let an interrupt (Ctrl+C) wait until the `with` block ends: it leaves all of what is done there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
         return
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    waiting: list[Any] = []
+    before = signal.signal(signal.SIGINT, lambda *interrupt: waiting.append(interrupt))
     try:
-        with catch_write_errors(path):
-            yield draft
-            draft.replace(path)
+        yield
     finally:
-        with suppress(OSError):
-            draft.unlink()
+        signal.signal(signal.SIGINT, before)
+        if waiting and callable(before):
+            before(*waiting[0])
 
 
-LOCK_NAME = ".lock"
-_DRAFT_NAME = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png))\.\d+|draft\..+)")
+_LOCK_NAME = ".lock"
+_DRAFT_NAME = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png|csv))\.\d+|draft\..+)")
 """Names of files and folders that a killed process may leave behind."""
+held_folders: list[Path] = []
+"""Folders that this process has locked: an interrupt has something to tidy up."""
 
 
 class FolderInUse(InputError):
@@ -223,62 +215,97 @@ class FolderInUse(InputError):
 
 @contextmanager
 def lock_folder(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator[None]:
-    """Make a folder, and keep other processes from writing into it inside the `with` block.
+    """Make a folder, remove what killed processes left there, and keep other processes from writing into it inside the
+    `with` block; a folder that is empty then is removed.
 
     The system frees the lock of a process that dies, and on a network file system that of a machine that is lost. On a file
     system without locks, and in an object store, nothing is locked.
 
     Args:
         folder: made if it does not exist.
-        shared: let other processes write that share it, too.
+        shared: let other processes write that share it, too; nothing is removed, as it may be theirs.
         wait: seconds to wait for another process that has locked it.
 
     Raises:
         FolderInUse: another process is writing into it.
         InputError: the folder cannot be written to.
     """
-    make_folder(folder)
     if is_remote(folder):
+        make_folder(folder)
         yield
         return
-    path = folder / LOCK_NAME
-    deadline = time.monotonic() + wait
-    while (file := _acquire_lock(path, shared)) is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    if file is None:
-        raise FolderInUse(
-            f"{folder}: {lock_holder(folder) or 'another process'} is writing into it; wait until it has ended, or choose "
-            "another folder with --out"
-        )
+    deadline, file = time.monotonic() + wait, None
+    held_folders.append(folder)
     try:
+        while True:
+            with hold_interrupts():
+                file = _acquire_lock(folder, shared)
+            if file is not None:
+                break
+            if time.monotonic() >= deadline:
+                raise FolderInUse(
+                    f"{folder}: {lock_holder(folder) or 'another process'} is writing into it; wait until it has ended, or "
+                    "choose another folder with --out"
+                )
+            time.sleep(0.05)
+        if not shared:
+            _remove_drafts(folder)
         yield
     finally:
-        with suppress(OSError):
-            # the file stays while other processes share the lock
-            if not shared or _try_lock(file, shared=False):
-                path.unlink()
-        file.close()
+        with hold_interrupts(), suppress(OSError):
+            held_folders.remove(folder)
+            if file is not None:
+                # the file stays while other processes share the lock
+                if not shared or _try_lock(file, shared=False):
+                    _remove_drafts(folder)
+                    with suppress(OSError):
+                        (folder / _LOCK_NAME).unlink()
+                    file.close()
+                    # Windows keeps a file that is open
+                    if os.name == "nt":
+                        (folder / _LOCK_NAME).unlink()
+                file.close()
+            # the system refuses to remove a folder that is not empty
+            folder.rmdir()
 
 
 def lock_holder(folder: Path) -> str:
     """The process that has locked a folder, with its host and since when; "" if it is not locked."""
-    if is_remote(folder):
-        return ""
-    with suppress(OSError), (folder / LOCK_NAME).open("r+") as file:
-        return "" if _try_lock(file, shared=False) else file.read()
+    if not is_remote(folder):
+        with suppress(OSError), _open_lock(folder, os.O_RDWR) as file:
+            return "" if _try_lock(file, shared=False) else file.read()
     return ""
 
 
-def _acquire_lock(path: Path, shared: bool) -> Any:
+def _open_lock(folder: Path, flags: int) -> Any:
+    """Open the file of a lock, which may not be a link: it is written to. Raises `OSError` where it is none of ours."""
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    file = os.fdopen(os.open(folder / _LOCK_NAME, flags, 0o666), "r+", encoding="utf-8")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.ELOOP, "is no regular file")
+    return file
+
+
+def _acquire_lock(folder: Path, shared: bool) -> Any:
     """Return the open file of a lock that this process now holds; None if another process holds it."""
     while True:
-        file = path.open("a+")
+        make_folder(folder)
+        path = folder / _LOCK_NAME
+        try:
+            file = _open_lock(folder, os.O_RDWR | os.O_CREAT)
+        except FileNotFoundError:
+            continue  # another process has just removed the folder
+        except OSError as error:
+            raise InputError(
+                f"{path}: is no lock of jaxbl ({error.strerror}); remove it, or choose another folder"
+            ) from None
         if not _try_lock(file, shared):
             file.close()
             return None
         # the process that held the lock may have removed the file meanwhile
         with suppress(FileNotFoundError):
-            if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+            if os.path.samestat(os.fstat(file.fileno()), path.lstat()):
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {socket.gethostname()} (since {time.strftime('%Y-%m-%d %H:%M:%S')})")
                 file.flush()
@@ -286,10 +313,16 @@ def _acquire_lock(path: Path, shared: bool) -> Any:
         file.close()
 
 
+_BYTES = 1 << 30, 1 << 10
+"""Where Windows locks a file, far from its text, and how many bytes: a shared lock takes one of them."""
+
+
 def _try_lock(file: Any, shared: bool) -> bool:
     """Lock an open file. Returns True if that was possible, or if the file system has no locks."""
-    import fcntl
-
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return _try_lock_bytes(file, shared)
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -300,16 +333,32 @@ def _try_lock(file: Any, shared: bool) -> bool:
     return True
 
 
-def remove_drafts(folder: Path) -> None:
-    """Remove the drafts that killed processes have left in a result folder."""
-    for draft in [] if is_remote(folder) else folder.rglob(".*"):
-        if _DRAFT_NAME.fullmatch(draft.name):
-            remove(draft)
+def _try_lock_bytes(file: Any, shared: bool) -> bool:
+    import msvcrt
+
+    start, count = _BYTES
+    place, length = (start + os.getpid() % count, 1) if shared else (start, count)
+    os.lseek(file.fileno(), place, os.SEEK_SET)
+    try:
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, length)  # pyright: ignore[reportAttributeAccessIssue]
+    except OSError:
+        return False
+    finally:
+        os.lseek(file.fileno(), 0, os.SEEK_SET)
+    return True
+
+
+def _remove_drafts(folder: Path) -> None:
+    """Remove the drafts that killed processes have left in a folder that is locked."""
+    for place in (folder, *(folder / name for name in ("points", "verify", "tune"))):
+        for draft in list_paths(place, ".*"):
+            if _DRAFT_NAME.fullmatch(draft.name):
+                remove(draft)
 
 
 def is_empty(folder: Path) -> bool:
     """True if a folder contains at most a lock."""
-    return all(path.name == LOCK_NAME for path in list_paths(folder, "*"))
+    return all(path.name == _LOCK_NAME for path in list_paths(folder, "*"))
 
 
 @contextmanager
@@ -333,13 +382,12 @@ def has_file(folder: Path, name: str) -> bool:
     return (folder / name).exists()
 
 
-def make_folder(path: Path, remedy: str = "", option: str = "--out") -> None:
+def make_folder(path: Path, remedy: str = "choose another folder with --out") -> None:
     """Make a folder, and check that it can be written to.
 
     Args:
         path: the folder, which may exist.
-        remedy: the end of the message; left out, it says to choose another folder with `option`.
-        option: the command-line option that names the folder.
+        remedy: the end of the message.
 
     Raises:
         InputError: it cannot be made, or not be written to.
@@ -355,44 +403,197 @@ def make_folder(path: Path, remedy: str = "", option: str = "--out") -> None:
         probe.touch()
         probe.unlink()
     except FileExistsError:
-        raise InputError(f"{path}: is a file; {option} should name a folder") from None
+        raise InputError(f"{path}: is a file; --out should name a folder") from None
     except NotADirectoryError:
-        raise InputError(f"{path}: lies under a file; {option} should name a folder") from None
+        raise InputError(f"{path}: lies under a file; --out should name a folder") from None
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written to ({error.strerror}); {remedy or f'choose another folder with {option}'}"
-        ) from None
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); {remedy}") from None
 
 
-def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:
-    """Make the folder for the results of a log.
+class Subject(NamedTuple):
+    """The subject of results in a folder; commands on one subject may share it.
+
+    Attributes:
+        kind: "study", "log" or such.
+        name: for messages.
+        identity: by which it is known again.
+    """
+
+    kind: str
+    name: str = ""
+    identity: str = ""
+
+
+def log_subject(log: Path) -> Subject:
+    """Return the subject of commands on a log."""
+    return Subject("log", str(log.resolve()), str(log.resolve()))
+
+
+class ResultFolder:
+    """A folder of results with its manifest, `results.json`.
+
+    Attributes:
+        path: the folder.
+        subject: what the results are about.
+        entries: what the manifest says of each result, by the result's name: `identity` of what was asked for, checksums of
+            its `files`, and what else the command keeps. A result that has `folders` checks what is in them itself.
+    """
+
+    def __init__(self, path: Path, subject: Subject, entries: JsonObject | None = None):
+        self.path, self.subject, self.entries = path, subject, {} if entries is None else entries
+
+    @classmethod
+    def read(cls, path: Path) -> "ResultFolder | None":
+        """Read the manifest of a folder; None if it has none. Raises `InputError` if it is damaged, or of another format."""
+        if not has_file(path, MANIFEST):
+            return None
+        data = read_json(path / MANIFEST)
+        names = [name for entry in data.get("results", {}).values() for name in (*entry["files"], *entry.get("folders", ()))]
+        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in names):
+            raise InputError(f"{path / MANIFEST}: is damaged (names files in other folders); {_BEGIN_ANEW}")
+        if data.get("format") != FORMAT:
+            raise InputError(
+                f"{path / MANIFEST}: has format {data.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
+                "that wrote it, or make the results anew in another folder"
+            )
+        return cls(path, Subject(*data["subject"]), data["results"])
+
+    def write_manifest(self) -> None:
+        """Write the manifest. Raises as :func:`write_atomic`."""
+        data = {"format": FORMAT, "subject": self.subject, "results": self.entries}
+        write_atomic(self.path / MANIFEST, json_with_checksum(data))
+
+    def is_whole(self, result: str, identity: str) -> bool:
+        """Return True if a result is there, is what was asked for, and none of its files has changed."""
+        entry = self.entries.get(result, {})
+        return entry.get("identity") == identity and not self.damaged_files(result)
+
+    def damaged_files(self, result: str) -> list[str]:
+        """List the names of a result's files that are not what was written."""
+        return [
+            name for name, expected in self.entries[result]["files"].items() if file_checksum(self.path / name) != expected
+        ]
+
+    def check_file(self, name: str) -> Path:
+        """Return the path of a result's file that is what was written. Raises `InputError` otherwise."""
+        expected = [entry["files"][name] for entry in self.entries.values() if name in entry["files"]]
+        if file_checksum(self.path / name) not in expected:
+            raise InputError(f"{self.path / name}: is missing, damaged or edited; run the command that wrote it again")
+        return self.path / name
+
+    @contextmanager
+    def write_files(self, result: str, **entry: Any) -> Iterator[Path]:
+        """Yield an empty folder; what is written there appears in this one when the `with` block ends, with the manifest,
+        and takes the place of the files of an earlier result of that name. Raises as :func:`write_atomic`."""
+        place = None if is_remote(self.path) else self.path
+        with catch_write_errors(self.path), TemporaryDirectory(prefix=".draft.", dir=place) as name:
+            draft = Path(name)
+            yield draft
+            files = {file.relative_to(draft).as_posix(): file_checksum(file) for file in draft.rglob("*") if file.is_file()}
+            with hold_interrupts():
+                before = self.entries.get(result, {}).get("files", {})
+                # the folder is this subject's before there is anything else in it
+                self.write_manifest()
+                self.entries[result] = entry | {"files": files}
+                listed = {file for other in self.entries.values() for file in other["files"]}
+                for file in before.keys() - listed:
+                    remove(self.path / file)
+                for file in files:
+                    move_file(draft / file, self.path / file)
+                self.write_manifest()
+
+
+def file_checksum(path: Path) -> str:
+    """Return the checksum of a file; "" if it cannot be read."""
+    try:
+        return checksum(path.read_bytes())
+    except OSError:
+        return ""
+
+
+def recover_log(folder: Path) -> ResultFolder | None:
+    """Return the folder of a log whose manifest is lost or damaged, by a summary that names the log; None without one.
+
+    Nothing in it counts as whole: it is made anew.
+    """
+    for file in list_paths(folder, "*.json"):
+        with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+            return ResultFolder(folder, log_subject(Path(json.loads(file.read_bytes())["file"])))
+    return None
+
+
+def claim_folder(
+    folder: Path,
+    subject: Subject,
+    *,
+    overwrite: bool = False,
+    identities: Mapping[str, str] | None = None,
+    recover: Callable[[Path], ResultFolder | None] = recover_log,
+) -> ResultFolder:
+    """Check that results may be written into a folder, which is locked (:func:`lock_folder`).
+
+    Args:
+        folder: folder of the results.
+        subject: what they are about.
+        overwrite: remove results of another subject.
+        identities: of results by name; others of these names are not written over, either.
+        recover: finds out what a folder holds whose manifest is lost or damaged.
 
     Raises:
-        InputError: it holds other files, or (unless `overwrite`) results of another log, or it cannot be written to.
+        InputError: the folder holds other results or other files, or its manifest is damaged.
     """
-    make_folder(folder)
-    results = [folder / name for name in LOG_RESULTS if (folder / name).exists()]
-    if not results and not is_empty(folder):
-        raise InputError(f"{folder}: is not empty and holds no results of a log; choose another folder with --out")
-    for file in results:
-        log_path = read_log_path(file)
-        if log_path != str(log.resolve()) and not overwrite:
-            name = log_path or "an unreadable one"
-            raise InputError(f"{folder}: holds results of another log ({name}); choose another with --out, or --overwrite")
-    if results:
-        remove_drafts(folder)
-
-
-def read_log_path(file: Path) -> str | None:
-    """Read from a result file the path of its log; None if that cannot be read. The other keys may be damaged."""
     try:
-        return str(json.loads(file.read_text(encoding="utf-8"))["file"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        results = ResultFolder.read(folder) or recover(folder)
+        if results is None and not is_empty(folder):
+            raise InputError(
+                f"{folder}: is not empty and holds no results with a {MANIFEST} (an earlier jaxbl wrote none); choose "
+                "another folder with --out, where they are made anew"
+            )
+    except InputError:
+        results = recover(folder)
+        if results is None and not (overwrite and (folder / MANIFEST).exists()):
+            raise
+    if results is None:
+        remove(folder / MANIFEST)
+        return ResultFolder(folder, subject)
+    asked = identities or {}
+    same = all(results.entries.get(name, {}).get("identity") in (None, value) for name, value in asked.items())
+    if same and (results.subject.kind, results.subject.identity) == (subject.kind, subject.identity):
+        return results
+    if not overwrite:
+        kind = f"another {subject.kind}" if results.subject.kind == subject.kind else f"a {results.subject.kind}"
+        option = "--static" if subject.kind == "page" else "--out"
+        remedy = f"choose another folder with {option}{', or --overwrite' if subject.kind in ('study', 'log') else ''}"
+        raise InputError(f"{folder}: holds results of {kind} ({results.subject.name or 'untitled'}); {remedy}")
+    for entry in results.entries.values():
+        for name in (*entry["files"], *entry.get("folders", ())):
+            remove(folder / name)
+    remove(folder / MANIFEST)
+    return ResultFolder(folder, subject)
+
+
+@contextmanager
+def open_results(folder: Path, subject: Subject, **options: Any) -> Iterator[ResultFolder]:
+    """Lock a folder for results (:func:`lock_folder`) and claim it (:func:`claim_folder`, with its options)."""
+    with lock_folder(folder):
+        yield claim_folder(folder, subject, **options)
+
+
+def check_result(file: Path) -> Path:
+    """Return the path of a result's file that is what was written. Raises `InputError` if it is not."""
+    results = ResultFolder.read(file.parent)
+    if results is None:
+        raise InputError(f"{file.parent}: holds no results of this version (no {MANIFEST}); run the command that makes them")
+    return results.check_file(file.name)
+
+
+def read_result(file: Path) -> JsonObject:
+    """Read a JSON file of a result. Raises as :func:`check_result`."""
+    return json.loads(check_result(file).read_bytes())
 
 
 def run_or_read(
-    task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, Path], object], *, overwrite: bool
+    task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, ResultFolder], object], *, overwrite: bool
 ) -> JsonObject:
     """Do a task on a log and write its results, unless an earlier call wrote the results of the same task.
 
@@ -407,30 +608,11 @@ def run_or_read(
         The summary, of this call or as the earlier one wrote it.
 
     Raises:
-        InputError: as :func:`claim_log_folder`, or as the task does.
+        InputError: as :func:`claim_folder`, or as the task does.
     """
-    folder = file.parent
-    with remove_if_empty_on_error(folder), lock_folder(folder):
-        claim_log_folder(folder, task.record.path, overwrite=overwrite)
-        with suppress(OSError, InputError):
-            summary = read_json(file)
-            # a report belongs to it that is older, as another command in the folder writes later
-            is_reported = (folder / "report.html").stat().st_mtime_ns <= file.stat().st_mtime_ns
-            if is_reported and summary.get("identity") == task.identity:
-                return summary
+    with open_results(file.parent, log_subject(task.record.path), overwrite=overwrite) as results:
+        if results.is_whole(file.name, task.identity):
+            return json.loads(file.read_bytes())
         result = run(task)
-        write(result, folder)
+        write(result, results)
     return result.summary
-
-
-@contextmanager
-def remove_if_empty_on_error(folder: Path) -> Iterator[None]:
-    """Remove a folder that is still empty if the `with` block raises."""
-    try:
-        yield
-    except BaseException:
-        # the system refuses to remove a folder that is not empty
-        with suppress(OSError):
-            if not is_remote(folder):
-                folder.rmdir()
-        raise

@@ -46,9 +46,11 @@ def name_config_in_errors(config: Path, folder: Path | None = None) -> Iterator[
 
 
 @contextmanager
-def run_with_progress(context: typer.Context, config: Path, folder: Path, *, unit: str = "runs") -> "Iterator[Progress]":
-    """Around a long computation: messages name the config, progress in `unit` is shown, and an interrupt (exit 130) says how
-    to go on: what is finished is in the folder, but for `STEPS`.
+def run_with_progress(
+    context: typer.Context, config: Path, folder: Path, *, unit: str = "runs", first: str = "compiling"
+) -> "Iterator[Progress]":
+    """Around a long computation: messages name the config, progress in `unit` is shown, `first` being done at the beginning,
+    and an interrupt (exit 130) says how to go on: what is finished is in the folder, but for `STEPS`.
 
     Foreign code may swallow an interrupt, or turn it into another error: it is remembered, and raised at the next progress
     or error.
@@ -64,7 +66,7 @@ def run_with_progress(context: typer.Context, config: Path, folder: Path, *, uni
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with name_config_in_errors(config, folder), progress_bar(unit, quiet=is_quiet(context)) as show:
+        with name_config_in_errors(config, folder), progress_bar(unit, quiet=is_quiet(context), first=first) as show:
 
             def progress(done: int, total: int) -> None:
                 if interrupted:

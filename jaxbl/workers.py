@@ -67,7 +67,13 @@ def count_cores() -> int:
 
 def count_memory() -> int:
     """Count the bytes of this machine's memory."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if hasattr(os, "sysconf"):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    import ctypes
+
+    kilobytes, libraries = ctypes.c_ulonglong(), getattr(ctypes, "windll")  # noqa: B009
+    libraries.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kilobytes))
+    return 1024 * kilobytes.value
 
 
 def useful_processes(jobs: int) -> int:
@@ -101,7 +107,8 @@ def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: 
     context = multiprocessing.get_context("spawn")
     cache = jax.config.values["jax_compilation_cache_dir"], jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     with ProcessPoolExecutor(processes, context, _start_process, cache) as pool:
-        futures = [pool.submit(_run_job, function, job) for job in jobs]
+        with _block_interrupts():
+            futures = [pool.submit(_run_job, function, job) for job in jobs]
         try:
             for future in futures:
                 yield future.result()
@@ -112,8 +119,27 @@ def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: 
                 for future in futures:
                     future.cancel()
                 for child in multiprocessing.active_children():
-                    with suppress(ProcessLookupError):
-                        os.kill(child.pid, signal.SIGINT)  # pyright: ignore[reportArgumentType]
+                    _interrupt_process(child)
+
+
+def _interrupt_process(child: Any) -> None:
+    """Interrupt a process. On Windows, Ctrl+C has reached all processes of the terminal by itself."""
+    if os.name != "nt":
+        with suppress(ProcessLookupError):
+            os.kill(child.pid, signal.SIGINT)
+
+
+@contextmanager
+def _block_interrupts() -> Iterator[None]:
+    """Let interrupts wait inside the `with` block; processes that begin in it hear none before :func:`_start_process`."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def map_in_threads(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
@@ -208,9 +234,10 @@ def make_private_folder(folder: Path) -> bool:
     except OSError:
         return False
     fault = ""
-    if status.st_uid != os.geteuid():
+    # on Windows a user's own folders are closed to others
+    if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
         fault = "is another user's"
-    elif status.st_mode & 0o022:
+    elif hasattr(os, "geteuid") and status.st_mode & 0o022:
         fault = "can be written to by others; remove it, to have it made anew"
     if fault and folder not in _refused_folders:
         _refused_folders.add(folder)
@@ -240,6 +267,8 @@ def _start_process(cache: str | None, compile_time: float) -> None:
     collect_garbage_rarely()
     _ignore_cache_warnings()
     signal.signal(signal.SIGINT, _handle_interrupt)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # nothing else tells a worker that its parent was killed
     threading.Thread(target=_end_with_parent, daemon=True).start()
     jax.config.update("jax_compilation_cache_dir", cache)

@@ -43,6 +43,11 @@ FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 AXES = [listed_axis(ALPHA, 5.0, 9.0, 20.0)]
 GAINS = [listed_axis(ALPHA, 5.0, 9.0), listed_axis(LAMBDA, 3.0, 6.0)]
 
+NO_RESULTS = (
+    "{}: is not empty and holds no results with a results.json (an earlier jaxbl wrote none); choose another folder with "
+    "--out, where they are made anew"
+)
+
 
 def interrupt(*_):
     raise KeyboardInterrupt
@@ -98,7 +103,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study_map"
     assert list_files(folder) == [
-        "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
+        "figures/line_motor_velocity_rmse.png", "points/part-00000.parquet", "report.html", "results.json", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("✓ Good: 6 runs: the motor observer converges in ")
@@ -127,7 +132,7 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
         == "interrupted; what is finished is kept. Go on with: jaxbl sweep 'a study.toml' --out out\n"
     )
     assert 1 <= len(list(folder.glob("points/part-*.parquet"))) < 30
-    assert not json.loads((folder / "manifest.json").read_text())["finished"]
+    assert not json.loads((folder / "results.json").read_text())["results"]["sweep"]["finished"]
 
 
 def test_interrupt_anywhere_else():
@@ -138,7 +143,7 @@ def test_interrupt_anywhere_else():
 
 SHARED = (
     "sweep: --detach needs the --scheduler of a cluster that stays, --share goes without one; neither goes with "
-    "--overwrite or --verify-store, as others may be at work in the folder; choose another one with --out"
+    "--overwrite, as others may be at work in the folder; choose another one with --out"
 )
 NO_SUCH_FILE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
 BAD = {
@@ -182,15 +187,15 @@ BAD = {
     ),
     "foreign folder": (
         ["sweep", "study.toml", "--out", "full"],
-        "full: is not empty and holds no study; choose another folder with --out",
+        NO_RESULTS.format("full"),
     ),
     "foreign folder, run": (
         ["simulate", "study.toml", "--out", "full"],
-        "full: is not empty and holds no study; choose another folder with --out",
+        NO_RESULTS.format("full"),
     ),
     "foreign folder, benchmark": (
         ["bench", "--out", "full"],
-        "full: is not empty and holds no bench.json; choose another folder with --out",
+        NO_RESULTS.format("full"),
     ),
     "a file as folder": (
         ["sweep", "study.toml", "--out", "plain.toml"],
@@ -198,7 +203,7 @@ BAD = {
     ),
     "too sparse": (
         ["simulate", "study.toml", "--every", "201"],
-        "every: should be between 1 and the number of samples 200, not 201",
+        "study.toml: every: should be between 1 and the number of samples 200, not 201",
     ),
     "nothing to tune for": (
         ["tune", "rest.toml"],
@@ -207,7 +212,7 @@ BAD = {
     ),
     "foreign folder, tune": (
         ["tune", "study.toml", "--out", "full"],
-        "full: is not empty and holds no study; choose another folder with --out",
+        NO_RESULTS.format("full"),
     ),
     "nothing to verify": (
         ["verify", "study.toml"],
@@ -221,7 +226,7 @@ BAD = {
     ),
     "foreign folder, verify": (
         ["verify", "gains.toml", "--out", "full"],
-        "full: is not empty and holds no study; choose another folder with --out",
+        NO_RESULTS.format("full"),
     ),
     "nothing to include": (
         ["tune", "part.toml"],
@@ -257,10 +262,10 @@ BAD = {
     ),
     "nothing of which to say the status": (
         ["status", "full"],
-        "full: holds no study (no manifest.json); run 'jaxbl sweep' first",
+        "full: holds no study (no results.json of a sweep); run 'jaxbl sweep' first",
     ),
-    "nothing to plot": (["plot", "full"], "full: holds no study (no manifest.json); run 'jaxbl sweep' first"),
-    "nowhere to plot": (["plot", "none"], "none: holds no study (no manifest.json); run 'jaxbl sweep' first"),
+    "nothing to plot": (["plot", "full"], "full: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
+    "nowhere to plot": (["plot", "none"], "none: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
 }
 
 
@@ -338,7 +343,7 @@ def test_a_sweep_is_explored(call, tmp_path):
     assert {"index.html", "views.js", "uPlot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
         list_files(Path("page"))
     )
-    with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
+    with pytest.raises(InputError, match="out: holds results of a study"):
         call("explore", "out", "--static", "out")
 
 
@@ -480,7 +485,7 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     folder = tmp_path / "results" / "study_gains"
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
-    assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(list_files(folder))
+    assert {"gains.toml", "tuning.json", "report.html", "results.json"} | figures <= set(list_files(folder))
     assert "λ = " in lines[0] and "α = " in lines[0] and len(lines) <= 8
     assert re.search(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", (folder / "report.html").read_text())
     assert lines[-1] == "results/study_gains/report.html"
@@ -490,7 +495,7 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     # other commands may share the folder, another study may not
     assert call("simulate", "study.toml")[0] == 0
     write_study(tmp_path, tunable_study(margin_exact=1.5), "b.toml")
-    with pytest.raises(InputError, match="holds another study"):
+    with pytest.raises(InputError, match="holds results of another study"):
         call("tune", "b.toml", "--out", folder)
 
 
@@ -531,10 +536,10 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
     call("sweep", "study.toml", "--out", "out")
     write_study(tmp_path, rigid_study({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
     for command in ("sweep", "simulate"):
-        with pytest.raises(InputError, match=r"out: holds another study \('small', other numbers\)"):
+        with pytest.raises(InputError, match=r"out: holds results of another study \(small\)"):
             call(command, "b.toml", "--out", "out")
     call("sweep", "b.toml", "--out", "out", "--overwrite")
-    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["title"] == "second"
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["results"]["sweep"]["title"] == "second"
 
 
 def test_progress_on_a_terminal_is_a_line_that_is_taken_away(monkeypatch, capsys):
@@ -723,7 +728,7 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     assert call("inspect", "axis.csv", "--overwrite")[0] == 0
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match="full: is not empty and holds no results of a log; choose another folder with"):
+    with pytest.raises(InputError, match="full: is not empty and holds no results"):
         call("inspect", "axis.csv", "--out", "full")
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
         call("inspect", "none.csv")
@@ -930,8 +935,9 @@ def quick_tasks(monkeypatch):
         return _Found(task)
 
     def report(result, folder, described=None):
-        (folder / "report.html").write_text("its page")
-        (folder / "diagnosis.json").write_text(json.dumps(result.summary))
+        with folder.write_files("diagnosis.json", identity=result.summary["identity"]) as draft:
+            (draft / "report.html").write_text("its page")
+            (draft / "diagnosis.json").write_text(json.dumps(result.summary))
 
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", run_task)
     monkeypatch.setattr("jaxbl.report.results.write_report", report)

@@ -7,13 +7,17 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
 from command_server import Process
+from small_study import ALPHA, listed_axis, rigid_study, small_study
 
 from jaxbl import workers
+from jaxbl.config import read_config
 from jaxbl.errors import NoResult
+from jaxbl.files import _try_lock_bytes
 from jaxbl.workers import _find_cache_folder, announce, clear_programs_if_needed, map_jobs, subscribe, useful_processes
 
 
@@ -164,3 +168,57 @@ def test_a_program_that_another_process_is_still_writing_is_compiled_in_silence(
     second = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     assert second.stdout == "6.0\n"
     assert not second.stderr
+
+
+def test_what_windows_has_not_is_not_needed(tmp_path):
+    """Main commands, in a process where the package finds no module, function of `os` or signal of POSIX alone."""
+    study = rigid_study(axes=[listed_axis(ALPHA, 5.0, 9.0)])
+    (tmp_path / "study.toml").write_text(read_config(study).to_toml())
+    (tmp_path / "gap.toml").write_text(read_config(small_study({"run.duration": 1.0})).to_toml())
+    commands = (
+        "simulate study.toml --out run",
+        "sweep study.toml --out map",
+        # what is there is found again
+        "sweep study.toml --out map",
+        "sweep study.toml --share 1/1 --out shared",
+        "plot map",
+        "status map",
+        "explore map --static page",
+        "compare map shared --out compared",
+        "export study.toml --out code",
+        "simulate gap.toml --out gap",
+        "inspect gap/trace.parquet --out seen",
+        "watch gap/trace.parquet --model gap.toml --window 0.5 --every 0.2 --out watched",
+    )
+    program = [sys.executable, Path(__file__).parent / "windows.py", *commands]
+    # a folder of programs as a user has it, not that of the tests
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAXBL_")}
+    result = subprocess.run(
+        program,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment | {"XDG_CACHE_HOME": str(tmp_path)},
+    )
+    assert result.returncode == 0, result.stderr
+    folders = "run", "map", "shared", "compared", "gap", "seen", "watched"
+    assert all((tmp_path / folder / "report.html").is_file() for folder in folders)
+    assert not list(tmp_path.rglob(".lock"))
+
+
+def test_locks_of_windows_exclude_one_another(tmp_path, monkeypatch):
+    """By bytes of a file: that of a process that shares the folder lies among those of one that has it for itself."""
+    locked = []
+
+    def lock(number, mode, length):
+        place = os.lseek(number, 0, os.SEEK_CUR)
+        if any(place < end and begin < place + length for begin, end in locked):
+            raise OSError
+        locked.append((place, place + length))
+
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=lock, LK_NBLCK=2))
+    with (tmp_path / "lock").open("w+") as file:
+        assert _try_lock_bytes(file, shared=True) and not _try_lock_bytes(file, shared=False)
+        locked.clear()
+        assert _try_lock_bytes(file, shared=False) and not _try_lock_bytes(file, shared=True)

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 import jaxbl
-from jaxbl.terminal import show_task
+from jaxbl.terminal import STEPS, run_with_progress
 
 from .options import ConfigArgument, folder_of, option
 from .outcome import Outcome, with_changes
@@ -39,6 +39,6 @@ def export(
     """
     study = read_study(context, config)
     folder = folder_of(config, target, out)
-    with show_task(context, "exporting"):
+    with run_with_progress(context, config, folder, unit=STEPS, first="exporting"):
         result = jaxbl.export(study, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
     return Outcome(result.lines, result.folder, "", "export.json")

@@ -10,7 +10,7 @@ import typer
 import jaxbl
 from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
-from jaxbl.files import claim_log_folder, lock_folder, remove_if_empty_on_error, run_or_read, to_jsonable, write_atomic
+from jaxbl.files import ResultFolder, log_subject, open_results, run_or_read, to_jsonable, write_atomic
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure
 from jaxbl.terminal import STEPS, is_quiet, repeat_call, run_with_progress, watch_for_end_request
@@ -72,7 +72,6 @@ def inspect(
         log_keys = None if table is None else table.model_dump(exclude_unset=True)
         study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, "inspected", out)
-    claim_log_folder(folder, log, overwrite=overwrite)
     card = jaxbl.describe(inspection)
     if write is not None:
         import tomli_w
@@ -84,7 +83,8 @@ def inspect(
         write_atomic(write, "".join(f"# {escape_unprintable(remark)}\n" for remark in remarks) + tomli_w.dumps(study))
         remarks = [f"{write}: a first model.", *guesses, *card.remarks]
         card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
-    jaxbl.write_report(inspection, folder, card)
+    with open_results(folder, log_subject(log), overwrite=overwrite) as results:
+        jaxbl.write_report(inspection, results, card)
     return Outcome(card, folder, summary="inspection.json")
 
 
@@ -277,21 +277,23 @@ def watch(
         result = _watch_and_print(context, task, None)
         card = jaxbl.describe(result)
     else:
-        with remove_if_empty_on_error(folder), lock_folder(folder):
-            _claim_watch(folder, task, overwrite)
+        with open_results(folder, log_subject(Path(task.name)), overwrite=overwrite) as results:
+            _claim_stream(results, task, overwrite)
             result = _watch_and_print(context, task, folder)
             card = replace(jaxbl.describe(result), next_steps=after_watch(task, result.summary, model))
-            jaxbl.write_report(result, folder, card)
+            jaxbl.write_report(result, results, card)
     code = ALARM if result.summary["alarm"] else 0
     return Outcome(card, folder, summary=result.summary, code=code)
 
 
-def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:
+def _claim_stream(results: ResultFolder, task: "WatchTask", overwrite: bool) -> None:
     from jaxbl.report.watch import VALUES
 
-    if task.record is None and (folder / VALUES).exists() and not overwrite:
-        raise InputError(f"{folder}: holds values of another stream; choose another folder with --out, or --overwrite")
-    claim_log_folder(folder, Path(task.name), overwrite=overwrite)
+    if task.record is None:
+        if (results.path / VALUES).exists() and not overwrite:
+            raise InputError(f"{results.path}: holds values of another stream; choose another with --out, or --overwrite")
+        # the folder is this stream's before there are values in it
+        results.write_manifest()
 
 
 def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | None) -> "Watch":

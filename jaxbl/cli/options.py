@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, make_folder, to_path
+from jaxbl.files import to_path
 from jaxbl.lines import doubts_among
 
 if TYPE_CHECKING:
@@ -70,13 +70,6 @@ def check_doubts(records: "Iterable[Record | SealedRecord]", force: bool) -> Non
     for record in records:
         if not force and (doubts := doubts_among(record.warnings)):
             raise InputError(f"{record.path}: {doubts[0]} --force searches all the same")
-
-
-def claim_out(folder: Path, file: str) -> None:
-    """Make a folder for results, unless it holds something else than those of which `file` is one."""
-    make_folder(folder)
-    if not is_empty(folder) and not (folder / file).exists():
-        raise InputError(f"{folder}: is not empty and holds no {file}; choose another folder with --out")
 
 
 def check_new(file: Path, option: str) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from jaxbl.errors import InputError, NoResult, escape_unprintable
-from jaxbl.files import list_paths, read_json, to_jsonable
+from jaxbl.files import list_paths, read_result, to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.result import Result, format_result
 from jaxbl.terminal import INTERRUPTED
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
             }
         if self.summary is not None:
             folder = self.folder or Path()
-            fields["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary
+            fields["summary"] = read_result(folder / self.summary) if isinstance(self.summary, str) else self.summary
         return fields
 
 

@@ -21,13 +21,13 @@ from jaxbl.datasheet import (
     write_first_study,
 )
 from jaxbl.errors import InputError
-from jaxbl.files import remove_if_empty_on_error, write_atomic
+from jaxbl.files import Subject, open_results, write_atomic
 from jaxbl.lines import format_descriptions
 from jaxbl.result import Result
 from jaxbl.terminal import STEPS, can_ask_user, run_with_progress, show_task
 
 from .next_steps import after_demo, after_init
-from .options import BackendOption, OutOption, argument, check_new, claim_out, flag, option
+from .options import BackendOption, OutOption, argument, check_new, flag, option
 from .outcome import Outcome, with_options
 from .studies import compute, read_study
 
@@ -233,9 +233,10 @@ def bench(
 
     from jaxbl.report.bench import write_bench_report
 
-    claim_out(out, "bench.json")
     # the time of compiling is measured, so that nothing may come from the cache
     jax.config.update("jax_enable_compilation_cache", False)
-    with remove_if_empty_on_error(out), run_with_progress(context, out, out, unit=STEPS) as progress:
+    with run_with_progress(context, out, out, unit=STEPS) as progress, open_results(out, Subject("bench")) as results:
         result = jaxbl.bench(quick=quick, progress=progress)
-    return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)
+        with results.write_files("bench.json") as draft:
+            lines = write_bench_report(result, draft)
+    return Outcome(lines, out, "", "bench.json", code=1 if result.failures else 0)

@@ -16,14 +16,14 @@ import typer
 import jaxbl
 from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
-from jaxbl.files import FolderInUse, lock_folder, make_folder, remove_if_empty_on_error, to_path
+from jaxbl.files import FolderInUse, Subject, lock_folder, make_folder, open_results, to_path
 from jaxbl.lines import NextStep, format_descriptions, format_duration
 from jaxbl.terminal import (
+    STEPS,
     is_quiet,
     name_config_in_errors,
     run_until_interrupted,
     run_with_progress,
-    show_task,
 )
 
 from .next_steps import after_sweep
@@ -36,7 +36,6 @@ from .options import (
     ResultsArgument,
     SchedulerOption,
     argument,
-    claim_out,
     flag,
     folder_of,
     option,
@@ -67,14 +66,14 @@ def simulate(
     Read on: docs/tutorial.md
     """
     workers.start_jax()
-    from jaxbl.sweeps.store import claim_folder
+    from jaxbl.sweeps.store import claim_study
 
     study = read_study(context, config)
     folder = folder_of(config, "run", out)
-    with remove_if_empty_on_error(folder), lock_folder(folder), show_task(context, "simulating"):
-        claim_folder(folder, study, "simulate", overwrite=overwrite)
+    with run_with_progress(context, config, folder, unit=STEPS, first="simulating"), lock_folder(folder):
+        results = claim_study(folder, study, "simulate", overwrite=overwrite)
         trial = jaxbl.run(study, seed=seed, every=every)
-        card = jaxbl.write_report(trial, folder)
+        card = jaxbl.write_report(trial, results)
     return Outcome(card, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
 
 
@@ -86,9 +85,6 @@ def sweep(
     dry_run: Annotated[bool, flag("--dry-run", "print the expected cost, and stop")] = False,
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
-    verify_store: Annotated[
-        bool, flag("--verify-store", "read every stored part first, and compute damaged ones anew")
-    ] = False,
     scheduler: SchedulerOption = None,
     detach: Annotated[bool, flag("--detach", "leave the cluster at work; see 'jaxbl status DIR'")] = False,
     share: Annotated[
@@ -101,10 +97,10 @@ def sweep(
 
     Read on: docs/tutorial.md
     """
-    if (detach or share) and (overwrite or verify_store or detach == (scheduler is None)):
+    if (detach or share) and (overwrite or detach == (scheduler is None)):
         raise InputError(
             "sweep: --detach needs the --scheduler of a cluster that stays, --share goes without one; neither goes with "
-            "--overwrite or --verify-store, as others may be at work in the folder; choose another one with --out"
+            "--overwrite, as others may be at work in the folder; choose another one with --out"
         )
     share_numbers = None if share is None else _parse_share(share)
     study, chosen = read_study(context, config), context.params["backend"]
@@ -117,8 +113,7 @@ def sweep(
         check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
             return _estimate_cost(study, chosen)
-    run = functools.partial(jaxbl.sweep, verify_store=verify_store)
-    collect = functools.partial(compute, context, config, study, run, "sweep", after_sweep)
+    collect = functools.partial(compute, context, config, study, jaxbl.sweep, "sweep", after_sweep)
     if detach or share_numbers is not None:
         folder = folder_of(config, "map", out)
         with run_with_progress(context, config, folder) as progress:
@@ -302,9 +297,7 @@ def compute(
     with run_with_progress(context, config, folder) as progress:
         passed_on = {name: options[name] for name in ("overwrite", "backend", "scheduler") if name in options}
         result = run(study, folder, progress=progress, **passed_on)
-    with show_task(context, "drawing"):
-        # what draws is loaded when there is something to be drawn
-
+    with run_with_progress(context, config, folder, first="drawing"):
         card = jaxbl.describe(result)
         card = jaxbl.write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
     return Outcome(card, folder, summary=_SUMMARIES.get(command) or _study_size(result))
@@ -331,7 +324,7 @@ def plot(
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = replace(result, config=study)
-    with show_task(context, "drawing"):
+    with run_with_progress(context, where, where, first="drawing"):
         card = jaxbl.describe(result)
         card = jaxbl.write_report(result, where, replace(card, next_steps=after_sweep(card, result.config, where)))
     return Outcome(card, where, summary=_study_size(result))
@@ -360,7 +353,7 @@ def explore(
 
     source = open_source(folder)
     if static is not None:
-        with show_task(context, "writing the page"):
+        with run_with_progress(context, static, static, unit=STEPS, first="writing the page"):
             page = write_static(source, static)
         return Outcome([*source.lead], static, page.name)
     from jaxbl.report.explorer.server import served
@@ -393,9 +386,11 @@ def compare(
 
     studies = jaxbl.open_study(first), jaxbl.open_study(second)
     folder = out or Path("results") / f"compare-{first.name}-{second.name}"
-    claim_out(folder, "comparison.json")
-    with remove_if_empty_on_error(folder), show_task(context, "comparing"):
-        card = jaxbl.write_report(jaxbl.compare(*studies), folder)
+    with (
+        run_with_progress(context, folder, folder, unit=STEPS, first="comparing"),
+        open_results(folder, Subject("comparison")) as results,
+    ):
+        card = jaxbl.write_report(jaxbl.compare(*studies), results)
     return Outcome(card, folder, summary="comparison.json")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, json_with_checksum, make_folder, read_json, remove_if_empty_on_error, write_atomic
+from jaxbl.files import Subject, open_results, write_atomic, write_json
 from jaxbl.fused import Unsupported
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.store import identity
@@ -222,26 +222,12 @@ def export(
         "files": list(files.contents),
     }
     summary = head | dict(files.summary)
-    out = Path(folder)
-    with remove_if_empty_on_error(out):
-        _claim(out, request.name, target)
+    out, exported = Path(folder), f"{request.name} for --target {target}"
+    with open_results(out, Subject("export", exported, exported)) as results, results.write_files(SUMMARY) as draft:
         for file_name, content in files.contents.items():
-            write_atomic(out / file_name, content)
-        write_atomic(out / SUMMARY, json_with_checksum(summary))
+            write_atomic(draft / file_name, content)
+        write_json(draft / SUMMARY, summary)
     return Export(out, (*files.contents, SUMMARY), summary, files.lines)
-
-
-def _claim(folder: Path, name: str, target: str) -> None:
-    """Make the folder, or check that it holds the same export. Raises `InputError`."""
-    make_folder(folder)
-    if is_empty(folder):
-        return
-    if not (folder / SUMMARY).exists():
-        raise InputError(f"{folder}: is not empty and holds no export; choose another folder with --out")
-    summary = read_json(folder / SUMMARY)
-    if (summary.get("name"), summary.get("target")) != (name, target):
-        other = f"{summary.get('name')} for --target {summary.get('target')}"
-        raise InputError(f"{folder}: holds another export ({other}); choose another folder with --out")
 
 
 _RESERVED = (

@@ -1,7 +1,7 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +10,11 @@ import pandas as pd
 from jaxbl.cluster import Cluster, Scheduler, connect
 from jaxbl.config import Config, TuneTable
 from jaxbl.errors import InputError
-from jaxbl.files import (
-    json_with_checksum,
-    lock_folder,
-    make_folder,
-    read_json,
-    remove_if_empty_on_error,
-    to_path,
-    write_atomic,
-)
+from jaxbl.files import ResultFolder, lock_folder, make_folder, to_path
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, check_backend, share_programs
-from jaxbl.sweeps.store import claim_folder, manifest_head
+from jaxbl.sweeps.store import claim_study, study_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress, announce
 
@@ -40,7 +32,6 @@ def open_stages(
     """
     with ExitStack() as stack:
         if out is not None:
-            stack.enter_context(remove_if_empty_on_error(to_path(out)))
             stack.enter_context(lock_folder(to_path(out)))
         stack.enter_context(share_programs())
         yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
@@ -69,7 +60,8 @@ class Stages:
 
     Attributes:
         folder: `out`/`command`, or None.
-        manifest: manifest of an earlier call in the same folder.
+        results: the folder `out` with its manifest, or None.
+        manifest: entry of the command in the manifest of an earlier call.
         total_lanes: lanes of all stages, for the progress.
         fallback_reasons: why runs were scanned although the fused backend was asked for.
         cost: seconds of compilation and of computing, and lanes computed.
@@ -99,36 +91,35 @@ class Stages:
         self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
         self._backend: Backend | None = check_backend(backend)
         self._finished_lanes = 0
-        self._manifest_is_damaged = False
-        """A damaged manifest is written anew only after a stage has run: the folder is this study's then."""
-        self._early_results: JsonObject = {}
+        self.results: ResultFolder | None = None
         if out is None:
             return
-        claim_folder(to_path(out), config, command, overwrite=overwrite)
-        self.folder = to_path(out) / command
-        if (self.folder / "manifest.json").exists():
-            try:
-                self.manifest = read_json(self.folder / "manifest.json")
-            except InputError:
-                self._manifest_is_damaged = True
-                return
-            earlier_backend = self.manifest.get("backend")
-            if backend not in (None, earlier_backend):
-                before = f"with --backend {earlier_backend}; go on with that"
-                if not earlier_backend:
-                    before = "without --backend; go on without it"
-                raise InputError(f"{out}: was begun {before}, or choose another folder with --out")
+        self.results = claim_study(to_path(out), config, command, overwrite=overwrite)
+        self.folder = self.results.path / command
+        self.manifest = self.results.entries.get(command, {})
+        earlier_backend = self.manifest.get("backend")
+        if self.manifest and backend not in (None, earlier_backend):
+            before = f"with --backend {earlier_backend}; go on with that"
+            if not earlier_backend:
+                before = "without --backend; go on without it"
+            raise InputError(f"{out}: was begun {before}, or choose another folder with --out")
+        if self.manifest:
             self._backend = check_backend(earlier_backend)
 
     def write_manifest(self, **early_results: Any) -> None:
         """Write the manifest, which claims the folder for this study, with results found before the stages."""
-        if self.folder is not None:
-            self._early_results = early_results
-            if self._manifest_is_damaged:
-                return
+        if self.results is not None and self.folder is not None:
             make_folder(self.folder)
-            manifest = manifest_head(self._config, self._command) | early_results | {"backend": self._backend}
-            write_atomic(self.folder / "manifest.json", json_with_checksum(manifest))
+            entry = study_head(self._config, self._command) | early_results | {"backend": self._backend}
+            # files of an earlier call stay until others take their place
+            entry |= {"files": self.manifest.get("files", {}), "folders": [self._command]}
+            self.results.entries[self._command] = entry
+            self.results.write_manifest()
+
+    def write_files(self) -> AbstractContextManager[Path]:
+        """Yield a folder for files that belong to what was found (:meth:`jaxbl.files.ResultFolder.write_files`)."""
+        assert self.results is not None
+        return self.results.write_files(self._command, **self.results.entries[self._command])
 
     def path_of(self, *names: str) -> Path | None:
         """Return a path in the folder, None without a folder."""
@@ -140,17 +131,17 @@ class Stages:
         Raises:
             InputError: the file is of another study.
         """
-        path, manifest = self.path_of(name), manifest_head(self._config, self._command)
+        path, manifest = self.path_of(name), study_head(self._config, self._command)
         if path is None:
             return compute()
         with suppress(FileNotFoundError, parts.Damaged):
             header, frame = parts.read_part(path)
-            if header.study.get("identity") != manifest["identity"]:
+            if header.study.get("identity") == manifest["identity"]:
+                return frame
+            if not self._overwrite:
                 raise InputError(f"{path}: belongs to another study; choose another folder with --out, or --overwrite")
-            return frame
         frame = compute()
-        if not self._manifest_is_damaged:
-            parts.write_part(path, frame, parts.PartHeader(manifest, {}, "", 0, 0, {}))
+        parts.write_part(path, frame, parts.PartHeader(manifest, {}, "", 0))
         return frame
 
     def run(self, study: Config | JsonObject, name: str) -> StudyResult:
@@ -171,9 +162,6 @@ class Stages:
             backend=self._backend,
             scheduler=self._cluster,
         )
-        if self._manifest_is_damaged:
-            self._manifest_is_damaged = False
-            self.write_manifest(**self._early_results)
         self.fallback_reasons |= dict.fromkeys(result.fallback_reasons)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result

@@ -10,7 +10,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import pandas as pd
 from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import to_jsonable, write_atomic, write_table
+from jaxbl.files import to_jsonable, write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.metrics import ROUNDING, no_disturbance_error
 from jaxbl.sweeps.points import Points
@@ -144,8 +143,9 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
         }
     )
     if stages.folder is not None:
-        write_table(stages.folder.parent / "counterexamples.parquet", counterexamples)
-        write_atomic(stages.folder.parent / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
+        with stages.write_files() as draft:
+            counterexamples.to_parquet(draft / "counterexamples.parquet", index=False)
+            write_json(draft / "verdict.json", summary)
     return Verdict(config, summary, error_map, levels, counterexamples, tuple(stages.fallback_reasons))
 
 

@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from jaxbl.files import json_with_checksum, remove, write_atomic
+from jaxbl.files import write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.result import ResultTable
 
@@ -22,13 +22,12 @@ ASSUMPTIONS = (
 
 
 def write_certificates(summary: JsonObject, folder: Path) -> None:
-    """Write `certificate.json` of the sides of which something is proven; where there is none, remove an earlier one."""
+    """Write `certificate.json` of the sides of which something is proven, if there is one."""
     proven = _proven(summary)
     if not proven:
-        remove(folder / "certificate.json")
         return
     data = {"title": summary["title"], "observer": "super_twisting", "assumptions": list(ASSUMPTIONS), "sides": proven}
-    write_atomic(folder / "certificate.json", json_with_checksum(data))
+    write_json(folder / "certificate.json", data)
 
 
 def _proven(summary: JsonObject) -> JsonObject:

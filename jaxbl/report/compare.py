@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, is_boolean
-from jaxbl.files import json_with_checksum, write_atomic, write_table
+from jaxbl.files import write_atomic, write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
@@ -30,12 +30,9 @@ _EVEN = 1.1
 
 def write_comparison(comparison: Comparison, folder: Path) -> str:
     """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
-    # of an earlier comparison
-    for name in ("comparison", "factors"):
-        (folder / "figures" / f"{name}.png").unlink(missing_ok=True)
-    write_table(folder / "comparison.parquet", tabulate_points(comparison))
+    tabulate_points(comparison).to_parquet(folder / "comparison.parquet")
     write_atomic(folder / "study.toml", comparison.first_config.to_toml())
-    write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
+    write_json(folder / "comparison.json", comparison.to_dict())
     return comparison.first_config.to_toml()
 
 

@@ -25,7 +25,6 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
-from jaxbl.files import is_remote, open_draft
 from jaxbl.json_types import JsonObject
 
 from .panels import (
@@ -113,10 +112,8 @@ def style() -> Iterator[None]:
 @style()
 def save_canvas(canvas: Canvas, path: Path) -> Path:
     """Write what matplotlib has drawn as PNG, making its folder. Returns the path."""
-    if not is_remote(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with open_draft(path) as draft:
-        canvas.savefig(draft, format="png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    canvas.savefig(path, format="png")
     return path
 
 

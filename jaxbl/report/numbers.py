@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import json_with_checksum, to_jsonable, write_atomic
+from jaxbl.files import to_jsonable, write_json
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -55,7 +55,7 @@ def write_fit(result: "Identification | Diagnosis | ElementIdentification", fold
     # that of a transmission alone is given
     model = model or format_model(result, folder / "trace.parquet")  # pyright: ignore[reportArgumentType]
     (folder / "model.toml").write_text(model, encoding="utf-8")
-    write_atomic(folder / f"{name}.json", json_with_checksum(result.summary))
+    write_json(folder / f"{name}.json", result.summary)
     return model
 
 

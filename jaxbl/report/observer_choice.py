@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.config import Config
-from jaxbl.files import write_atomic, write_json
+from jaxbl.files import write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
@@ -184,7 +184,7 @@ def write_choice(choice: ObserverChoice, folder: Path) -> str:
     """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
     summary = choice.summary
     if (gains := observer_toml(summary)) is not None:
-        write_atomic(folder / "gains.toml", gains)
+        (folder / "gains.toml").write_text(gains, encoding="utf-8")
     write_json(folder / "tuning.json", summary, allow_nan=False)
     return choice.config.to_toml()
 

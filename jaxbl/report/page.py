@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import catch_write_errors, write_atomic
+from jaxbl.files import write_atomic
 from jaxbl.result import VERDICTS, Result, ResultTable
 
 from .drawing import Picture, picture
@@ -27,8 +27,7 @@ from .panels import Figure
 
 def write_page(folder: Path, result: Result, figures: Sequence[Figure], config: str) -> None:
     """Write figures into `figures/`, and `report.html` with the result, the figures and the study's TOML."""
-    with catch_write_errors(folder):
-        pictures = [(figure.name, picture(figure, folder / "figures" / f"{figure.name}.png")) for figure in figures]
+    pictures = [(figure.name, picture(figure, folder / "figures" / f"{figure.name}.png")) for figure in figures]
     write_atomic(folder / "report.html", format_page(result, pictures, config))
 
 

@@ -1,18 +1,17 @@
 """Result, figures and report of what Python calls and commands return."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.estimation.identify import Identification
-from jaxbl.files import catch_write_errors, to_path
+from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_path
 from jaxbl.fused import SCAN_MESSAGE
 from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
@@ -22,6 +21,7 @@ from jaxbl.monitoring.watch import Watch
 from jaxbl.records import Inspection
 from jaxbl.result import Result
 from jaxbl.sweeps.compare import Comparison
+from jaxbl.sweeps.store import study_subject
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.sweeps.trial import Trial
 from jaxbl.validation import suggest_word
@@ -51,33 +51,51 @@ class _Kind(NamedTuple):
         describe: says what was found.
         draw: draws the figures; the first is the one beside the answer.
         write: writes the files beside the page into a folder, and returns the study or model that the page shows, as TOML.
-        last: the file that says that the results are complete, where they appear in the folder together.
+        subject: what the result is about.
+        file: what was found, as data; names the result in the manifest of its folder.
     """
 
     describe: Callable[[Any], Result]
     draw: Callable[[Any], list[Figure]]
     write: Callable[[Any, Path], str]
-    last: str = ""
+    subject: Callable[[Any], Subject]
+    file: str = "report.html"
 
 
 def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
     return lambda found: describe(found.summary)
 
 
+def _study(result: Any) -> Subject:
+    return study_subject(result.config)
+
+
+def _log(result: Any) -> Subject:
+    return log_subject(Path(result.summary["file"]))
+
+
 _KINDS = {
-    Trial: _Kind(describe_trial, draw_trial, write_trial),
-    StudyResult: _Kind(describe_sweep, draw_study, write_sweep),
-    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning),
-    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice),
-    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict),
-    Comparison: _Kind(describe_comparison, draw_comparison, write_comparison),
-    Inspection: _Kind(describe_inspection, draw_inspection, write_inspection),
-    Identification: _Kind(
-        _of_summary(describe_identification), draw_identification, write_identification, "identification.json"
+    Trial: _Kind(describe_trial, draw_trial, write_trial, _study, "summary.json"),
+    StudyResult: _Kind(describe_sweep, draw_study, write_sweep, _study),
+    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning, _study, "tuning.json"),
+    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice, _study, "tuning.json"),
+    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict, _study),
+    Comparison: _Kind(
+        describe_comparison, draw_comparison, write_comparison, lambda _: Subject("comparison"), "comparison.json"
     ),
-    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, "identification.json"),
-    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, "diagnosis.json"),
-    Watch: _Kind(describe_watch, draw_watch, write_watch),
+    Inspection: _Kind(
+        describe_inspection,
+        draw_inspection,
+        write_inspection,
+        lambda inspection: log_subject(inspection.record.path),
+        "inspection.json",
+    ),
+    Identification: _Kind(
+        _of_summary(describe_identification), draw_identification, write_identification, _log, "identification.json"
+    ),
+    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, _log, "identification.json"),
+    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, _log, "diagnosis.json"),
+    Watch: _Kind(describe_watch, draw_watch, write_watch, lambda watch: log_subject(Path(watch.task.name)), "watch.json"),
 }
 
 
@@ -133,7 +151,7 @@ def describe(result: Any) -> Result:
     return replace(described, details=details)
 
 
-def write_report(result: Any, folder: str | Path, described: Result | None = None) -> Result:
+def write_report(result: Any, folder: str | Path | ResultFolder, described: Result | None = None) -> Result:
     """Write figures, `report.html` and the files that the command leaves beside them. Returns what the page says.
 
     Args:
@@ -142,34 +160,24 @@ def write_report(result: Any, folder: str | Path, described: Result | None = Non
         described: what the page says; left out, what :func:`jaxbl.describe` returns.
 
     Raises:
-        InputError: no result of these.
+        InputError: no result of these, or another process writes into the folder.
         NoResult: the files cannot be written.
     """
-    kind, described, place = _kind_of(result), described or describe(result), to_path(folder)
-    with catch_write_errors(place):
-        place.mkdir(parents=True, exist_ok=True)
-    with _draft_of(place, kind.last) as draft:
+    kind, described = _kind_of(result), described or describe(result)
+    identity = (getattr(result, "summary", None) or {}).get("identity", "")
+    with ExitStack() as stack:
+        if not isinstance(folder, ResultFolder):
+            place = to_path(folder)
+            stack.enter_context(lock_folder(place, wait=_WAIT))
+            folder = ResultFolder.read(place) or ResultFolder(place, kind.subject(result))
+        draft = stack.enter_context(folder.write_files(kind.file, identity=identity))
         config = kind.write(result, draft)
         write_page(draft, described, kind.draw(result), config)
     return described
 
 
-@contextmanager
-def _draft_of(folder: Path, last: str) -> Iterator[Path]:
-    """Yield the folder itself, or where there is a `last` file one whose files appear there once all are written."""
-    if not last:
-        yield folder
-        return
-    with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
-        draft = Path(place)
-        yield draft
-        # it is younger than the page that belongs to it
-        (draft / last).touch()
-        for file in sorted(draft.rglob("*"), key=lambda file: file.name == last):
-            if file.is_file():
-                target = folder / file.relative_to(draft)
-                target.parent.mkdir(exist_ok=True)
-                file.replace(target)
+_WAIT = 10.0
+"""Seconds to wait for another process that writes into the folder."""
 
 
 def _kind_of(result: Any) -> _Kind:

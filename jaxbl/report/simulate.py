@@ -6,7 +6,7 @@ import numpy as np
 from pandas import DataFrame
 
 from jaxbl.drive.parameters import units_of
-from jaxbl.files import write_json, write_table
+from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
@@ -35,9 +35,8 @@ _TIME = Axis("time (s)")
 
 def write_trial(trial: Trial, folder: Path) -> str:
     """Write trace and summary of a run. Returns the study's TOML."""
-    # the summary first: it is what makes the folder this study's
     write_json(folder / "summary.json", trial.summary)
-    write_table(folder / "trace.parquet", trial.trace)
+    trial.trace.to_parquet(folder / "trace.parquet", index=False)
     return trial.config.to_toml()
 
 

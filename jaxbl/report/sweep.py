@@ -33,8 +33,6 @@ def write_sweep(result: StudyResult, folder: Path) -> str:
     """Write `laws.json` if figures ask for laws. Returns the study's TOML."""
     if laws := laws_of(result):
         write_json(folder / "laws.json", [law.to_dict() for law in laws])
-    else:
-        (folder / "laws.json").unlink(missing_ok=True)
     return result.config.to_toml()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from pandas import DataFrame
 
-from jaxbl.files import write_atomic, write_json
+from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -265,7 +265,7 @@ def _bars(key: str, label: str, y: Axis, title: str, rows: list[JsonObject]) -> 
 def write_tuning(tuning: Tuning, folder: Path) -> str:
     """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
     summary = tuning.summary
-    write_atomic(folder / "gains.toml", gains_toml(summary))
+    (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
     write_certificates(summary, folder)
     write_json(folder / "tuning.json", summary, allow_nan=False)
     return tuning.config.to_toml()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
+from jaxbl.files import catch_write_errors, write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
@@ -27,9 +27,8 @@ _LABELS = {
 
 def write_watch(watch: Watch, folder: Path) -> str:
     """Write `watch.csv` and `watch.json`. Returns the study's TOML."""
-    with open_draft(folder / VALUES) as draft:
-        watch.values.to_csv(draft, index=False)
-    write_atomic(folder / SUMMARY, json_with_checksum(watch.summary))
+    watch.values.to_csv(folder / VALUES, index=False)
+    write_json(folder / SUMMARY, watch.summary)
     return tomli_w.dumps(watch.task.config.to_dict())
 
 

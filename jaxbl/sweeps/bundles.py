@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
 from jaxbl.errors import InputError
-from jaxbl.files import is_remote, lock_folder, to_path
+from jaxbl.files import MANIFEST, is_remote, lock_folder, to_path
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
@@ -53,9 +53,8 @@ class Bundle(NamedTuple):
 
 
 class _BundleResult(NamedTuple):
-    """Checksums of the parts of a bundle by index, totals of its run, and the worker's host."""
+    """Totals of the run of a bundle, and the worker's host."""
 
-    checksums: dict[int, str]
     totals: RunTotals
     host: str
 
@@ -95,7 +94,6 @@ class ClusterRun(StudyRun):
             for chunk in _chunks_of(self.engine, bundle):
                 _wait_for_part(self.store.part_path(chunk.index), result.host)
                 self.count_chunk(chunk)
-            self.store.add_checksums(result.checksums)
             self.worker_totals += result.totals
 
     def _poll_parts(self) -> None:
@@ -155,19 +153,17 @@ def _wait_for_part(part: Path, host: str) -> None:
 def compute_bundle(bundle: Bundle) -> _BundleResult:
     """Compute the chunks of a bundle that are not stored; called on a worker."""
     folder, host = to_path(bundle.folder), socket.gethostname()
-    if not (folder / "manifest.json").exists():
+    if not (folder / MANIFEST).exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
     with lock_folder(folder, shared=True, wait=_DELAY_SECONDS):
-        store = Store.open(folder, writes_manifest=False)
+        store = Store.open(folder)
         if store.manifest["identity"] != bundle.identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
         engine = _cached_engine(*bundle[:-1])
         engine.compile_seconds = engine.run_seconds = 0.0
         run = StudyRun(engine, store)
-        chunks = _chunks_of(engine, bundle)
-        run.compute_missing(chunks)
-    checksums = {chunk.index: store.manifest["checksums"][str(chunk.index)] for chunk in chunks}
-    return _BundleResult(checksums, run.totals, host)
+        run.compute_missing(_chunks_of(engine, bundle))
+    return _BundleResult(run.totals, host)
 
 
 @functools.lru_cache(maxsize=2)

@@ -16,7 +16,7 @@ from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .refine import refine_boundary
-from .store import Store, claim_folder
+from .store import Store, claim_study
 
 _PREPARATION_SECONDS = 60.0
 """Longest wait for another process that prepares the folder."""
@@ -37,8 +37,8 @@ def open_or_create_store(folder: Path, engine: Engine, *, overwrite: bool = Fals
         InputError: the folder holds another study, or a store of another backend.
     """
     config = engine.config
-    claim_folder(folder, config, overwrite=overwrite)
-    store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
+    results = claim_study(folder, config, overwrite=overwrite)
+    store = Store.create(results, config, engine.layout, engine.backend, len(engine), engine.rows)
     engine = _match_engine(store, engine)
     if engine.points.refinement is not None:
         store.restore_part_count()
@@ -63,8 +63,7 @@ def _match_engine(store: Store, engine: Engine) -> Engine:
 def join_store(folder: Path, engine: Engine) -> Iterator[tuple[Engine, Store]]:
     """Open the store of a study whose parts several processes write; the first of them creates it.
 
-    Yields an engine with the store's layout and backend, and the store, which does not write the manifest. Raises as
-    :func:`open_or_create_store`.
+    Yields an engine with the store's layout and backend, and the store. Raises as :func:`open_or_create_store`.
     """
     deadline = time.monotonic() + _PREPARATION_SECONDS
     while True:
@@ -78,8 +77,8 @@ def join_store(folder: Path, engine: Engine) -> Iterator[tuple[Engine, Store]]:
                 if time.monotonic() > deadline:
                     raise
             else:
-                claim_folder(folder, engine.config, exclusive=False)
-                store = Store.open(folder, writes_manifest=False)
+                claim_study(folder, engine.config)
+                store = Store.open(folder)
                 yield _match_engine(store, engine), store
                 return
         time.sleep(0.1)
@@ -205,7 +204,7 @@ class StudyRun:
 
         If an interrupt ends this, the chunks that were computed are written first.
         """
-        written: tuple[Chunk, Future[str]] | None = None
+        written: tuple[Chunk, Future[None]] | None = None
         with ThreadPoolExecutor(1) as writer:
             for chunk in chunks:
                 if self.has_chunk(chunk):
@@ -222,11 +221,11 @@ class StudyRun:
                 self._await_part(before)
             self._await_part(written)
 
-    def _await_part(self, written: tuple[Chunk, Future[str]] | None) -> None:
+    def _await_part(self, written: tuple[Chunk, Future[None]] | None) -> None:
         """Wait until the part of a chunk is written, and count the chunk."""
         if written is not None:
-            chunk, checksum = written
-            self.store.add_checksums({chunk.index: checksum.result()})
+            chunk, end = written
+            end.result()
             self.count_chunk(chunk)
 
     def has_chunk(self, chunk: Chunk) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import list_paths, lock_holder, to_path
+from jaxbl.files import MANIFEST, list_paths, lock_holder, to_path
 
 from .store import Store
 
@@ -79,7 +79,8 @@ def list_statuses(folder: str | Path) -> list[Status]:
         InputError: the folder holds no study.
     """
     folder = to_path(folder)
-    studies = [path.parent for command in ("verify", "tune") for path in list_paths(folder, f"{command}/*/manifest.json")]
-    if (folder / "manifest.json").exists() or not studies:
+    studies = [path.parent for command in ("verify", "tune") for path in list_paths(folder, f"{command}/*/{MANIFEST}")]
+    # the folder of verify or tune has no points of its own
+    if (folder / "points").exists() or not studies:
         studies.insert(0, folder)
     return [status(study) for study in studies]

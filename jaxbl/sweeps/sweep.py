@@ -14,7 +14,7 @@ from pyarrow.parquet import filters_to_expression
 from jaxbl.cluster import Scheduler, connect
 from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import lock_folder, remove_drafts, remove_if_empty_on_error, to_path
+from jaxbl.files import MANIFEST, lock_folder, to_path
 from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, submit_chunks
@@ -113,8 +113,8 @@ class StudyResult:
         pyarrow compares each page that it reads with its checksum.
 
         Args:
-            check: compare each file with its checksum in the manifest first (about a second a GB); otherwise only the header
-                of each part is checked, and damage to a file's index of its rows may pass.
+            check: compare each file with its checksum first (about a second a GB); otherwise only the header of each part is
+                read, and damage to a file's index of its rows may pass.
 
         Raises:
             InputError: a part is damaged, or not of this study.
@@ -169,7 +169,6 @@ def sweep(
     devices: list[Any] | None = None,
     overwrite: bool = False,
     backend: Backend | None = None,
-    verify_store: bool = False,
     scheduler: Scheduler = None,
 ) -> StudyResult:
     """Run all points of a study.
@@ -182,8 +181,6 @@ def sweep(
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
         backend: `fused` or `scan`; left out, the faster one here. A study that is continued keeps its backend.
-        verify_store: first read each stored part, column by column; otherwise only files are compared with their
-            checksums.
         scheduler: Dask cluster whose workers compute and write into `out`, which they must see: an address, a scheduler's
             file, `local:N` for N processes of this machine, or a `distributed.Client`; left out, this process computes.
 
@@ -202,15 +199,13 @@ def sweep(
         run.compute_all()
         return _make_result(run, run.frame())
     folder = to_path(out)
-    if backend == "fused" and not (folder / "manifest.json").exists():
+    if backend == "fused" and not (folder / MANIFEST).exists():
         # a backend that cannot run the study is refused before anything is written
         engine.compile_all()
-    with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
+    with connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
             engine, store = open_or_create_store(folder, engine, overwrite=overwrite)
             store.checked_parts()
-            if verify_store:
-                store.verify()
             if cluster is None:
                 run = StudyRun(engine, store, progress)
                 run.compute_all()
@@ -220,9 +215,8 @@ def sweep(
         if cluster is not None:
             with lock_folder(folder, shared=True):
                 run.compute_all()
+            # this removes drafts of workers that were lost, too
             with lock_folder(folder, wait=_RELEASE_SECONDS):
-                # drafts of workers that were lost
-                remove_drafts(folder)
                 run.mark_finished()
     return _make_result(run, store)
 
@@ -267,7 +261,7 @@ def share(
     folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--share")
     number, count = portion
-    with remove_if_empty_on_error(folder), join_store(folder, engine) as (engine, store):
+    with join_store(folder, engine) as (engine, store):
         StudyRun(engine, store, progress, engine.chunk_order()[number - 1 :: count]).compute_all()
     return status(folder)
 
@@ -290,7 +284,7 @@ def submit(
     """
     folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--detach")
-    with remove_if_empty_on_error(folder), connect(scheduler) as cluster:
+    with connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
         with join_store(folder, engine) as (engine, store):

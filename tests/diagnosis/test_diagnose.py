@@ -24,7 +24,7 @@ from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.estimation.logs import SealedRecord
-from jaxbl.files import read_json
+from jaxbl.files import read_result
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import describe_diagnosis
 from jaxbl.report.results import write_report
@@ -171,7 +171,7 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, t
     assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in result.remarks)
     model = read_config(tmp_path / "model.toml")
     assert [effect.kind for effect in model.effects] == ["motor.coulomb_friction"]
-    summary = read_json(tmp_path / "diagnosis.json")
+    summary = read_result(tmp_path / "diagnosis.json")
     assert summary == diagnosis.summary and describe_diagnosis(summary) == result
     assert model.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 

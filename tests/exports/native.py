@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxbl.files import read_json
+from jaxbl.files import read_result
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Wconversion", "-Werror")
 UNCONTRACTED = ("-ffp-contract=off",)
@@ -51,7 +51,7 @@ class Native:
     """Exported code of a folder, compiled; its state is a structure of ctypes."""
 
     def __init__(self, folder: Path, compiler="gcc", flags=("-O2", *UNCONTRACTED)):
-        self.summary = read_json(folder / "export.json")
+        self.summary = read_result(folder / "export.json")
         name = self.summary["name"]
         build = Path(tempfile.mkdtemp(dir=folder))
         (build / "harness.c").write_text(write_harness(self.summary))

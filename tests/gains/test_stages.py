@@ -6,8 +6,10 @@ from small_study import ALPHA, LAMBDA, listed_axis, read_parts, rigid_study, thi
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
+from jaxbl.files import MANIFEST, ResultFolder
 from jaxbl.gains.stages import open_stages
 from jaxbl.sweeps import programs
+from jaxbl.sweeps.store import study_subject
 from jaxbl.sweeps.sweep import sweep
 
 
@@ -22,37 +24,38 @@ def run_stage(folder, changes=None, **options):
         return stages.cost["lanes"], manifest, table
 
 
-def test_a_damaged_manifest_is_written_anew(tmp_path):
+def test_a_damaged_manifest_is_written_anew_where_that_is_asked_for(tmp_path):
     assert run_stage(tmp_path)[0] == 30
-    path = tmp_path / "tune" / "manifest.json"
+    path = tmp_path / MANIFEST
     before = path.read_bytes()
     path.write_bytes(before[: len(before) // 2])
+    with pytest.raises(InputError, match=r"results\.json: is damaged \(.*\); begin anew with --overwrite"):
+        run_stage(tmp_path)
     # what it said is found again; the stage's parts are there
-    lanes, manifest, _ = run_stage(tmp_path)
+    lanes, manifest, _ = run_stage(tmp_path, overwrite=True)
     assert (lanes, manifest) == (0, {})
     assert path.read_bytes() == before
     lanes, manifest, _ = run_stage(tmp_path)
     assert lanes == 0 and manifest["pilot"] == 1.5
 
 
-def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
+def test_a_lost_manifest_does_not_make_the_folder_anothers(tmp_path):
     run_stage(tmp_path)
-    path = tmp_path / "tune" / "manifest.json"
-    path.write_text(path.read_text().replace("1.5", "1.6"))
-    before = path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")
-    with pytest.raises(InputError, match=r"(belongs to|holds) another study"):
+    path = tmp_path / MANIFEST
+    path.unlink()
+    with pytest.raises(InputError, match="is not empty and holds no results"):
+        run_stage(tmp_path)
+    results = ResultFolder(tmp_path, study_subject(read_config(thirty_run_study(encoders={"noise": 1e-3}))))
+    results.write_manifest()
+    before = read_parts(tmp_path / "tune" / "coarse")
+    with pytest.raises(InputError, match=r"(belongs to|holds results of) another study"):
         run_stage(tmp_path, {"encoders": {"noise": 1e-3}})
     (tmp_path / "tune" / "table.parquet").unlink()
-    with pytest.raises(InputError, match="holds another study"):
+    with pytest.raises(InputError, match="holds results of another study"):
         run_stage(tmp_path, {"encoders": {"noise": 1e-3}})
-    assert (path.read_bytes(), read_parts(tmp_path / "tune" / "coarse")) == before
-    assert sorted(path.name for path in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
-    # of a command that is not there nobody can say whose it is
-    with (
-        pytest.raises(InputError, match="is damaged"),
-        open_stages(read_config(thirty_run_study()), "verify", tmp_path, None),
-    ):
-        pass
+    assert read_parts(tmp_path / "tune" / "coarse") == before
+    # tables that are in the way are written over, too
+    assert list(run_stage(tmp_path, overwrite=True)[2]["x"]) == [1.0, 2.0]
 
 
 def test_a_damaged_table_is_computed_anew(tmp_path):

@@ -251,7 +251,7 @@ def test_second_call_simulates_nothing_and_says_the_same(verified_study, monkeyp
 def test_another_studys_folder_is_left_as_it_is(verified_study):
     _, folder = verified_study
     before = read_contents(folder)
-    with pytest.raises(InputError, match="holds another study"):
+    with pytest.raises(InputError, match="holds results of another study"):
         verify(rigid_study({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
     assert read_contents(folder) == before
 
@@ -295,7 +295,7 @@ def test_a_verification_keeps_to_its_backend(verified_study):
 
 def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match="is not empty and holds no study"):
+    with pytest.raises(InputError, match="is not empty and holds no results"):
         verify(VERIFY_STUDY, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

@@ -23,7 +23,7 @@ from small_study import multisine_study, rigid_study, small_study
 import jaxbl
 from jaxbl.cli import app, main
 from jaxbl.errors import InputError
-from jaxbl.files import read_json
+from jaxbl.files import read_result
 from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch, watch_columns
 from jaxbl.quantity import Quantity
 
@@ -257,7 +257,7 @@ def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path,
         "watch.json",
     ]
     values = pd.read_csv(tmp_path / "out" / "watch.csv")
-    summary = read_json(tmp_path / "out" / "watch.json")
+    summary = read_result(tmp_path / "out" / "watch.json")
     assert values["t"][values["alarm"]].iloc[0] == summary["alarm"]["t"]
     assert (tmp_path / "out" / "figures" / "watch.png").stat().st_size > 10_000
     # the same log again, and another one
@@ -301,7 +301,7 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, ca
     assert ("ALARM from 4.0 s on" in final_output) == alarm
     assert "  half gap at 4.0 s (95 %: 0.0" in final_output
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
-    assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
+    assert read_result(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten
     assert run_command(*words) == 2
     assert "holds values of another stream" in capsys.readouterr().err

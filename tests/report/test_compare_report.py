@@ -8,7 +8,7 @@ from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, spaced_axis
 
 from jaxbl import cli
 from jaxbl.config import read_config
-from jaxbl.files import json_with_checksum, read_json
+from jaxbl.files import ResultFolder
 from jaxbl.sweeps.sweep import sweep
 
 
@@ -71,8 +71,9 @@ def test_command_writes_text_json_and_figure(studies_folder, run_command):
 
 def test_unfinished_studies_are_compared_as_far_as_they_are(studies_folder, tmp_path, run_command):
     shutil.copytree(studies_folder / "before", tmp_path / "part")
-    manifest = tmp_path / "part" / "manifest.json"
-    manifest.write_text(json_with_checksum(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
+    results = ResultFolder.read(tmp_path / "part")
+    results.entries["sweep"] |= {"rows": 48, "parts": 2, "finished": False}
+    results.write_manifest()
     code, output = run_command(
         "compare", str(studies_folder / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out")
     )
@@ -83,8 +84,8 @@ def test_unfinished_studies_are_compared_as_far_as_they_are(studies_folder, tmp_
 @pytest.mark.parametrize(
     ("second", "out", "message"),
     [
-        ("nothing", "new", "nothing: holds no study (no manifest.json); run 'jaxbl sweep' first"),
-        ("after", "before", "before: is not empty and holds no comparison.json; choose another folder with --out"),
+        ("nothing", "new", "nothing: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
+        ("after", "before", "before: holds results of a study (before); choose another folder with --out"),
     ],
 )
 def test_bad_input(studies_folder, run_command, second, out, message):

@@ -107,7 +107,7 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     code, lines, _ = call("verify", "study.toml")
     assert code == 0
     assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor"}
-    assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "verify/manifest.json"))
+    assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "results.json"))
     assert lines[0].startswith("✗ Failed: Not safe: small gains")
     assert lines[-1] == "results/study_verdict/report.html"
     # the second call says the same

@@ -7,7 +7,7 @@ from moto.server import ThreadedMotoServer
 from small_study import ALPHA, listed_axis, read_parts, thirty_run_study
 
 from jaxbl.errors import InputError
-from jaxbl.files import create_file, to_path
+from jaxbl.files import MANIFEST, to_path
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import open_study, repair, share, sweep
@@ -58,7 +58,7 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, disk_study, computed_chunk
     assert sorted(computed_chunks) == list(range(8))
     pd.testing.assert_frame_equal(study.frame, result.frame, check_exact=True)
     stored = read_objects(address)
-    assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
+    assert {name for name in stored if not name.startswith("points/")} == {MANIFEST, "study.toml"}
     assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == read_parts(
         folder
     )
@@ -67,11 +67,11 @@ def test_a_study_in_a_store_is_that_of_a_disk(bucket, disk_study, computed_chunk
     assert read_objects(address) == stored
     assert status(address).finished
     pd.testing.assert_frame_equal(open_study(address).frame, result.frame, check_exact=True)
-    with pytest.raises(InputError, match="holds another study"):
+    with pytest.raises(InputError, match="holds results of another study"):
         sweep(thirty_run_study(sweep={"seeds": 3, "chunk": 4}), address)
     sweep(thirty_run_study(axes=[listed_axis(ALPHA, 5.0, 9.0)]), address, overwrite=True)
     assert set(read_objects(address)) == {
-        "manifest.json",
+        MANIFEST,
         "study.toml",
         *(f"points/part-0000{seed}.parquet" for seed in (0, 1)),
     }
@@ -89,8 +89,8 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_ch
     assert len(sweep(thirty_run_study(), address).damaged) == 1
     assert sorted(computed_chunks) == [2, 5]
     assert "damaged/part-00002.parquet" in read_objects(address)
-    (to_path(address) / "manifest.json").unlink()
-    with pytest.raises(InputError, match="has lost its manifest"):
+    (to_path(address) / MANIFEST).unlink()
+    with pytest.raises(InputError, match="has lost its results"):
         open_study(address)
     assert repair(address)[0] == 8
     pd.testing.assert_frame_equal(open_study(address).frame, disk_study[1].frame, check_exact=True)
@@ -103,13 +103,6 @@ def test_a_report_in_a_store(bucket):
     stored = read_objects(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
     assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
-
-
-def test_who_comes_second_does_not_begin(bucket):
-    path = to_path(f"{bucket}/d/manifest.json")
-    assert create_file(path, "first")
-    assert not create_file(path, "second")
-    assert path.read_bytes() == b"first"
 
 
 def test_bad_addresses(bucket, monkeypatch):

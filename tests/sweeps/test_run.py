@@ -46,7 +46,7 @@ def test_shares_are_the_whole_study(tmp_path, computed_chunks):
 def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed_chunks, monkeypatch):
     share(thirty_run_study(), tmp_path / "study", (1, 2))
     before = read_parts(tmp_path / "study")
-    with pytest.raises(InputError, match="holds another study"):
+    with pytest.raises(InputError, match="holds results of another study"):
         share(thirty_run_study(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
     monkeypatch.setattr(run, "_PREPARATION_SECONDS", 0.2)
     with (

@@ -16,10 +16,9 @@ from upath import UPath
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
-from jaxbl.files import json_with_checksum, make_folder, read_json
+from jaxbl.files import MANIFEST, json_with_checksum, make_folder
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.parts import file_checksum
-from jaxbl.sweeps.store import Store, claim_folder, identity
+from jaxbl.sweeps.store import Store, claim_study, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study, repair, sweep
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -54,8 +53,8 @@ def study_copy(finished_study, tmp_path):
 
 def test_what_a_study_leaves(finished_study):
     folder, result = finished_study
-    assert set(read_files(folder)) == {"study.toml", "manifest.json", *(f"points/part-0000{i}.parquet" for i in range(3))}
-    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(read_files(folder)) == {"study.toml", MANIFEST, *(f"points/part-0000{i}.parquet" for i in range(3))}
+    manifest = json.loads((folder / MANIFEST).read_text())["results"]["sweep"]
     assert manifest["finished"]
     assert (manifest["parts"], manifest["rows"]) == (3, 9)
     assert read_config(folder / "study.toml").to_dict() == read_config(study()).to_dict()
@@ -134,7 +133,7 @@ OTHER_STUDIES = {
 @pytest.mark.parametrize("case", OTHER_STUDIES)
 def test_another_study_in_the_folder_stays_as_it_is(study_copy, case):
     before = read_files(study_copy)
-    with pytest.raises(InputError, match=r"holds another study \('small'") as error:
+    with pytest.raises(InputError, match=r"holds results of another study \(small\)") as error:
         sweep(study(**OTHER_STUDIES[case]), study_copy)
     assert str(study_copy) in str(error.value)
     assert read_files(study_copy) == before
@@ -167,17 +166,17 @@ MANIFESTS = {
 def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(
     study_copy, finished_study, computed_chunks, case
 ):
-    file, content = study_copy / "manifest.json", MANIFESTS[case]
+    file, content = study_copy / MANIFEST, MANIFESTS[case]
     if content is None:
         file.unlink()
     elif isinstance(content, str):
         file.write_text(content)
     else:
         data = json.loads(file.read_text())
-        content(data)
+        content(data["results"]["sweep"])
         file.write_text(json.dumps(data))
     before = read_files(study_copy)
-    with pytest.raises(InputError, match=r"lost its manifest\.json; 'jaxbl repair|manifest\.json: is") as error:
+    with pytest.raises(InputError, match=r"has (lost its|a damaged) results\.json; 'jaxbl repair") as error:
         open_study(study_copy)
     assert "\n" not in str(error.value)
     assert read_files(study_copy) == before
@@ -189,18 +188,33 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
 
 
 def test_a_damaged_manifest_without_parts(study_copy):
-    (study_copy / "manifest.json").write_text("{")
+    (study_copy / MANIFEST).write_text("{")
     for part in (study_copy / "points").iterdir():
         part.unlink()
-    with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite"):
+    with pytest.raises(InputError, match=r"results\.json: is damaged \(.*\); begin anew with --overwrite"):
         sweep(study(), study_copy)
     assert len(sweep(study(), study_copy, overwrite=True).frame) == 9
 
 
 def test_manifest_of_another_version(study_copy):
-    (study_copy / "manifest.json").write_text(json_with_checksum(read_json(study_copy / "manifest.json") | {"format": 99}))
-    with pytest.raises(InputError, match="has format 99; this version reads 4"):
+    text = json.dumps(json.loads((study_copy / MANIFEST).read_text()) | {"format": 99})
+    data = json.loads(text)
+    del data["checksum"]
+    (study_copy / MANIFEST).write_text(json_with_checksum(data))
+    with pytest.raises(InputError, match="has format 99; this version reads 5"):
         open_study(study_copy)
+    # that of format 4 had another name, and its parts other headers
+    (study_copy / MANIFEST).rename(study_copy / "manifest.json")
+    for part in (study_copy / "points").iterdir():
+        part.write_bytes(b"PAR1")
+    with pytest.raises(
+        InputError, match=r"was written by an earlier jaxbl; .* 'jaxbl sweep .*study\.toml --out NEW' makes it"
+    ):
+        open_study(study_copy)
+    with pytest.raises(
+        InputError, match=r"is not empty and holds no results with a results\.json \(an earlier jaxbl wrote none"
+    ):
+        sweep(study(), study_copy, overwrite=True)
 
 
 def flip_bit(folder, random):
@@ -228,7 +242,7 @@ def test_flipped_bits_are_noticed_and_healed(study_copy, finished_study, repeats
         shutil.rmtree(study_copy / "damaged", ignore_errors=True)
         contents = read_files(study_copy)
         assert contents.keys() == before.keys()
-        assert {name for name in contents if contents[name] != before[name]} <= {"manifest.json"}, path
+        assert {name for name in contents if contents[name] != before[name]} <= {MANIFEST}, path
     assert damaged_count > flips / 2
 
 
@@ -249,7 +263,7 @@ def test_an_edited_part_is_kept_aside(study_copy, finished_study, computed_chunk
     frame = pd.read_parquet(part)
     frame["motor.velocity_rmse"] *= 1.01
     frame.to_parquet(part, index=False)
-    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(has no header"):
+    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(has no (header|checksum)"):
         _ = open_study(study_copy).frame
     sweep(study(), study_copy)
     assert computed_chunks == [1]
@@ -259,17 +273,13 @@ def test_an_edited_part_is_kept_aside(study_copy, finished_study, computed_chunk
 
 def test_a_part_of_another_study_is_refused(study_copy, tmp_path):
     sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
-    manifest = read_json(study_copy / "manifest.json")
-    (study_copy / "manifest.json").write_text(json_with_checksum(manifest | {"checksums": {}, "finished": False}))
     part = study_copy / "points" / "part-00001.parquet"
     part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
     before = read_files(study_copy)
     for read in (lambda: sweep(study(), study_copy), lambda: open_study(study_copy).frame, lambda: repair(study_copy)):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is of another study \('small', other numbers\)"):
             read()
-    assert {name: content for name, content in read_files(study_copy).items() if name != "manifest.json"} == {
-        name: content for name, content in before.items() if name != "manifest.json"
-    }
+    assert read_files(study_copy) == before
 
 
 @pytest.mark.parametrize("name", ["part-00099.parquet", "part-3.parquet", "part-copy.parquet"])
@@ -282,7 +292,7 @@ def test_a_part_too_many_is_refused(study_copy, computed_chunks, name):
 
 
 def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(study_copy, computed_chunks):
-    (study_copy / "manifest.json").unlink()
+    (study_copy / MANIFEST).unlink()
     (study_copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
     whole_part_count, store = repair(study_copy)
     assert whole_part_count == 2 and len(store.damaged) == 1 and computed_chunks == []
@@ -302,25 +312,12 @@ def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, comput
     parts, points = list(computed_chunks), read_files(tmp_path / "study" / "points")
     coarse = len(Engine(read_config(refined)))
     assert len(parts) > coarse
-    (tmp_path / "study" / "manifest.json").unlink()
+    (tmp_path / "study" / MANIFEST).unlink()
     whole_part_count, store = repair(tmp_path / "study")
     assert (whole_part_count, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
     second = sweep(refined, tmp_path / "study")
     assert computed_chunks == parts and read_files(tmp_path / "study" / "points") == points
     pd.testing.assert_frame_equal(second.frame, result.frame)
-
-
-def test_all_of_it_is_read_where_it_is_asked_for(study_copy, computed_chunks):
-    """A part that agrees with a manifest that is wrong as well."""
-    part = study_copy / "points" / "part-00001.parquet"
-    frame = pd.read_parquet(part)
-    frame.to_parquet(part, index=False)
-    manifest = read_json(study_copy / "manifest.json")
-    manifest["checksums"]["1"] = file_checksum(part)
-    (study_copy / "manifest.json").write_text(json_with_checksum(manifest))
-    assert sweep(study(), study_copy).damaged == ()
-    assert len(sweep(study(), study_copy, verify_store=True).damaged) == 1
-    assert computed_chunks == [1]
 
 
 def test_two_processes_do_not_write_into_one_folder(study_copy):
@@ -343,21 +340,24 @@ def test_two_processes_do_not_write_into_one_folder(study_copy):
 
 
 def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished_study):
-    def fill_disk(table, draft, **_):
-        Path(draft).write_bytes(b"x")
-        raise OSError(28, "No space left on device")
+    write = Path.write_bytes
+
+    def fill_disk(path, content):
+        write(path, content[:1] if path.suffix != ".json" and "part" in path.name else content)
+        if "part" in path.name:
+            raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("jaxbl.sweeps.parts.pq.write_table", fill_disk)
+        patched.setattr(Path, "write_bytes", fill_disk)
         with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
             sweep(study(), tmp_path / "study")
-    assert {*read_files(tmp_path / "study")} == {"study.toml", "manifest.json"}
+    assert {*read_files(tmp_path / "study")} == {"study.toml", MANIFEST}
     pd.testing.assert_frame_equal(sweep(study(), tmp_path / "study").frame, finished_study[1].frame)
 
 
 def test_folder_with_other_files_stays_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match="is not empty and holds no study"):
+    with pytest.raises(InputError, match=r"is not empty and holds no results with a results\.json"):
         sweep(study(), tmp_path, overwrite=True)
     assert read_files(tmp_path) == {"thesis.tex": b"mine"}
 
@@ -403,8 +403,8 @@ def test_files_of_others_are_never_removed(tmp_path):
     (tmp_path / "summary.json").write_text('{"mine": 1}')
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "mine.png").write_bytes(b"x")
-    with pytest.raises(InputError, match="not of a study"):
-        claim_folder(tmp_path, read_config(rigid_study()), overwrite=True)
+    with pytest.raises(InputError, match="is not empty and holds no results"):
+        claim_study(tmp_path, read_config(rigid_study()), overwrite=True)
     assert (tmp_path / "figures" / "mine.png").exists()
 
 
@@ -447,7 +447,7 @@ def test_a_dataset_of_damaged_or_foreign_parts_is_refused(study_copy, tmp_path):
     # the last byte of the column's values
     content[column.data_page_offset + column.total_compressed_size - 1] ^= 1
     part.write_bytes(content)
-    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(does not agree with its checksum"):
+    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(does not agree with its checksum\)"):
         open_study(study_copy).dataset()
     # what is not looked at first is found where it is read
     dataset = open_study(study_copy).dataset(check=False)
@@ -462,7 +462,8 @@ def test_a_dataset_of_damaged_or_foreign_parts_is_refused(study_copy, tmp_path):
 
 def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     engine = Engine(read_config(study()), backend="scan")
-    store = Store.create(tmp_path, engine.config, engine.layout, engine.backend, 100_001, 9)
+    results = claim_study(tmp_path, engine.config)
+    store = Store.create(results, engine.config, engine.layout, engine.backend, 100_001, 9)
     rows = next(finished_study[1].source.batches())
     for index in (99_999, 100_000, 2):
         store.write_part(index, rows.assign(seed=index))

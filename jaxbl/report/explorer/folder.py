@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from jaxbl.errors import InputError
-from jaxbl.files import catch_write_errors, is_empty, json_with_checksum, make_folder, read_json
+from jaxbl.files import Subject, open_results
 from jaxbl.json_types import JsonObject
 from jaxbl.report.maps import drawn_values
 
@@ -28,8 +27,6 @@ ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
-_MARKER = "jaxbl-explorer.json"
-"""Says that a folder is one of ours, which may be written anew."""
 _LIBRARIES = ("hyparquet.js", "hyparquet.LICENSE.txt", "uPlot.js", "uPlot.css", "uPlot.LICENSE.txt")
 _SCRIPTS = ("hyparquet", "uPlot", "shared", "chart", "common")
 
@@ -45,25 +42,6 @@ def points_writer(out: Path, types: Mapping[str, type]) -> Iterator[Callable[[An
             writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
 
         yield write
-
-
-def read_text(file: Path) -> str:
-    """A text. Raises `InputError` where it cannot be read."""
-    return _read(file, lambda place: place.read_text(encoding="utf-8"))
-
-
-def read_table(file: Path) -> pd.DataFrame:
-    """A table of Parquet or CSV. Raises `InputError` where it cannot be read."""
-    return _read(file, pd.read_csv if file.suffix == ".csv" else pd.read_parquet)
-
-
-def _read(file: Path, read: Callable[[Path], Any]) -> Any:
-    try:
-        return read(file)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            f"{file}: cannot be read ({error}); run the command that wrote it again, with --overwrite"
-        ) from None
 
 
 class Source(NamedTuple):
@@ -99,17 +77,11 @@ def write_static(source: Source, out: Path) -> Path:
     Raises:
         InputError: the folder holds something else.
     """
-    make_folder(out, option="--static")
-    marker = out / _MARKER
-    if not is_empty(out) and not marker.exists():
-        raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
-    if marker.exists() and read_json(marker).get("of") != source.identity:
-        raise InputError(f"{out}: holds the page of other results; choose another folder, or remove it")
-    with catch_write_errors(out):
-        marker.write_text(json_with_checksum({"made_by": "jaxbl explore", "of": source.identity}), encoding="utf-8")
-        for old in out.glob("points.*"):
-            old.unlink()
-        source.write(out, False)
+    with (
+        open_results(out, Subject("page", "of jaxbl explore", source.identity)) as results,
+        results.write_files("index.html") as draft,
+    ):
+        source.write(draft, False)
     return out / "index.html"
 
 

@@ -4,11 +4,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from pandas import DataFrame
 
 from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
-from jaxbl.files import checksum, read_json
+from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import describe_diagnosis
@@ -18,7 +19,7 @@ from jaxbl.report.panels import missing_quantity
 from jaxbl.result import Result
 from jaxbl.sweeps.metrics import find_metric
 
-from .folder import Source, colours_of, points_writer, read_table, read_text, write_page
+from .folder import Source, colours_of, points_writer, write_page
 
 _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
            "displacement": "displacement"}  # fmt: skip
@@ -30,7 +31,7 @@ def log_source(file: Path) -> Source:
     Raises:
         InputError: files are damaged or missing.
     """
-    summary, model = read_json(file), "model.toml"
+    summary, model = read_result(file), "model.toml"
     if file.name == "diagnosis.json":
         card = describe_diagnosis(summary)
     elif file.name == "identification.json":
@@ -41,7 +42,8 @@ def log_source(file: Path) -> Source:
     table = "watch.csv" if file.name == "watch.json" else "trace.parquet"
 
     def write(out: Path, served: bool) -> bool:
-        text, frame = read_text(file.with_name(model)), read_table(file.with_name(table))
+        text, points = check_result(file.with_name(model)).read_text(encoding="utf-8"), check_result(file.with_name(table))
+        frame = pd.read_csv(points) if points.suffix == ".csv" else pd.read_parquet(points)
         content = write_log(summary, frame, out)
         content |= {"title": card.title, "lead": card.sentences, "config": text, "file": model}
         write_page(out, ("log",), content, scripts=not served)

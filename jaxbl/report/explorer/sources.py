@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxbl.errors import InputError
-from jaxbl.files import has_file, read_json, to_path
+from jaxbl.files import MANIFEST, ResultFolder, read_result, to_path
+from jaxbl.sweeps.store import STUDY
 
 from .folder import Source
 from .log import log_source
@@ -18,33 +19,34 @@ def open_source(folder: str | Path) -> Source:
         InputError: it holds none, or they are damaged.
     """
     where = to_path(folder)
-    files = [where / name for name in _KINDS if has_file(where, name)]
-    if not files:
+    results = ResultFolder.read(where)
+    listed = {} if results is None else {name for entry in results.entries.values() for name in entry["files"]}
+    files = [where / name for name in _KINDS if name in listed]
+    swept = [where / STUDY] if results is not None and "sweep" in results.entries else []
+    if not files + swept:
         raise InputError(f"{folder}: is missing, or holds no results; give a folder that {_COMMANDS} wrote")
     # of several commands that wrote into one folder the last one counts
-    newest = (
-        max(files, key=lambda file: (file.stat().st_mtime, file.name != "manifest.json")) if len(files) > 1 else files[0]
-    )
-    return _KINDS[newest.name](newest)
+    newest = max(files + swept, key=lambda file: file.stat().st_mtime) if files else where / STUDY
+    return _KINDS[newest.name](newest) if newest in files else study_source(where)
 
 
 def _tuning_source(file: Path) -> Source:
     """The maps of the search for gains, the widest first."""
-    gains = read_json(file)["gains"].items()
+    gains = read_result(file)["gains"].items()
     chosen = [f"{side}: λ = {pair['lambda']:.4g} √rad/s, α = {pair['alpha']:.4g} rad/s²" for side, pair in gains]
     return _stage_source(file.parent / "tune", ("wide", "coarse"), f"The search for gains chose, {'; '.join(chosen)}.")
 
 
 def _verdict_source(file: Path) -> Source:
     """The runs by which conditions were judged, those of the sampled observers first."""
-    count = read_json(file)["counterexamples_in_all"]
+    count = read_result(file)["counterexamples_in_all"]
     answer = f"In {count} cases an observer failed although a gain condition held."
     return _stage_source(file.parent / "verify", ("sampled", "drive"), answer)
 
 
 def _stage_source(folder: Path, names: tuple[str, ...], answer: str) -> Source:
     """The first stage that is there, and a word on how the others are opened."""
-    stages = sorted(place.parent.name for place in folder.glob("*/manifest.json"))
+    stages = sorted(place.parent.name for place in folder.glob(f"*/{MANIFEST}"))
     first = next((name for name in names if name in stages), None)
     if first is None:
         raise InputError(f"{folder}: holds no runs; run the command that wrote it again")
@@ -55,7 +57,6 @@ def _stage_source(folder: Path, names: tuple[str, ...], answer: str) -> Source:
 
 
 _KINDS: dict[str, Callable[[Path], Source]] = {
-    "manifest.json": lambda file: study_source(file.parent),
     "diagnosis.json": log_source,
     "identification.json": log_source,
     "summary.json": log_source,

@@ -7,9 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from jaxbl.config import Config, is_boolean, read_config, with_values
 from jaxbl.errors import InputError
-from jaxbl.files import checksum, read_json
+from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.maps import value_label
@@ -21,7 +23,7 @@ from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
 from .cloud import write_cloud
-from .folder import Source, colours_of, drawable, read_table, write_page
+from .folder import Source, colours_of, drawable, write_page
 from .grid import dimensions, write_grid
 
 
@@ -62,15 +64,17 @@ def comparison_source(file: Path) -> Source:
     Raises:
         InputError: files are damaged or missing.
     """
-    summary, folder = read_json(file), file.parent
-    config = read_config(folder / "study.toml")
+    summary, folder = read_result(file), file.parent
+    config = read_config(check_result(folder / "study.toml"))
     config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"seeds": 1})})
     names = [Path(name).name for name in summary["names"]]
     changed = [change["metric"] for change in summary["metrics"] if change["changed"]]
     lead = [f"{names[0]} and {names[1]}: {len(changed)} of {len(summary['metrics'])} metrics differ."]
 
     def write(out: Path, served: bool) -> bool:
-        frame = read_table(folder / "comparison.parquet").assign(seed=config.sweep.first_seed, finite=True)
+        frame = pd.read_parquet(check_result(folder / "comparison.parquet")).assign(
+            seed=config.sweep.first_seed, finite=True
+        )
         return write_study(StudyResult(config, frame), out, lead, studies=names)
 
     return Source(checksum(file.read_bytes()), lead, write, {}, lambda: None, lambda: None)

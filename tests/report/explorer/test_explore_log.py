@@ -1,5 +1,8 @@
 """A log and what models make of it in a browser: its columns, and its page by mouse and keyboard."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
@@ -7,7 +10,7 @@ import pytest
 from browser import check_figures, needs_chromium, open_pages
 
 from jaxbl.errors import InputError
-from jaxbl.files import json_with_checksum
+from jaxbl.files import log_subject, open_results
 from jaxbl.report.explorer.folder import write_page, write_static
 from jaxbl.report.explorer.log import write_log
 from jaxbl.report.explorer.sources import open_source
@@ -92,15 +95,17 @@ def test_an_identification_and_an_element(tmp_path):
 
 def write_identification(folder):
     """A folder as `jaxbl identify` leaves it."""
-    make_trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
-    (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
     result = {
         "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
         "kind": "element", "warnings": [], "refused": [],
         "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
         "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
-    (folder / "identification.json").write_text(json_with_checksum(result))
+    trace = make_trace().rename(columns={"motor.missing_before": "motor.residual"})
+    with open_results(folder, log_subject(Path("axis.csv"))) as results, results.write_files("identification.json") as draft:
+        trace.to_parquet(draft / "trace.parquet", index=False)
+        (draft / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
+        (draft / "identification.json").write_text(json.dumps(result))
 
 
 def test_folders_without_results_and_damaged_ones(tmp_path):
@@ -109,8 +114,9 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
     write_identification(tmp_path)
     (tmp_path / "trace.parquet").write_bytes(b"no table")
     source = open_source(tmp_path)
-    with pytest.raises(InputError, match=r"trace\.parquet: cannot be read .*--overwrite"):
+    with pytest.raises(InputError, match=r"trace\.parquet: is missing, damaged or edited; run the command that wrote it"):
         write_static(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @needs_chromium

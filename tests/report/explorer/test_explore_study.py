@@ -95,16 +95,16 @@ def test_zipped_axes_are_one(tmp_path):
 def test_folders_of_others_are_refused(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
-    with pytest.raises(InputError, match="mine: is not empty, and was not written by jaxbl explore"):
+    with pytest.raises(InputError, match="mine: is not empty and holds no results"):
         write_static(make_source(make_study_result(), []), tmp_path / "mine")
     assert (tmp_path / "mine" / "index.html").read_text() == "mine"
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file: is a file; --static should name a folder"):
+    with pytest.raises(InputError, match="file: is a file; --out should name a folder"):
         write_static(make_source(make_study_result()), tmp_path / "file")
     for _ in range(2):
         write_static(make_source(make_study_result(), []), tmp_path / "again")
     other = make_source(make_study_result())._replace(identity="another study")
-    with pytest.raises(InputError, match="again: holds the page of other results; choose another folder, or remove it"):
+    with pytest.raises(InputError, match="again: holds results of another page"):
         write_static(other, tmp_path / "again")
 
 
