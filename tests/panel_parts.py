@@ -1,12 +1,10 @@
 """Parts of panels in tests: by name and by kind."""
 
-from jaxbl.report.panels import Map
-
 
 def names_of(*panels):
     """Names of all that has one, each once, as a legend has them."""
     parts = [part for panel in panels for part in panel.parts]
-    names = [part.failed_name if isinstance(part, Map) else getattr(part, "name", "") for part in parts]
+    names = [getattr(part, "name", "") for part in parts]
     return list(dict.fromkeys(filter(None, names)))
 
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
@@ -29,7 +28,6 @@ from jaxbl.json_types import JsonObject
 
 from .panels import (
     BLACK,
-    COLOURS,
     FAINT,
     MISSING,
     Axis,
@@ -65,7 +63,6 @@ _SETTINGS: Any = {
     # of figures that are made elsewhere under these settings
     "figure.constrained_layout.use": True,
     "savefig.dpi": 150,
-    "axes.prop_cycle": cycler(color=COLOURS),
     "svg.fonttype": "path",
 }
 _INK = ((BLACK, "currentColor"), ("#ffffff", "var(--paper)"), ("#dddddd", "var(--grid)"))
@@ -246,15 +243,9 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     box = ax.get_position()
     width, height = ax.figure.get_size_inches()  # type: ignore[union-attr]
     ticks = {"x": int(np.clip(1.4 * width * box.width, 2, 8)), "y": int(np.clip(2.5 * height * box.height, 2, 6))}
-    held = []
-    for layer, part in enumerate(panel.parts):
-        if isinstance(part, Line) and part.held:
-            held.append(part)
-        else:
-            _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
-    for part in held:
-        x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((part.x, ax.get_xlim()), (part.y, ax.get_ylim())))
-        _draw_line(ax, part._replace(x=x, y=y), 5.0)
+    # those that are held on the edge of the axes last, as these have to be known
+    for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
+        _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
     ax.grid(not any(isinstance(part, Map) for part in panel.parts) and panel.note == "")
     for name, axis in zip("xy", panel[:2], strict=True):
         drawn = getattr(ax, f"{name}axis")
@@ -284,14 +275,16 @@ def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
 
 
 def _line_look(line: Line) -> dict[str, Any]:
-    size = line.size
     look = {"ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker}
     edge = line.colour if line.marker in "x|+" or line.fill else line.fill or "none"
-    return look | {"ms": size, "mfc": line.fill or line.colour, "mec": edge, "mew": 1.1 if line.fill else 1.0}
+    return look | {"ms": line.size, "mfc": line.fill or line.colour, "mec": edge, "mew": 1.1 if line.fill else 1.0}
 
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     line = thin(line)  # type: ignore[assignment]
+    if line.held:
+        x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
+        line = line._replace(x=x, y=y)
     look: Any = {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
     (artist,) = ax.plot(line.x, line.y, drawstyle="steps-post" if line.steps else "default", **_line_look(line), **look)
     # one by one, markers would be larger than an image of them
@@ -363,8 +356,8 @@ def _legend_handles(panel: Panel) -> dict[str, Any]:
     handles: dict[str, Any] = {}
     for part in panel.parts:
         name = getattr(part, "name", "")
-        if isinstance(part, Map) and np.any(part.failed):
-            name = part.failed_name
+        if isinstance(part, Map) and not np.any(part.failed):
+            continue
         if not name or name in handles or (isinstance(part, Line) and part.at_line):
             continue
         if isinstance(part, Line):

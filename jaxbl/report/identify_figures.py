@@ -100,7 +100,7 @@ def _residuals(log: LogSignals) -> Figure:
         name = f"rms {rms:.2g} {unit}, {rms / noise:.3g} times the noise"
         parts = [_line(log, log[f"{side}.residual"], name, colour=SIDE_COLOURS[side], width=0.7)]
         parts += [Span(end, end, "± 2 noise", along="y", width=0.9) for end in (-2.0 * noise, 2.0 * noise)]
-        panels.append(Panel(Axis("time (s)"), Axis(f"{side}:\nmeasured − model ({unit})"), parts))
+        panels.append(Panel(Axis("time (s)"), Axis(f"{side}: measured\n− model ({unit})"), parts))
     return stack(
         "residuals",
         panels,

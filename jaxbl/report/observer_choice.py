@@ -52,13 +52,12 @@ def _ratios(summary: JsonObject, sides: Sequence[str]) -> Figure:
         highest = max((result["high"] for result in compared.values()), default=1.0)
         low, ratio, high = (np.array([result[key] for result in compared.values()]) for key in ("low", "ratio", "high"))
         texts = ["best" if i == 0 else _ratio(result) for i, result in enumerate(compared.values())]
+        texts += ["diverged, or too slow"] * len(lost)
         parts: list[Part] = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(compared)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            Line(high, range(len(compared)), width=0.0, marker=" ", texts=texts),
-            Line([0.9] * len(lost), range(len(compared), len(kinds)), width=0.0, marker=" ",
-                 texts=["diverged, or too slow"] * len(lost)),
-        ]  # fmt: skip
+            Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
+        ]
         x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + highest) ** 1.5))
         names = tuple(enumerate([*compared, *lost]))
         panels.append(Panel(x, Axis(ends=(len(kinds) - 0.5, -0.5), names=names), parts, side))

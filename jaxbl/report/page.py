@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import platform
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -99,7 +100,7 @@ def _figure(name: str, picture: Picture) -> str:
 
 def _table(table: ResultTable) -> str:
     heading = escape(table.heading)
-    head = "".join(f'<th scope="col">{escape(column)}</th>' if column else "<td></td>" for column in table.columns)
+    head = "".join(f'<th scope="col">{_breakable(column)}</th>' if column else "<td></td>" for column in table.columns)
     body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)
     return (
         f'<h2>{heading}</h2><div class="scroll" tabindex="0" role="region" aria-label="{heading}">'
@@ -107,11 +108,16 @@ def _table(table: ResultTable) -> str:
     )
 
 
+def _breakable(text: str) -> str:
+    """A text whose names in code may go on in a new line, so that a table is no wider than the page."""
+    return re.sub(r"([._])(?=[a-z])", r"\1<wbr>", escape(text))
+
+
 def _cell(value: object) -> str:
     if isinstance(value, bool | None):
         value = {True: "yes", False: "no", None: "–"}[value]
     if isinstance(value, str):
-        return f"<td>{escape(value)}</td>"
+        return f"<td>{_breakable(value)}</td>"
     # counts in full
     text = str(value) if isinstance(value, int | np.integer) else f"{value:.4g}"
     return f'<td class="number" data-value="{value}">{text}</td>'

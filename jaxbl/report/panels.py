@@ -129,7 +129,7 @@ class Map(NamedTuple):
 
     Attributes:
         failed: cells that are of one grey, whatever they hold.
-        failed_name: of these in the legend.
+        name: of these in the legend.
     """
 
     x: Any
@@ -137,7 +137,7 @@ class Map(NamedTuple):
     values: Any
     scale: Scale
     failed: Any = None
-    failed_name: str = ""
+    name: str = ""
 
 
 class Dots(NamedTuple):

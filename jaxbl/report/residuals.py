@@ -35,7 +35,7 @@ from .panels import (
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
 """Coordinates that are drawn: as many as are wide enough side by side."""
-_WIDTH = 90
+_WIDTH = 70
 """Characters of a line above a figure."""
 _LABELLED = 0.1
 """Least share of the power of a peak with a label; labels of smaller ones would cover each other."""

@@ -121,15 +121,11 @@ def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Figure:
 
 def _torque(trace: DataFrame, sides: list[str]) -> Figure:
     time, torque = trace["t"], trace["torque"]
-    estimates = {side: trace[f"{side}.torque_estimate"] for side in sides}
     above = [
-        Line(time, estimate, f"from the {side} observer", SIDE_COLOURS[side], 2.0, opacity=0.75)
-        for side, estimate in estimates.items()
+        Line(time, trace[f"{side}.torque_estimate"], f"from the {side} observer", SIDE_COLOURS[side], 2.0, opacity=0.75)
+        for side in sides
     ]
-    below = [
-        Line(time, torque - estimate, colour=SIDE_COLOURS[side], width=1.0, opacity=0.75)
-        for side, estimate in estimates.items()
-    ]
+    below = [line._replace(y=torque - line.y, name="", width=1.0) for line in above]
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
     panels = [
         Panel(_TIME, Axis(f"{name} (N m)"), [*above, Line(time, torque, "true", width=1.0)]),

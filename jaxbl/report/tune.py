@@ -153,7 +153,7 @@ def _limits(tuning: Tuning, side: str) -> Figure:
             "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
             "chatter is not above the error. "
         )
-    return Figure(f"limits_{side}", panels, caption, 2, 8.4, 3.6)
+    return Figure(f"limits_{side}", panels, caption, 2)
 
 
 _PLANES = (

@@ -9,7 +9,7 @@ from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.result import ResultTable
 
 from .gain_plane import least_lambdas
-from .panels import COLOURS, FAINT, MISSING, Array, Axis, Band, Figure, Line, Panel, Part, Span, mark
+from .panels import COLOURS, FAINT, MISSING, Axis, Band, Figure, Line, Panel, Part, Span, mark
 
 _ALPHA, _LAMBDA = (0.3, 20.0), (0.15, 25.0)
 """Ends of the plane, alpha / f⁺ and lambda / √f⁺."""
@@ -64,17 +64,13 @@ def _draw_region(judged: JsonObject, colour: str, dashes: str) -> list[Part]:
                 Line(alpha, np.where((low < high) & is_border, border, np.nan), judged["title"], colour, 2.0, dashes)
             )
         if wrong is not None:
-            parts.append(_shade_wrong(alpha, low, np.minimum(high, failing), colour))
+            # what a rule allows although it fails
+            bottom, top = (np.clip(border, *_LAMBDA) for border in (low, np.minimum(high, failing)))
+            parts.append(Band(alpha, bottom, np.where(bottom < top, top, np.nan), "", colour))
     if wrong is not None:
         x, y = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])
         parts.append(Line([x], [y], colour=colour, width=0.0, marker="x", size=9.0))
     return parts
-
-
-def _shade_wrong(alpha: Array, low: Array, high: Array, colour: str) -> Band:
-    """Shade the gains that a rule allows although they fail."""
-    ends = np.clip(low, *_LAMBDA), np.clip(high, *_LAMBDA)
-    return Band(alpha, ends[0], np.where(ends[0] < ends[1], ends[1], np.nan), "", colour)
 
 
 def rule_lines(rules: list[JsonObject]) -> list[str]:

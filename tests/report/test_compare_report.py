@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study, spaced_axis
+from test_page import Page
 
 from jaxbl import cli
 from jaxbl.config import read_config
@@ -48,7 +49,7 @@ def test_command_writes_text_json_and_figure(studies_folder, run_command):
     lines = output.splitlines()
     assert len(lines) <= 8 and all(len(line) <= 100 for line in lines[:-1])
     assert "metrics differ by more than noise" in output and "Points: 6 in both; 0 in the first alone" in output
-    page = (studies_folder / "both" / "report.html").read_text()
+    page = Page((studies_folder / "both" / "report.html").read_text()).text
     for text in ("excitation.amplitude", "motor.f_plus_acceleration", "Noise: by differences seed by seed, 4 seeds"):
         assert text in page
     data = json.loads((studies_folder / "both" / "comparison.json").read_text())

@@ -103,7 +103,7 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
     cells = find_map(drawing.panels[0])
     assert cells.failed[:, -1].all()
     assert not cells.failed[:, :-1].any()
-    assert cells.failed_name == "diverged (4 points)"
+    assert cells.name == "diverged (4 points)"
 
 
 def test_what_did_not_converge_is_grey_and_sets_no_colour(tmp_path):

@@ -21,7 +21,7 @@ from jaxbl.report.results import describe, write_report
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.trial import run
 
-VOID = {"meta", "img"}
+VOID = {"meta", "img", "wbr"}
 
 
 class Page(HTMLParser):

@@ -85,7 +85,7 @@ def test_only_what_was_simulated_is_counted_as_missing():
     frame["motor.converged"] = frame["finite"]
     (drawing,) = draw(result)
     cells = drawn_map(drawing.panels[0])
-    assert cells.failed_name == "diverged (1 points)"
+    assert cells.name == "diverged (1 points)"
     assert cells.failed.sum() == 5 * 5  # its block, cut by the edges of the map
 
 
