@@ -81,7 +81,7 @@ class Chart {
   set(lines, shades = []) {
     this.lines = lines.filter((one) => one.x.length);
     this.shades = shades;
-    const entries = [...this.lines, ...shades].filter((one) => one.name).map((one) => [one.name, one.colour ?? "currentColor", one.dash?.length]);
+    const entries = [...this.lines, ...shades.map((one) => ({ colour: GREY, ...one }))].filter((one) => one.name).map((one) => [one.name, one.colour ?? "currentColor", one.dash?.length]);
     this.key.replaceChildren(...(this.named ? [legend([...new Map(entries.map((one) => [one[0], one])).values()])] : []));
     this.build();
   }

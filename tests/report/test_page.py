@@ -238,7 +238,6 @@ def test_signals_are_drawn_by_uplot_and_enlarged_together(tmp_path):
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
     with open_pages(tmp_path / "page.html", color_scheme="dark") as (page,):
         assert page.locator("figure .uplot").count() == 3 and not page.locator("figure img").first.is_visible()
-        check_figures(page, 2)
         over = page.locator(".u-over").first
         box = over.bounding_box()
         page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.9 * box["height"])
@@ -253,6 +252,7 @@ def test_signals_are_drawn_by_uplot_and_enlarged_together(tmp_path):
         page.get_by_label("whole figure").first.click()
         assert page.evaluate(shown) == [[0, 10]] * 3
         assert page.locator(".legend").first.inner_text().split("\n") == ["seen", "95 %", "held out"]
+        check_figures(page, 2)
 
 
 def place(view, x, y):

@@ -139,7 +139,7 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
     best, telling = (-1.0, -1.0), (0,) * (len(sizes_of_slices) + 1)
     for index in np.ndindex(*sizes_of_slices):
         part = [array[(*index, 0)].reshape(-1) for array in (values, cells[first])]
-        works, sizes = (one[:: max(one.size // _MOST_JUDGED, 1)] for one in part)
+        works, sizes = (array[:: max(array.size // _MOST_JUDGED, 1)] for array in part)
         works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
         share = float(np.mean(works)) if works.size and values is not cells[first] else 0.0
         spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0

@@ -201,8 +201,8 @@ def _about(config: Config, columns: list[str], studies: Sequence[str] = ()) -> J
 
 def _label(name: str, studies: Sequence[str]) -> str:
     """A metric in words; of two studies that are compared, which one's."""
-    metric, _, which = name.rpartition(".")
+    metric, _, end = name.rpartition(".")
     if not studies or name == "finite":
         return value_label(name)
     words = {"first": f"in {studies[0]}", "second": f"in {studies[1]}", "factor": f"{studies[1]} over {studies[0]}"}
-    return f"{value_label(metric)}, {words[which]}"
+    return f"{value_label(metric)}, {words[end]}"

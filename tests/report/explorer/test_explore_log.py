@@ -171,7 +171,6 @@ def test_lines_coordinates_and_moments(tmp_path):
         page.locator("#play:text-is('pause')").wait_for()
         check_figures(page, 0)
         # the link opens the same part, coordinates and lines
-        page.goto(page.url)
         page.reload()
         page.wait_for_selector("body[data-drawn^='motor: missing torque theta_e motor.velocity ']")
         assert page.locator("#sizes tbody").inner_text() == shown

@@ -236,7 +236,6 @@ def test_a_filter_the_points_it_leaves_and_a_link_to_them(tmp_path):
         page.wait_for_selector("body[data-drawn='motor.velocity_rmse motor.chatter motor.velocity_rmse']")
         page.wait_for_selector(filtered)
         # the link opens the same
-        page.goto(page.url)
         page.reload()
         page.wait_for_selector(f"{filtered} >> visible=true")
         assert page.evaluate("page.shown.chart.lines[0].x.length") == len(passing)
@@ -279,8 +278,8 @@ def test_an_address_with_anything_in_it_opens_a_page(tmp_path):
     ]
     with open_pages(page_file) as (page,):
         for words in addresses:
+            page.goto("about:blank")
             page.goto(f"{page_file.as_uri()}#{words}")
-            page.reload()
             page.wait_for_selector("body[data-drawn]:not([data-drawn='overview'])")
             page.wait_for_selector("#state:not(:has-text('reading'))")
             assert page.locator("#plot .uplot").count() >= 1 and "cannot be read" not in page.locator("#state").inner_text()
@@ -478,7 +477,6 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
             assert apart[0] > 1e-3 and apart[1] == 0.0
             check_figures(page, 0)
             # a link restores both runs
-            page.goto(page.url)
             page.reload()
             page.locator("#pinned li").nth(1).wait_for()
             page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")

@@ -11,7 +11,9 @@ const saveTable = (name, columns) => {
 };
 /** An element as it is seen, its canvases and its texts, as PNG. */
 const savePicture = (name, element) => {
-  const whole = element.getBoundingClientRect(), sheet = made("canvas", { width: whole.width * devicePixelRatio, height: whole.height * devicePixelRatio });
+  // what stands below the last canvas is no part of it
+  const whole = element.getBoundingClientRect(), bottom = Math.max(...Array.from(element.querySelectorAll("canvas"), (one) => one.getBoundingClientRect().bottom));
+  const sheet = made("canvas", { width: whole.width * devicePixelRatio, height: (bottom - whole.top + 4) * devicePixelRatio });
   const context = sheet.getContext("2d"), style = getComputedStyle(document.body);
   context.scale(devicePixelRatio, devicePixelRatio);
   context.fillStyle = style.backgroundColor;
@@ -54,9 +56,7 @@ const head = ({ title, lead, config, file }) => {
 
 const waiting = new Map();
 /** Called by the scripts that carry a Parquet file for pages opened from disk. */
-globalThis.jaxblBytes = (number, content) => {
-  waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0)));
-};
+globalThis.jaxblBytes = (number, content) => { waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0))); };
 
 /** The Parquet file beside the page as hyparquet reads it: its length, and bytes from and to. */
 const bytesOf = (about) => {
@@ -98,9 +98,7 @@ const bytesOf = (about) => {
 /** Columns of the Parquet file beside the page, each read when it is asked for. */
 class Columns {
   /** `most` columns are kept; `told` hears the share that is read. */
-  constructor(about, most, told) {
-    Object.assign(this, { rows: about.rows, file: bytesOf(about), most, told, kept: new Map() });
-  }
+  constructor(about, most, told) { Object.assign(this, { rows: about.rows, file: bytesOf(about), most, told, kept: new Map() }); }
   get(name, Kind = Float32Array) {
     if (!this.kept.has(name)) {
       if (this.kept.size >= this.most) this.kept.delete(this.kept.keys().next().value);
