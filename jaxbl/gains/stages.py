@@ -1,7 +1,7 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ class Stages:
     Attributes:
         folder: `out`/`command`, or None.
         results: the folder `out` with its manifest, or None.
-        manifest: entry of the command in the manifest of an earlier call.
+        manifest: entry of the command in the manifest, of an earlier call at first.
         total_lanes: lanes of all stages, for the progress.
         fallback_reasons: why runs were scanned although the fused backend was asked for.
         cost: seconds of compilation and of computing, and lanes computed.
@@ -113,13 +113,8 @@ class Stages:
             entry = study_head(self._config, self._command) | early_results | {"backend": self._backend}
             # files of an earlier call stay until others take their place
             entry |= {"files": self.manifest.get("files", {}), "folders": [self._command]}
-            self.results.entries[self._command] = entry
+            self.manifest = self.results.entries[self._command] = entry
             self.results.write_manifest()
-
-    def write_files(self) -> AbstractContextManager[Path]:
-        """Yield a folder for files that belong to what was found (:meth:`jaxbl.files.ResultFolder.write_files`)."""
-        assert self.results is not None
-        return self.results.write_files(self._command, **self.results.entries[self._command])
 
     def path_of(self, *names: str) -> Path | None:
         """Return a path in the folder, None without a folder."""

@@ -142,8 +142,8 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
             "counterexamples_in_all": len(at_true_bound),
         }
     )
-    if stages.folder is not None:
-        with stages.write_files() as draft:
+    if stages.results is not None:
+        with stages.results.write_files("verify", **stages.manifest) as draft:
             counterexamples.to_parquet(draft / "counterexamples.parquet", index=False)
             write_json(draft / "verdict.json", summary)
     return Verdict(config, summary, error_map, levels, counterexamples, tuple(stages.fallback_reasons))

@@ -59,7 +59,7 @@ def write_part(path: Path, frame: pd.DataFrame, header: PartHeader) -> None:
 
 
 def _checksum(content: bytes | bytearray) -> tuple[int, bytes]:
-    """Where a file has its checksum, and what it should be: CRC-32, which detects damage, not forgery."""
+    """Return the place of a file's checksum and what it should be: CRC-32, which detects damage, not forgery."""
     # after the key come the type and the length of the value
     place = content.rfind(_SUM) + len(_SUM) + 2
     start = zlib.crc32(_NO_SUM, zlib.crc32(memoryview(content)[:place]))

@@ -233,6 +233,6 @@ def test_wrong_requests_get_one_line_and_leave_nothing(tmp_path, options, messag
 
 def test_another_folder_is_not_overwritten(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="is not empty and holds no export"):
+    with pytest.raises(InputError, match="is not empty and holds no results"):
         jaxbl.export(study(), tmp_path, name="drive")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
